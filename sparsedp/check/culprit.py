@@ -99,8 +99,8 @@ def _of_operator(op, cleared, rng):
         return None
     cleared.add(id(op))
     reason = fault_of(op, rng)
-    if reason and isinstance(op, Inverse) and fault_of(op.solver.system.given, rng):
-        reason += f"; so is that of {op.solver.system.given.name}, which it inverts"
+    if reason and isinstance(op, Inverse) and fault_of(op.solver.system.unscaled, rng):
+        reason += f"; so is that of {op.solver.system.unscaled.name}, which it inverts"
     if reason.startswith("its transpose is"):
         reason += _entries_of_operator(op, rng)
     return (op.name.removesuffix(".T"), reason) if reason else None  # it and its transpose are one operator

@@ -247,7 +247,7 @@ class Resolvent:
         """Refuse an L under which something grows as fast as 1 / z or faster: a step would turn its sign."""
         if system.complex or not system.symmetric:
             return
-        x = system.masked(np.random.default_rng(system.seed).standard_normal(system.here))
+        x = system.masked(np.random.default_rng(system.seed).standard_normal(system.local_size))
         for _ in range(8):  # towards what changes fastest
             change = x - system.masked(system.applied(x))  # z L x
             if system.total(x @ (system.weights * (x - change))) < 0:

@@ -6,7 +6,6 @@ turn, and raise together. The true residual is that of the operator itself, not 
 """
 
 from functools import cached_property, reduce
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -73,16 +72,19 @@ class RanksSystem(System):
     """What the contract and the engine ask of the operator, for fields on ranks. Arrays are flat blocks."""
 
     faces = splitting = None
-    here: Any = 0
 
     def __init__(self, op, rtol=1e-10, maxiter=None):
         self.layout, self.parts = op.domain.layout, op.domain.parts
         self.side = self.layout, self.parts
         self.seed = [7, self.layout.comm.rank]
-        self.here = self.layout.size(self.parts)
         super().__init__(op, rtol, maxiter)
 
     # sizes, over all ranks
+
+    @property
+    def local_size(self):
+        """The number of entries of the blocks of this rank."""
+        return self.layout.size(self.parts)
 
     def size_of(self, x):
         """2-norm."""
@@ -126,7 +128,7 @@ class RanksSystem(System):
 
     def applied(self, x):
         """A x as it was given: not scaled, for all that is not an unknown too."""
-        return self.structure_of(self.given).product(x)
+        return self.structure_of(self.unscaled).product(x)
 
     def residual(self, x, b, transposed=False):
         """(b - A x, its norm; that of x)."""
@@ -146,9 +148,9 @@ class RanksSystem(System):
     def components(self):
         """(labels, count) of the connected components of the unknowns: those of the blocks, joined across ranks."""
         indptr, indices, data = self.matrix.getValuesCSR()
-        links = _matrix((self.here,) * 2, indptr, indices, (data != 0).astype(float), self.layout)
+        links = _matrix((self.local_size,) * 2, indptr, indices, (data != 0).astype(float), self.layout)
         starts, columns, ones = links.getDiagonalBlock().getValuesCSR()
-        block = sp.csr_array((ones, columns, starts), shape=(self.here,) * 2)
+        block = sp.csr_array((ones, columns, starts), shape=(self.local_size,) * 2)
         block.eliminate_zeros()
         many, labels = connected_components(block, directed=False)
         counts = self.layout.agreement.gathered(many)
@@ -216,7 +218,7 @@ class PetscEngine(Engine):
         comm, w = system.layout.comm, system.weights
         PETSc.garbage_cleanup(comm)  # what Python has dropped is freed here, on all ranks together
         self.system, sign = system, -1.0 if system.sign < 0 else 1.0
-        self.rows = np.full(system.here, sign) * (1.0 if w is None else w)  # by these the matrix is positive
+        self.rows = np.full(system.local_size, sign) * (1.0 if w is None else w)  # by these the matrix is positive
         matrix = system.matrix.copy()
         matrix.diagonalScale(L=system.vector(self.rows))
         space, symmetric = system.null_space, w is not None
@@ -264,4 +266,4 @@ class PetscEngine(Engine):
         return x, self.ksp.getIterationNumber(), word
 
 
-RanksSystem.make = PetscEngine
+RanksSystem.engine_builder = PetscEngine

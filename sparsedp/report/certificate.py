@@ -96,7 +96,7 @@ class RecordedSolves(dict):
 
     def linear(self, solver, b, transposed, checked, start):
         """The solution of one linear solve, flat. The solver calls this in place of its own `solved`."""
-        product = (solver.system.given.T if transposed else solver.system.given)._flat.apply
+        product = (solver.system.unscaled.T if transposed else solver.system.unscaled)._flat.apply
         first = partial(solver.solve, b, transposed, checked, start, observed=False)
         if self.correct is None:
             first = partial(solver.approximate, b, self.share, transposed)

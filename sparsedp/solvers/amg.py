@@ -76,11 +76,11 @@ def multigrid_engine(system, *, cycle="V", strength=0.25, sweeps=(("forward",), 
     """
     strength, levels = check_multigrid_options(cycle, strength, sweeps, levels)
     if not system.op.structure.has_entries:
-        raise ValueError(f"multigrid needs the entries, {system.given} only knows its products; write method='krylov'")
+        raise ValueError(f"multigrid needs the entries, {system.unscaled} has only products; write method='krylov'")
     if not system.sign:
         ends = system.diagonal if system.active is None else system.diagonal[system.active]
         raise ValueError(
-            f"multigrid needs a diagonal of one sign; {system.given} has {ends.min():.1e} and {ends.max():.1e}; "
+            f"multigrid needs a diagonal of one sign; {system.unscaled} has {ends.min():.1e} and {ends.max():.1e}; "
             "write method='direct'"
         )
     return Multigrid(system, CYCLES[cycle], strength, tuple(map(tuple, sweeps)), levels)
@@ -123,7 +123,7 @@ class Multigrid(Krylov):
         coarsest = found[-1].A.shape[0]
         if coarsest > DENSE_UP_TO:
             raise ConvergenceError(
-                f"multigrid on {system.given} ends at a coarsest level of {coarsest} unknowns, after {len(found)} of "
+                f"multigrid on {system.unscaled} ends at a level of {coarsest} unknowns, after {len(found)} of "
                 f"{levels} levels; it may have {DENSE_UP_TO}; write method='direct' or 'krylov', or raise levels",
                 info=failure("setup_failed"),
             )

@@ -136,7 +136,7 @@ def check_unknowns(system: System) -> None:
     number = system.unused_unknown
     if number is not None:
         raise ConvergenceError(
-            f"row {number} of {system.given} has entries, but unknown {number} is used in no row, so that this "
+            f"row {number} of {system.unscaled} has entries, but unknown {number} is used in no row, so that this "
             "equation would be ignored; use the unknown in a row, or leave the equation out: "
             "dp.mask(A.codomain, keep) @ A",
             info=failure("empty_column"),
@@ -166,7 +166,7 @@ def engine_of(system: System, choice: Choice, options: dict[str, Any], near: Eng
         return EmptySystem()
     if system.empty_row is not None:
         raise ConvergenceError(
-            f"row {system.empty_row} of {system.given} has no entries, but its unknown is used in other rows; "
+            f"row {system.empty_row} of {system.unscaled} has no entries, but its unknown is used in other rows; "
             "give it an equation",
             info=failure("empty_row"),
         )
@@ -174,7 +174,7 @@ def engine_of(system: System, choice: Choice, options: dict[str, Any], near: Eng
         engine = _engine(system, choice, options, near)
         _ = system.null_space  # found here, so that its failure is one of the set-up
     except ArithmeticError as error:
-        message = f"{system.given} is singular and cannot be projected: {error}; add a shift"
+        message = f"{system.unscaled} is singular and cannot be projected: {error}; add a shift"
         raise ConvergenceError(message, info=failure("setup_failed")) from None
     return engine
 
@@ -191,7 +191,7 @@ def _engine(system: System, choice: Choice, options: dict[str, Any], near: Engin
         return Near(system, getattr(near, "lu", near))
     if choice.engine is not None and not options:
         return choice.engine
-    build = system.make or METHODS[method]
+    build = system.engine_builder or METHODS[method]
     return build(system, **options)
 
 
@@ -209,7 +209,9 @@ def choose_method(system: System, solves: str) -> Choice:
     """
     structure = system.op.structure
     grid = system.op.domain.grid
-    dimension = 0 if grid is None else grid.dim
+    dimension = 0
+    if grid is not None:
+        dimension = grid.dim
     engine = _transforms(system, dimension)
     if engine is not None:
         kind = "a sum of 1-D factors" if structure.separable else "a function of a sum of 1-D factors"
@@ -309,4 +311,6 @@ def _largest_factored(system: System) -> int:
     if system.faces is not None:
         return system.unknowns
     largest, triangular = largest_block(system.matrix)
-    return largest if triangular else system.unknowns
+    if not triangular:
+        return system.unknowns
+    return largest

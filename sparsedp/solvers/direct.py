@@ -112,7 +112,7 @@ def direct_engine(system, *, precision="auto"):
         return direct_engine(system, precision="double")
     if not growth < MOST_GROWTH:
         raise ConvergenceError(
-            f"{system.given} is singular and its null space is neither constant nor that of the volumes, or its "
+            f"{system.unscaled} is singular and its null space is neither constant nor that of the volumes, or its "
             "condition number is beyond 1e14; add a shift, or remove the rows that depend on others",
             info=failure("setup_failed"),
         )
@@ -157,7 +157,7 @@ class DenseSystem(System):
     exponent = 0
 
     def __init__(self, op, rtol):
-        self.given = self.op = op
+        self.unscaled = self.op = op
         self.size, self.rtol, self.maxiter = op.shape[0], rtol, None
         self.dense = op.matrix.toarray()
         sizes = np.abs(self.dense)
@@ -207,7 +207,7 @@ def _sparse(matrix, system, single):
         return (lambda b, transposed: np.full(b.shape, np.nan, matrix.dtype)), "sparse LU"
     except MemoryError:
         advice = "method='krylov', preconditioner='shifted_laplace'" if system.complex else "method='multigrid'"
-        message = f"sparse LU of {system.given} does not fit into memory; write {advice}"
+        message = f"sparse LU of {system.unscaled} does not fit into memory; write {advice}"
         raise ConvergenceError(message, info=failure("setup_failed")) from None
     solve = lambda b, transposed: factors.solve(b, trans="T" if transposed else "N")
     if not single:

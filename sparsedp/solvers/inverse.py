@@ -176,7 +176,10 @@ def build(
         system = System(op, rtol, maxiter)
         if method in ("krylov", "separable"):
             system.splitting = None  # these solve for all unknowns, without looking at the entries
-        choice = Choice(method, "as asked") if method != "auto" else choose_method(system, solves)
+        if method == "auto":
+            choice = choose_method(system, solves)
+        else:
+            choice = Choice(method, "as asked")
         check_options(choice.method, options)
     if system.complex and choice.method not in ("direct", "krylov"):
         raise ValueError(f"{choice.method} takes real operators, {op} is complex; write method='direct' or 'krylov'")
@@ -313,7 +316,7 @@ class Inverse(Operator):
 
     def __init__(self, structure: Solution) -> None:
         solver = structure.solver
-        op = solver.system.given
+        op = solver.system.unscaled
         if structure.transposed:
             super().__init__(structure, op.domain, op.codomain, f"{solver.name}.T", "matrix-free")
         else:

@@ -82,8 +82,8 @@ class Linearisation:
         solver = self.solver
         if self.singular and solver.nullspace == "raise":
             raise ConvergenceError(
-                f"the Jacobian {solver.system.given} is singular at the solution: the root is not isolated and has no "
-                "derivative; add an equation that fixes it or write nullspace='project'",
+                f"the Jacobian {solver.system.unscaled} is singular at the solution: the root is not isolated and has "
+                "no derivative; add an equation that fixes it or write nullspace='project'",
                 info=failure("setup_failed"),
             )
         x = self._of(solver.solve, b, transposed, False)
@@ -202,7 +202,7 @@ class Jacobians:
         equation, x, leaves = known.point
         with self._alone:
             if equation.layout.ranks:
-                self._stencil(equation, [x], leaves, known.solver.system.given.structure.stencil)
+                self._stencil(equation, [x], leaves, known.solver.system.unscaled.structure.stencil)
             else:
                 self._enlarge(equation, x, leaves, row)
         return True

@@ -82,7 +82,7 @@ class Krylov(Engine):
 
     def unroll(self, b, goal, transposed):
         """As `solve`, differentiable as it runs: b may be traced."""
-        op = (self.system.given.T if transposed else self.system.given)._flat
+        op = (self.system.unscaled.T if transposed else self.system.unscaled)._flat
         accepted = lambda residual, x: residual <= goal and self.refines
         return self._conjugate_gradients(b, accepted, transposed, op)
 

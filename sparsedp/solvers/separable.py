@@ -542,7 +542,7 @@ def separable_engine(system: System) -> Separable:
     if system.active is None:
         basis = find_eigenbasis(system.op.structure)
     if basis is None:
-        raise ValueError(f"separable needs a sum of 1-D factors that can be diagonalised, got {system.given}")
+        raise ValueError(f"separable needs a sum of 1-D factors that can be diagonalised, got {system.unscaled}")
     return transform_engine(system, *basis)
 
 

@@ -94,7 +94,9 @@ class Run:
         str
             "converged", "converged_at_roundoff", or "" if the residual is not accepted.
         """
-        self.residual = residual / data if data else 0.0
+        self.residual = 0.0
+        if data:
+            self.residual = residual / data
         self.backward_error = residual / (terms or 1.0)
         if residual <= goal:
             return "converged"
@@ -244,12 +246,15 @@ class Solver(Remade):
 
         # A tolerance relative to all data would leave no digits to a region with small data. They are scaled up; the
         # norm of the data stays that of the data as given.
-        lift = system.lift(b, data) if self.engine.iterative else None
+        lift = None
+        if self.engine.iterative:
+            lift = system.lift(b, data)
         if lift is not None:
             run.exponent = run.exponent - lift
             b = shifted(b, lift)
             b = system.null_space.project(b, run.transposed, into=b)
-            start = None if start is None else shifted(start, lift)
+            if start is not None:
+                start = shifted(start, lift)
 
         # Solve and refine. Accept or raise.
         x = self._refined(b, data, run, start)
@@ -288,13 +293,20 @@ class Solver(Remade):
             if singular:
                 r, residual = system.null_space.projected(r, transposed)
             status = run.assess(residual, goal, data, size_of_matrix * length + data, LARGEST_AT_ROUNDOFF * data)
-        for _ in range(0 if status else engine.most_refinements):
+        rounds = engine.most_refinements
+        if status:  # the first guess is a solution
+            rounds = 0
+        for _ in range(rounds):
             # A correction need not be more accurate than the rounding errors of the whole solution.
-            floor = 0.0 if x is None else system.rounding(x, data, transposed)
-            step, iterations, trouble = engine.solve(r, max(goal, floor), transposed)
+            accuracy = goal
+            if x is not None:
+                accuracy = max(goal, system.rounding(x, data, transposed))
+            trial, iterations, trouble = engine.solve(r, accuracy, transposed)
             run.iterations += iterations
-            step = system.masked(step) if system.active is not None else step
-            trial = step if x is None else np.add(x, step, out=step)
+            if system.active is not None:
+                trial = system.masked(trial)
+            if x is not None:
+                np.add(x, trial, out=trial)
             if singular:
                 trial = system.null_space.project(trial, transposed, into=trial)
             trial_r, trial_residual, trial_length = system.residual(trial, b, transposed)
@@ -307,7 +319,7 @@ class Solver(Remade):
             if trouble or not reduced or not engine.refines or status == "converged":
                 break
             # The accuracy that is attainable by the norm of A is not the limit where rows differ in size.
-            if status and residual <= 2 * system.rounding(x, data, transposed):
+            if status and x is not None and residual <= 2 * system.rounding(x, data, transposed):
                 break
         if x is None:
             x = np.zeros_like(b)
@@ -361,14 +373,17 @@ class Solver(Remade):
         """
         system = self.system
         run = Run(transposed, rtol=system.rtol)
-        op = system.given.T if transposed else system.given
-        r = b * 1.0 if start is None else b - op(start)
+        op = system.unscaled.T if transposed else system.unscaled
+        r = b * 1.0
+        if start is not None:
+            r = b - op(start)
         data = np.array(plain(b), dtype=float).reshape(-1)
         size = norm(data)
         goal = run.rtol * size
         x, run.iterations, trouble = self.engine.unroll(anp.reshape(r, (-1,)), goal, transposed)
         x = anp.reshape(x, op.domain.shape)
-        x = x + (0.0 if start is None else start)
+        if start is not None:
+            x = x + start
         solution = shifted(np.array(plain(x)).reshape(-1), system.exponent)
         _, residual, length = system.residual(solution, data, transposed)
         run.status = trouble
@@ -419,15 +434,18 @@ class Solver(Remade):
     def _on_unknowns(self, b: np.ndarray, size: float, run: Run, refuses: bool) -> np.ndarray:
         """Return b with zeros where there is no unknown; refuse primal data that are not 0 there."""
         system = self.system
-        outside = np.where(system.active, 0.0, b)
-        run.defect = system.size_of(outside) / size if size else 0.0
+        active: Any = system.active
+        outside = np.where(active, 0.0, b)
+        run.defect = 0.0
+        if size:
+            run.defect = system.size_of(outside) / size
         if refuses and run.defect > 8 * EPS:
             self._refuse_data(
                 run,
                 ": the right-hand side must be 0 where there is no unknown (solid or isolated cells, "
                 f"coefficient 0), but is not in cell {self._cell(system.number_of_largest(outside))}; set it to 0",
             )
-        return np.where(system.active, b, 0.0)
+        return np.where(active, b, 0.0)
 
     def _refuse_defect(self, run: Run, defect: float, component: int) -> None:
         """Raise for data with a component along a null vector."""
@@ -452,7 +470,7 @@ class Solver(Remade):
 
     def _not_converged(self, run: Run, x: np.ndarray, how: str = "", why: str = "") -> ConvergenceError:
         """Return the error of a solve whose solution x does not meet the tolerance."""
-        op = self.system.given.T if run.transposed else self.system.given
+        op = self.system.unscaled.T if run.transposed else self.system.unscaled
         reached = number_beside(run.residual, run.rtol, digits=1, style="e")
         return ConvergenceError(
             f"{how}{self.engine.method} on {op}: relative residual {reached} after {run.iterations} "

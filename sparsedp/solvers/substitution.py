@@ -300,9 +300,9 @@ class BlockTriangular(Engine):
                 setattr(self, name, getattr(inner, name))
         if not self._growth() < LARGEST_GROWTH:
             raise ConvergenceError(
-                f"{system.given} is singular, or its condition number is beyond 1e14: in its triangular part a pivot "
-                "is too small for its row, or the solution grows from row to row; add a shift, or remove rows that "
-                "depend on others",
+                f"{system.unscaled} is singular, or its condition number is beyond 1e14: in its triangular part a "
+                "pivot is too small for its row, or the solution grows from row to row; add a shift, or remove rows "
+                "that depend on others",
                 info=failure("setup_failed"),
             )
 

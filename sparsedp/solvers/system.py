@@ -1,7 +1,9 @@
-"""System: what an engine may know about the operator it inverts. Every fact is found on first use."""
+"""System: what an engine may know about the operator it inverts. Every property is computed on first use."""
+
+from __future__ import annotations
 
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -17,86 +19,112 @@ from sparsedp.operators.structure.lazy import Chain, Diagonal, Mask, Sum
 from sparsedp.solvers.nullspace import NullSpace, find_null_space
 from sparsedp.solvers.scaling import exponent_of, largest, norm, remainder
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from sparsedp.grid.space import Space
+    from sparsedp.operators.structure.base import Structure
+    from sparsedp.solvers.engine import Engine
+    from sparsedp.solvers.substitution import Splitting
+
 __all__ = ["System"]
 
-SYMMETRIC = 1e-13  # share of the sizes of two products that is rounding
-FAINT = 1e-3  # share of the size of the data, below which those of a component are solved for at a size of their own
-FAR = 200  # binary exponents of |A| beyond this are scaled away: squares of solutions must not overflow
+SYMMETRIC = 1e-13  # two products that should be equal may differ by this share of their sizes
+FAINT = 1e-3  # share of the size of the data, below which those of a component are scaled up before they are solved for
+LARGEST_EXPONENT = 200  # an operator whose norm has a larger binary exponent is scaled: squares must not overflow
+LARGEST_SCALING = 1000  # binary exponent by which an operator is scaled at most
 
 
 class System:
-    """The square operator of a solve, and its facts.
+    """The square operator of a solve, and its properties.
 
     Parameters
     ----------
     op : Operator
     rtol : float
-    maxiter : int or None
+    maxiter : int, optional
 
     Attributes
     ----------
     op : Operator
-        The operator to be inverted. Where the one given has entries beyond 2^+-200 it is that one
-        times 2^-exponent, exactly; the contract scales the solution back.
+        The operator to be inverted: `unscaled` times 2^-exponent.
+    unscaled : Operator
+        The operator as it was given.
     exponent : int
+        Not 0 if entries are beyond 2^+-200. The scaling is exact; the contract scales the solution back.
+    size, local_size : int
+        Numbers in a field, and those of them that this process holds.
     """
 
-    make: Any = None  # its own builder of an engine, where there is only one
-    size_of, largest = staticmethod(norm), staticmethod(largest)
-    here = property(lambda self: self.size)
+    engine_builder: Callable[[System], Engine] | None = None  # set where there is only one method
+    size_of = staticmethod(norm)
+    largest = staticmethod(largest)
     seed: Any = 0
     side: Any = None  # (layout, parts) of fields on ranks
 
-    def __init__(self, op, rtol=1e-10, maxiter=None):
-        self.given = self.op = op
+    def __init__(self, op: Operator, rtol: float = 1e-10, maxiter: int | None = None) -> None:
+        self.unscaled = op
+        self.op = op
         self.size = op.domain.size
-        self.rtol, self.maxiter = rtol, maxiter
+        self.rtol = rtol
+        self.maxiter = maxiter
         self.exponent = 0
-        known = self.faces is not None and self.faces.within(FAR - 1)
-        exponent = 0 if known else exponent_of(self.norm(False))
-        if abs(exponent) > FAR:
-            self.exponent = int(np.clip(exponent, -1000, 1000))
+        if self.faces is not None and self.faces.within(LARGEST_EXPONENT - 1):
+            return
+        exponent = exponent_of(self.norm(False))
+        if abs(exponent) > LARGEST_EXPONENT:
+            self.exponent = int(np.clip(exponent, -LARGEST_SCALING, LARGEST_SCALING))
             self.op = op * 2.0**-self.exponent
             _check_underflow(op, self.op)
-            for name in ("_magnitudes", "sums", "norms", "faces"):
+            for name in ("_magnitudes", "sums", "norms", "faces"):  # computed for the unscaled operator
                 self.__dict__.pop(name, None)
+
+    @property
+    def local_size(self) -> int:
+        """The number of entries of a field that this process holds."""
+        return self.size
 
     # ------------------------------------------------------------ products
 
-    def product(self, x, transposed=False):
-        """A x or A^T x for the unknowns (x is 0 elsewhere), flat and fresh. Not counted as an application."""
+    def product(self, x: np.ndarray, transposed: bool = False) -> np.ndarray:
+        """Return A x or A^T x for the unknowns as a fresh flat array; x is 0 elsewhere. It is not counted."""
         op = self.op.T if transposed else self.op
         has_matrix = "entries" in self.__dict__ and not isinstance(op.structure, Kronecker)
         structure = op._matrix_structure if has_matrix else op._acting  # a product with the matrix is one pass
-        y = structure.matrix @ x if isinstance(structure, Matrix) else structure.product(x)
+        if isinstance(structure, Matrix):
+            y = structure.matrix @ x
+        else:
+            y = structure.product(x)
         if self.active is not None:
             y[~self.active] = 0.0
         return y
 
-    def structure_of(self, op):
-        """The Structure of an operator on what this process holds."""
+    def structure_of(self, op: Operator) -> Structure:
+        """Return the Structure of an operator on the entries that this process holds."""
         return op.structure
 
-    def applied(self, x):
-        """A x as it was given: not scaled, for all that is not an unknown too."""
-        return self.given._acting.product(x)
+    def applied(self, x: np.ndarray) -> np.ndarray:
+        """Return A x for the unscaled operator, in all rows."""
+        return self.unscaled._acting.product(x)
 
-    def residual(self, x, b, transposed=False):
+    def residual(self, x: np.ndarray, b: np.ndarray, transposed: bool = False) -> tuple[np.ndarray, float, float]:
         """Return b - A x for the unknowns, as a fresh array, its norm, and the norm of x. b is 0 elsewhere."""
         r = self.product(x, transposed)
         size, length = remainder(b, r, x)
         return r, size, length
 
     @cached_property
-    def grid(self):
-        """Grid of the cells that a square operator acts on, lengths divided by powers of two; or None."""
+    def grid(self) -> Grid | None:
+        """The grid of an operator on cells, with its lengths divided by powers of two; else None."""
         grid = self.op.domain.grid or self.op.codomain.grid
         kinds = {space.kind for space in (self.op.domain, self.op.codomain) if space.grid is not None}
-        return _rescaled(grid) if grid is not None and kinds == {"cells"} else None
+        if grid is None or kinds != {"cells"}:
+            return None
+        return _rescaled(grid)
 
     @cached_property
-    def faces(self):
-        """The stencil of all cells, where the operator is one and no entries are needed to see that; else None."""
+    def faces(self) -> Any:
+        """The stencil of an operator that is known to be one without looking at its entries; else None."""
         if self.grid is None or self.grid.dim == 1:
             return None
         from sparsedp.solvers.multigrid.stencil import stencil_without_entries
@@ -104,91 +132,100 @@ class System:
         return stencil_without_entries(self.op, self.grid)
 
     @cached_property
-    def complex(self):
+    def complex(self) -> bool:
         """Whether the entries are complex."""
         return self.op.dtype.kind == "c"
 
     # ------------------------------------------------------------ sizes
 
-    def total(self, numbers):
-        """Sums over all ranks that hold unknowns."""
+    def total(self, numbers: Any) -> Any:
+        """Return sums over all ranks that hold unknowns."""
         return numbers
 
-    def extremes(self, x):
-        """The least and the largest entry."""
+    def extremes(self, x: np.ndarray) -> tuple[float, float]:
+        """Return the least and the largest entry."""
         return np.min(x, initial=np.inf), np.max(x, initial=-np.inf)
 
-    def shaped(self, x, space):
-        """The field of a flat array."""
+    def shaped(self, x: np.ndarray, space: Space) -> Any:
+        """Return the field of a flat array."""
         return x.reshape(space.shape)
 
-    def flat(self, field):
-        """The flat array of a field."""
+    def flat(self, field: Any) -> np.ndarray:
+        """Return the flat array of a field."""
         return field.reshape(-1)
 
-    def whole(self, x):
-        """The flat array of all entries."""
+    def whole(self, x: np.ndarray) -> np.ndarray:
+        """Return the flat array of the entries on all processes."""
         return x
 
-    def number_of_largest(self, x):
-        """Flat number of the entry of largest magnitude."""
+    def number_of_largest(self, x: np.ndarray) -> int:
+        """Return the flat number of the entry of largest magnitude."""
         return int(np.argmax(np.abs(self.shaped(x, self.op.domain))))
 
-    def counts(self, labels, weights, count):
-        """Sums of weights over each label; None: how often it is there."""
+    def counts(self, labels: np.ndarray, weights: np.ndarray | None, count: int) -> np.ndarray:
+        """Return the sums of the weights over the entries of each label; with None, the numbers of entries."""
         return self.total(np.bincount(labels, weights, count))
 
     @cached_property
-    def _magnitudes(self):
-        return tuple(self.structure_of(op).magnitude() for op in (self.op, self.op.T))
+    def _magnitudes(self) -> tuple[Callable[[np.ndarray], np.ndarray], ...]:
+        """Functions that return upper bounds of |A| x and |A^T| x."""
+        return self.structure_of(self.op).magnitude(), self.structure_of(self.op.T).magnitude()
 
     @cached_property
-    def sums(self):
+    def sums(self) -> tuple[np.ndarray, np.ndarray]:
         """Sums of the magnitudes of each row and of each column, or upper bounds of them."""
-        return tuple(self.magnitude(np.ones(self.here), transposed) for transposed in (False, True))
+        ones = np.ones(self.local_size)
+        return self.magnitude(ones), self.magnitude(ones, True)
 
-    def magnitude(self, x, transposed=False):
-        """An upper bound of |A| x for x >= 0."""
+    def magnitude(self, x: np.ndarray, transposed: bool = False) -> np.ndarray:
+        """Return an upper bound of |A| x, or |A^T| x, for x >= 0."""
         return self._magnitudes[transposed](x)
 
-    def norm(self, transposed=False):
-        """|A|_inf (|A^T|_inf), or an upper bound of it."""
+    def norm(self, transposed: bool = False) -> float:
+        """Return |A|_inf, or |A^T|_inf, or an upper bound of it."""
         return self.norms[transposed]
 
     @cached_property
-    def norms(self):
-        """|A|_inf and |A^T|_inf. An engine builder may set them."""
-        return tuple(map(self.largest, self.sums))
+    def norms(self) -> tuple[float, float]:
+        """|A|_inf and |A^T|_inf, or upper bounds. The function that builds an engine may set them."""
+        rows, columns = self.sums
+        return self.largest(rows), self.largest(columns)
 
     # ------------------------------------------------------------ unknowns
 
     @cached_property
-    def active(self):
-        """Boolean array of the unknowns; None when all are.
+    def active(self) -> np.ndarray | None:
+        """The unknowns as a boolean array; None when all are.
 
-        What no row reads (a column without entries: solid cells, coefficients that are 0) is not an
-        unknown: it is 0 in every solution, and its equation is left out.
+        Entries that no row uses (columns without entries: solid cells, coefficients that are 0) are not unknowns: they
+        are 0 in every solution, and their equations are left out.
         """
         if self.faces is not None and self.faces.connected:
             return None
-        read = self.sums[True] > 0
-        return read if self.largest(~read) else None
+        used = self.sums[True] > 0
+        if not self.largest(~used):
+            return None
+        return used
 
     @cached_property
-    def unknowns(self):
-        """Number of unknowns."""
-        return self.size if self.active is None else int(self.total(np.count_nonzero(self.active)))
+    def unknowns(self) -> int:
+        """The number of unknowns."""
+        if self.active is None:
+            return self.size
+        return int(self.total(np.count_nonzero(self.active)))
 
     @cached_property
-    def empty_row(self):
+    def empty_row(self) -> int | None:
         """The first unknown whose row has no entries, or None."""
         if self.faces is not None and self.faces.connected:
             return None
         empty = self.masked(self.sums[False] == 0)
-        return self.number_of_largest(empty) if self.largest(empty) else None
+        if not self.largest(empty):
+            return None
+        return self.number_of_largest(empty)
 
     @cached_property
-    def unused_unknown(self):
+    def unused_unknown(self) -> int | None:
         """The first unknown that no row uses although its own row has entries, or None.
 
         Its equation would be left out of the solve. That is right where a factor of the operator sets the unknown to 0,
@@ -199,26 +236,35 @@ class System:
         unused = ~self.active & (self.sums[False] > 0)
         if self.largest(unused):
             op = Operator(_without_zero_factors(self.op.structure), self.op.domain, self.op.codomain, self.op.name)
-            unused &= self.structure_of(op.T).magnitude()(np.ones(self.here)) == 0
-        return self.number_of_largest(unused.astype(float)) if self.largest(unused) else None
+            unused &= self.structure_of(op.T).magnitude()(np.ones(self.local_size)) == 0
+        if not self.largest(unused):
+            return None
+        return self.number_of_largest(unused.astype(float))
 
     @cached_property
-    def components(self):
-        """(labels, count) of the connected components of the unknowns; labels None: one, everywhere.
+    def components(self) -> tuple[np.ndarray | None, int]:
+        """Labels of the connected components of the unknowns, and their number; labels None: one component everywhere.
 
-        An engine builder that knows them better than the entries do sets them first.
+        The function that builds an engine may set them first, if it knows them without the entries.
         """
-        structure, labels, count = self.op.structure, None, 1
+        structure: Any = self.op.structure
+        labels = None
+        count = 1
         if self.active is None and structure.separable:
             labels, count = structure.components()
         elif structure.has_entries:
-            matrix = self.matrix  # without zeros, and without links to what is not an unknown
+            matrix = self.matrix  # without zeros, and without links to entries that are not unknowns
             links = sp.csr_array((np.ones(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape)
             count, labels = connected_components(links, directed=False)
-        return (None, 1) if count == 1 else (labels, count)
+        if count == 1:
+            return None, 1
+        return labels, count
 
-    def lift(self, b, size):
-        """Powers of two that bring the data of faint components to the size of the whole; None where none is faint."""
+    def lift(self, b: np.ndarray, size: float) -> np.ndarray | None:
+        """Return, for each entry, the power of two that scales the data of a component of small data to those of all.
+
+        None if no component has much smaller data than others. `size` is the norm of b.
+        """
         labels, count = self.components
         if labels is None:
             return None
@@ -229,86 +275,106 @@ class System:
         return np.where(faint, np.frexp(size / np.where(faint, sizes, 1.0))[1], 0)[labels]
 
     @cached_property
-    def null_space(self):
-        """The null vectors of the singular components. An engine builder may set it."""
+    def null_space(self) -> NullSpace:
+        """The null vectors of the singular components. The function that builds an engine may set it."""
         if self.splitting is None:
             return find_null_space(self)
         from sparsedp.solvers.substitution import extended_null_space
 
         return extended_null_space(self)
 
-    def kernel(self, labels, right, left, count):
-        """The NullSpace of these vectors."""
-        return NullSpace(None if not count or np.all(labels == 0) else labels, right, left, count)
+    def kernel(self, labels: np.ndarray, right: np.ndarray, left: np.ndarray, count: int) -> NullSpace:
+        """Return the NullSpace of these vectors."""
+        if not count or np.all(labels == 0):
+            return NullSpace(None, right, left, count)
+        return NullSpace(labels, right, left, count)
 
     # ------------------------------------------------------------ symmetry
 
     @cached_property
-    def volumes(self):
+    def volumes(self) -> np.ndarray:
         """Cell volumes as a flat array, up to a power of two; ones where there is no grid."""
         space = self.op.domain if self.op.domain.grid is not None else self.op.codomain
-        space = space if space.grid is None else getattr(_rescaled(space.grid), space.kind)
+        if space.grid is not None:
+            space = getattr(_rescaled(space.grid), space.kind)
         return space.volumes.reshape(-1)
 
     @cached_property
-    def uniform(self):
+    def uniform(self) -> bool:
         """Whether all volumes are equal."""
         low, high = self.extremes(self.volumes)
         return bool(low >= high)
 
     @cached_property
-    def weights(self):
+    def weights(self) -> Any:
         """Positive w such that diag(w) A is symmetric: 1.0, an array, or None when no such w is known.
 
-        Tried are ones, the cell volumes and their inverses, on two random vectors.
+        Ones, the cell volumes and their inverses are tested with two random vectors.
         """
-        x, y = map(self.masked, np.random.default_rng(self.seed).standard_normal((2, self.here)))
-        ax, ay, size = self.product(x), self.product(y), self.magnitude(np.abs(x))
-        for weights in [1.0] if self.uniform else [1.0, self.volumes, 1.0 / self.volumes]:
-            terms = y @ (weights * ax), x @ (weights * ay), np.abs(y) @ (weights * size)
-            one, other, scale = self.total(np.array(terms))
-            if abs(one - other) <= SYMMETRIC * abs(scale):
+        x, y = np.random.default_rng(self.seed).standard_normal((2, self.local_size))
+        x = self.masked(x)
+        y = self.masked(y)
+        ax = self.product(x)
+        ay = self.product(y)
+        bound = self.magnitude(np.abs(x))
+        candidates: list[Any] = [1.0]
+        if not self.uniform:
+            candidates += [self.volumes, 1.0 / self.volumes]
+        for weights in candidates:
+            terms = np.array([y @ (weights * ax), x @ (weights * ay), np.abs(y) @ (weights * bound)])
+            y_a_x, x_a_y, size = self.total(terms)
+            if abs(y_a_x - x_a_y) <= SYMMETRIC * abs(size):
                 return weights
         return None
 
     @property
-    def symmetric(self):
+    def symmetric(self) -> bool:
         """Whether A is symmetric after scaling its rows by `weights`."""
         return self.weights is not None
 
-    def masked(self, x):
-        """x, 0 on what is not an unknown."""
-        return x if self.active is None else np.where(self.active, x, 0.0)
+    def masked(self, x: np.ndarray) -> np.ndarray:
+        """Return x with zeros where there is no unknown."""
+        if self.active is None:
+            return x
+        return np.where(self.active, x, 0.0)
 
     # ------------------------------------------------------------ entries
 
     @cached_property
-    def entries(self):
-        """The operator as a csr_array with 32-bit indices, as it is."""
+    def entries(self) -> sp.csr_array:
+        """The operator as a csr_array with 32-bit indices, with all rows and columns."""
         return self.op.matrix
 
     @cached_property
-    def diagonal(self):
-        """The diagonal on all unknowns (0 on what is not one), or None when only products are known."""
-        structure = self.op.structure
+    def diagonal(self) -> np.ndarray | None:
+        """The diagonal on all unknowns and 0 elsewhere; None when only products are known."""
+        structure: Any = self.op.structure
         if structure.separable:
             return self.masked(structure.diagonal())
-        return self.masked(self.entries.diagonal()) if structure.has_entries else None
+        if structure.has_entries:
+            return self.masked(self.entries.diagonal())
+        return None
 
     @cached_property
-    def sign(self):
-        """1 or -1: the sign of the diagonal; 0 when it is mixed or not known."""
+    def sign(self) -> int:
+        """The sign of the diagonal, 1 or -1; 0 when it is mixed or not known."""
         if self.diagonal is None or self.complex:
             return 0
-        low, high = self.extremes(self.diagonal if self.active is None else self.diagonal[self.active])
-        return 1 if low > 0 else -1 if high < 0 else 0
+        diagonal = self.diagonal
+        if self.active is not None:
+            diagonal = diagonal[self.active]
+        low, high = self.extremes(diagonal)
+        if low > 0:
+            return 1
+        if high < 0:
+            return -1
+        return 0
 
     @cached_property
-    def matrix(self):
-        """The entries with every row that is not an unknown replaced by one of the identity (scaled).
+    def matrix(self) -> sp.csr_array:
+        """The entries, with a scaled row of the identity in place of each row that is not one of an unknown.
 
-        Square of size `size`, so an engine needs no renumbering: the contract gives it right-hand
-        sides that are 0 there.
+        Square of size `size`, so that an engine needs no renumbering: its right-hand sides are 0 there.
         """
         matrix = self.entries
         if self.active is not None:
@@ -319,39 +385,42 @@ class System:
         return matrix
 
     @cached_property
-    def splitting(self):
+    def splitting(self) -> Splitting | None:
         """The Splitting of a block triangular system; None where substitution finds no unknown.
 
-        In an obstacle that is held at 0, 1 - z L takes values from the fluid beside it and gives none back: such
-        rows cannot be smoothed, and need not be solved.
+        The rows of 1 - z L in an obstacle that is held at 0 use values of the fluid, and no row of the fluid uses
+        theirs: such rows cannot be smoothed, and are found by substitution.
 
         Raises
         ------
         ArithmeticError
             If the matrix is singular because an unknown that substitution should find has no pivot.
         """
-        if self.faces is not None or not self.op.structure.has_entries or self.empty_row is not None:
+        structure: Any = self.op.structure
+        if self.faces is not None or not structure.has_entries or self.empty_row is not None:
             return None
-        if self.op.structure.separable and not self.op.structure.may_be_triangular():
+        if structure.separable and not structure.may_be_triangular():
             return None
         from sparsedp.solvers.substitution import split
 
         return split(self.matrix, self.active)
 
     @cached_property
-    def coupled(self):
+    def coupled(self) -> System:
         """The System of the unknowns that substitution does not find."""
+        assert self.splitting is not None
         keep = Operator(Mask(self.splitting.coupled), self.op.domain, self.op.domain, "mask")
         system = System(self.op @ keep, self.rtol, self.maxiter)
-        system.given, system.splitting = self.given, None  # messages name what was given
+        system.unscaled = self.unscaled  # messages name the whole operator
+        system.splitting = None
         system.unused_unknown = None
         return system
 
     @cached_property
-    def regular_matrix(self):
-        """`matrix` with one unknown of each singular component pinned: it can be factored.
+    def regular_matrix(self) -> sp.csr_array:
+        """`matrix` with one unknown of each singular component pinned, so that it can be factored.
 
-        With compatible data, 0 in place of those at the anchors, it has a solution of the singular system.
+        For data in the range of the operator, set to 0 at these unknowns, its solution is one of the singular system.
         """
         anchors = self.null_space.anchors()
         if not anchors.size:
@@ -362,41 +431,50 @@ class System:
 
     # ------------------------------------------------------------ the test of a solution
 
-    def rounding(self, x, data, transposed=False):
-        """The residual that rounding leaves, row by row: well below the bound with |A|_inf on stretched grids."""
+    def rounding(self, x: np.ndarray, data: float, transposed: bool = False) -> float:
+        """Return the norm of the rounding errors of a residual, row by row.
+
+        On stretched grids this is far below the bound by |A|_inf. `data` is the norm of the right-hand side.
+        """
         return EPS * (self.size_of(self.magnitude(np.abs(x), transposed)) + data)
 
 
-def _without_zero_factors(structure, leftmost=True):
+def _without_zero_factors(structure: Structure, leftmost: bool = True) -> Structure:
     """Replace zeros of diagonal factors by ones, except in the leftmost factor, which removes rows, not unknowns."""
     if isinstance(structure, Chain):
         members = [_without_zero_factors(member, False) for member in structure.members]
         return Chain([structure.members[0], *members[1:]] if leftmost else members)
     if isinstance(structure, Sum):
-        members = [m if isinstance(m, Diagonal) else _without_zero_factors(m, leftmost) for m in structure.members]
+        # A diagonal among the summands is no factor: its zeros set nothing to 0.
+        members = [m for m in structure.members if isinstance(m, Diagonal)]
+        members += [_without_zero_factors(m, leftmost) for m in structure.members if not isinstance(m, Diagonal)]
         return Sum(members)
     if isinstance(structure, Diagonal) and not leftmost:
         return Diagonal(np.where(structure.values == 0, 1.0, structure.values))
     return structure
 
 
-def _check_underflow(op, scaled):
-    """Entries that vanish when the largest is scaled to 1 are too far apart for one solve."""
-    before, after = op.structure, scaled.structure
-    if isinstance(before, Matrix) and np.count_nonzero(before.matrix.data) != np.count_nonzero(after.matrix.data):
+def _check_underflow(op: Operator, scaled: Operator) -> None:
+    """Refuse entries that vanish when the largest is scaled to 1: they are too far apart for one solve."""
+    if not isinstance(op.structure, Matrix) or not isinstance(scaled.structure, Matrix):
+        return
+    if np.count_nonzero(op.structure.matrix.data) != np.count_nonzero(scaled.structure.matrix.data):
         raise NonFiniteError(f"the entries of {op} span more than 1e308; rescale its rows or columns")
 
 
-def _rescaled(grid):
-    """The grid with its lengths divided by powers of two, so that volumes are near 1, and so are their squares."""
+def _rescaled(grid: Grid) -> Grid:
+    """Divide the lengths of a grid by powers of two, so that volumes and their squares are near 1."""
     widths = [np.ldexp(h, -exponent_of(np.max(h, initial=0.0))) for h in grid.widths]
     return Grid(grid.shape, spacing=widths, periodic=grid.periodic)
 
 
-def _pinned(matrix, flags):
-    """Matrix -> copy whose flagged rows and columns are those of the identity, scaled to its entries."""
-    keep, size = sp.diags_array(np.where(flags, 0.0, 1.0)), matrix.diagonal()[~flags]
-    largest = size[np.argmax(np.abs(size))] if size.size and np.any(size) else 1.0
-    result = sp.csr_array(keep @ matrix @ keep + sp.diags_array(np.where(flags, largest, 0.0)))
+def _pinned(matrix: sp.csr_array, flags: np.ndarray) -> sp.csr_array:
+    """Return a copy whose flagged rows and columns are those of the identity, scaled to the other diagonal entries."""
+    keep = sp.diags_array(np.where(flags, 0.0, 1.0))
+    diagonal = matrix.diagonal()[~flags]
+    scale = 1.0
+    if np.any(diagonal):
+        scale = diagonal[np.argmax(np.abs(diagonal))]
+    result = sp.csr_array(keep @ matrix @ keep + sp.diags_array(np.where(flags, scale, 0.0)))
     result.eliminate_zeros()
     return result

@@ -144,7 +144,7 @@ def test_an_inexact_method_is_refined():
     x = inv(np.ones(101))
     assert engine.calls == 4 and inv.info.forward.iterations == 12  # 1e-3, 1e-6, 1e-9, 1e-12
     assert inv.info.forward.residual <= 1e-10
-    assert np.linalg.norm(1.0 - inv.solver.system.given(x)) <= 1e-10 * np.sqrt(101)
+    assert np.linalg.norm(1.0 - inv.solver.system.unscaled(x)) <= 1e-10 * np.sqrt(101)
 
 
 @pytest.mark.parametrize("error, status", [(0.7, "stagnated"), (np.nan, "nonfinite_output")])

@@ -130,7 +130,7 @@ SET_UP = [
     Case(
         lambda: dp.inverse(dp.from_functions(lambda u: 2 * u, lambda u: 2 * u, 5, 5, name="double"), "multigrid"),
         ValueError,
-        match="multigrid needs the entries, <double: space(5) -> space(5), matrix-free> only knows its products; "
+        match="multigrid needs the entries, <double: space(5) -> space(5), matrix-free> has only products; "
         "write method='krylov'",
     ),
     Case(

@@ -363,7 +363,7 @@ def test_a_large_coarsest_level_is_refused():
     op = -dp.laplacian(dp.Grid((60, 60)), dp.dirichlet)
     with pytest.raises(
         ConvergenceError,
-        match="multigrid on <-laplacian: .*> ends at a coarsest level of 3600 unknowns, after 1 of 1 levels; it may "
+        match="multigrid on <-laplacian: .*> ends at a level of 3600 unknowns, after 1 of 1 levels; it may "
         "have 2000; write method='direct' or 'krylov', or raise levels",
     ):
         dp.inverse(op, "multigrid", levels=1)

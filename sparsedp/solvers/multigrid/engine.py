@@ -82,7 +82,7 @@ def structured_engine(system: System, *, precision: str = "auto") -> Structured:
             method = "multigrid"
         else:
             method = "direct"
-        message = f"structured cannot solve {system.given}: {reason}; write method={method!r}"
+        message = f"structured cannot solve {system.unscaled}: {reason}; write method={method!r}"
         raise ValueError(message) from None
 
 
