@@ -74,7 +74,8 @@ def drawn(request):
 
 def pytest_terminal_summary(terminalreporter):
     """Print the totals of a campaign of random scenes: scenes, comparisons, and refusals by reason."""
-    total, reasons = Counter(), Counter()
+    total = Counter()
+    reasons = Counter()
     for report in terminalreporter.getreports("passed"):
         for name, tally in report.user_properties:
             if name == "campaign" and report.when == "call":

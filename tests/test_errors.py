@@ -9,9 +9,14 @@ import pytest
 import sparsedp as dp
 from sparsedp.autodiff.derivative import value_and_grad
 
-LINE, BOX, RING = dp.Grid(3), dp.Grid((2, 2)), dp.Grid(3, periodic=True)
-SHAPE, TYPE, VALUE = dp.errors.ShapeError, TypeError, ValueError
-FINITE, DERIVATIVE = dp.errors.NonFiniteError, dp.errors.DerivativeError
+LINE = dp.Grid(3)
+BOX = dp.Grid((2, 2))
+RING = dp.Grid(3, periodic=True)
+SHAPE = dp.errors.ShapeError
+TYPE = TypeError
+VALUE = ValueError
+FINITE = dp.errors.NonFiniteError
+DERIVATIVE = dp.errors.DerivativeError
 
 
 def traced(use):

@@ -9,9 +9,12 @@ import pytest
 import sparsedp as dp
 
 GRID = dp.Grid((4, 3))
-U, V = np.ones((4, 3)), np.ones(GRID.faces.size)
+U = np.ones((4, 3))
+V = np.ones(GRID.faces.size)
 MASKED = np.ma.masked_array(U, mask=np.eye(4, 3, dtype=bool))
-SHAPE, TYPE, VALUE = dp.errors.ShapeError, TypeError, ValueError
+SHAPE = dp.errors.ShapeError
+TYPE = TypeError
+VALUE = ValueError
 LAP = -dp.laplacian(GRID, dp.dirichlet)
 SOLVE = dp.elliptic_solver(dp.divergence(GRID), dp.gradient(GRID, dp.dirichlet))
 BUILDERS = {

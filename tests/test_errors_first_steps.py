@@ -11,7 +11,8 @@ from sparsedp.errors import ShapeError
 
 GRID = dp.Grid((3, 2))
 SIDES = {"x": dp.dirichlet, "y": dp.robin(1.0, 0.5)}
-LIFT, SOLVE = dp.lift(GRID, SIDES), dp.elliptic_solver(dp.divergence(GRID), dp.gradient(GRID, dp.dirichlet))
+LIFT = dp.lift(GRID, SIDES)
+SOLVE = dp.elliptic_solver(dp.divergence(GRID), dp.gradient(GRID, dp.dirichlet))
 MINIMUM = dp.minimize(lambda x: (x - 1.0) ** 2, 0.0)
 LAYERS = {"first": dp.network.dense_weights(np.random.default_rng(0), 2, 3)}
 RNG = np.random.default_rng(0)

@@ -8,9 +8,13 @@ import pytest
 
 import sparsedp as dp
 
-LINE, BOX = dp.Grid(4), dp.Grid((4, 4))
+LINE = dp.Grid(4)
+BOX = dp.Grid((4, 4))
 RATES = (lambda v, c: v), (lambda p, c: p)
-SHAPE, UNSTABLE, VALUE, TYPE = dp.errors.ShapeError, dp.errors.UnstableStepError, ValueError, TypeError
+SHAPE = dp.errors.ShapeError
+UNSTABLE = dp.errors.UnstableStepError
+VALUE = ValueError
+TYPE = TypeError
 
 
 def carry(u, params, axis):

@@ -119,7 +119,8 @@ def test_implicit_or_unrolled():
     table = {(label, int(n)): tuple(map(float, figures)) for label, n, *figures in rows}
     assert len(table) == 10
     for n in (48, 96):
-        taped, cut = table["CG, 200 iterations unrolled", n], table["CG, 20 iterations unrolled", n]
+        taped = table["CG, 200 iterations unrolled", n]
+        cut = table["CG, 20 iterations unrolled", n]
         for label in ("CG, implicit", "multigrid, implicit", "chosen by itself, implicit"):
             assert table[label, n][1] <= taped[1] / 20 and table[label, n][2] <= 1e-10
         for label in ("multigrid, implicit", "chosen by itself, implicit"):

@@ -14,7 +14,8 @@ import sparsedp as dp
 
 from extremes import KINDS, agree, same_bits  # isort: skip
 
-NONFINITE, SHAPE = dp.errors.NonFiniteError, dp.errors.ShapeError
+NONFINITE = dp.errors.NonFiniteError
+SHAPE = dp.errors.ShapeError
 
 
 class Piece(NamedTuple):
@@ -99,7 +100,9 @@ def tensor(grid):
 
 def waves(damped=False, memory=None):
     def make(grid):
-        D, G, inside = dp.divergence(grid), dp.gradient(grid), dp.interior(grid)
+        D = dp.divergence(grid)
+        G = dp.gradient(grid)
+        inside = dp.interior(grid)
         damping = dp.sponge(grid, min(grid.shape, default=0) and 1, 1.0) if damped else None
         rates = (lambda v, c: -c * D(v)), (lambda p, c: -inside(G(p)))
         step = dp.stepper("leapfrog", rates, 0.1, damping=damping)
@@ -110,7 +113,8 @@ def waves(damped=False, memory=None):
 
 def law(scheme, speed):
     def make(grid):
-        flux, source = (lambda u, p, axis: u**2 / 2), (lambda u, p: -p * u)
+        flux = lambda u, p, axis: u**2 / 2
+        source = lambda u, p: -p * u
         return dp.conservation_law(grid, flux, speed, scheme=scheme, source=source)
 
     return make
@@ -148,7 +152,9 @@ SHAPES = [(0,), (0, 3), (1,), (1, 1), (1, 7), (7, 1), (2, 2), (7, 5), (1, 1, 1),
 
 def scene(name, shape=(5, 4), periodic=False):
     """A piece on a grid, and its arguments."""
-    piece, grid, rng = PIECES[name], dp.Grid(shape, periodic=periodic), np.random.default_rng(5)
+    piece = PIECES[name]
+    grid = dp.Grid(shape, periodic=periodic)
+    rng = np.random.default_rng(5)
     values = {"c": lambda: 0.2 + rng.random(shape), "f": lambda: 0.1 * rng.normal(size=grid.faces.size)}
     values["k"] = lambda: 0.2 + rng.random(grid.faces.size)
     return piece.make(grid), [values[letter]() for letter in piece.args]
@@ -167,7 +173,8 @@ def test_every_size_has_its_gradient(name, shape, periodic):
     """No cells, one cell, lines, primes: the gradient is the slope of the value."""
     run, args = scene(name, shape, periodic)
     for number, x in enumerate(args):
-        loss, t = alone(run, args, number), np.cos(np.arange(x.size)).reshape(x.shape)
+        loss = alone(run, args, number)
+        t = np.cos(np.arange(x.size)).reshape(x.shape)
         slope = dp.grad(loss)(x)
         assert slope.shape == x.shape and np.all(np.isfinite(slope))
         wanted = (loss(x + 1e-5 * t) - loss(x - 1e-5 * t)) / 2e-5
@@ -271,7 +278,8 @@ def test_wrong_shapes_and_masks(name):
 # ---- numbers that settle a piece -----------------------------------------------------------------------------------
 
 GRID = dp.Grid((3, 4))
-U, V = np.ones((3, 4)), np.zeros(GRID.faces.size)
+U = np.ones((3, 4))
+V = np.zeros(GRID.faces.size)
 TRANSPORT = dp.conservation_law(GRID, lambda u, p, axis: u, lambda u, p, axis: abs(u), inflow=1e300, boundary=dp.inflow)
 ON = dp.forces(GRID, cells=np.ones((3, 4), bool))
 SPLIT = lambda **options: dp.minimize(lambda x: anp.sum(x**2), U, method="admm", weight=0.1, maxiter=1, **options)
@@ -318,7 +326,8 @@ def test_a_rate_beyond_the_range_of_floats():
 def test_a_batch_of_flows_is_a_flow_each():
     """The Courant number of each counts; the first state has the form of the next."""
     grid = dp.Grid((4, 3), size=1.0)
-    step, v = dp.flow_step(grid, 0.02, 0.01), 0.3 * np.random.default_rng(3).normal(size=(2, grid.faces.size))
+    step = dp.flow_step(grid, 0.02, 0.01)
+    v = 0.3 * np.random.default_rng(3).normal(size=(2, grid.faces.size))
     ends = dp.rollout(step, step.start(v), None, 3)
     for number, one in enumerate(v):
         wanted = dp.rollout(step, step.start(one), None, 3)
@@ -337,12 +346,17 @@ def test_a_batch_of_flows_is_a_flow_each():
 @pytest.mark.parametrize("left", [0, 1, None])
 def test_solids_everywhere(shape, periodic, left):
     """So many cells are left open: values and gradients stay finite, and where nothing is open nothing happens."""
-    grid, rng = dp.Grid(shape, periodic=periodic), np.random.default_rng(2)
+    grid = dp.Grid(shape, periodic=periodic)
+    rng = np.random.default_rng(2)
     solid = np.arange(np.prod(shape)).reshape(shape) >= (np.prod(shape) if left is None else left)
-    u, v = 1.0 + rng.random(shape), 0.1 * rng.normal(size=grid.faces.size)
-    D, L = dp.divergence(grid), dp.laplacian(grid, solid=solid)
+    u = 1.0 + rng.random(shape)
+    v = 0.1 * rng.normal(size=grid.faces.size)
+    D = dp.divergence(grid)
+    L = dp.laplacian(grid, solid=solid)
     solve = dp.elliptic_solver(D, dp.gradient(grid, solid=solid))
-    on, tv, box = dp.forces(grid, solid), dp.total_variation(grid, 0.1, solid), dp.flux(grid, solid)
+    on = dp.forces(grid, solid)
+    tv = dp.total_variation(grid, 0.1, solid)
+    box = dp.flux(grid, solid)
     step = dp.flow_step(grid, 0.01, 0.1, solid=solid, friction=lambda p: p, scalars={"heat": {"diffusivity": 0.1}})
 
     def flow(v, u):
@@ -367,8 +381,10 @@ def test_solids_everywhere(shape, periodic, left):
 @pytest.mark.parametrize("turn", [1.0, 1j, -1.0, -1.0 - 0.1j])
 def test_coefficients_over_eight_decades(turn):
     """A field as shift, real, complex, and of waves: backward error of LU."""
-    grid, rng = dp.Grid((8, 7)), np.random.default_rng(4)
-    D, G = dp.divergence(grid), dp.gradient(grid, dp.dirichlet)
+    grid = dp.Grid((8, 7))
+    rng = np.random.default_rng(4)
+    D = dp.divergence(grid)
+    G = dp.gradient(grid, dp.dirichlet)
     k, shift = (10.0 ** rng.uniform(-4, 4, shape) for shape in (grid.faces.size, grid.shape))
     b = rng.normal(size=grid.shape)
     x = dp.elliptic_solver(D, G)(k, b, turn * shift).ravel()

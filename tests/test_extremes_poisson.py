@@ -14,12 +14,15 @@ from extremes import (  # isort: skip
 
 import sparsedp as dp
 
-INCOMPATIBLE, NONFINITE, SHAPE = dp.errors.IncompatibleError, dp.errors.NonFiniteError, dp.errors.ShapeError
+INCOMPATIBLE = dp.errors.IncompatibleError
+NONFINITE = dp.errors.NonFiniteError
+SHAPE = dp.errors.ShapeError
 
 
 def solved(matrix, b):
     """Dense solve, refined with residuals in long double: right digits for condition numbers up to 1e14."""
-    inverse, x = np.linalg.inv(matrix), np.zeros(b.shape, dtype=np.longdouble)
+    inverse = np.linalg.inv(matrix)
+    x = np.zeros(b.shape, dtype=np.longdouble)
     for _ in range(8):
         x = x + inverse @ (b - matrix.astype(np.longdouble) @ x).astype(float)
     return x.astype(float)
@@ -27,7 +30,8 @@ def solved(matrix, b):
 
 def regular(op):
     """(matrix, projection of data). Singular pure Neumann problems get the mean added, which makes them regular."""
-    matrix, w = dense(op), op.domain.volumes.ravel()
+    matrix = dense(op)
+    w = op.domain.volumes.ravel()
     if np.max(np.abs(matrix.sum(axis=1)) / np.abs(matrix).sum(axis=1)) > 1e-10:
         return matrix, np.eye(w.size)
     mean = np.broadcast_to(w / w.sum(), matrix.shape)
@@ -77,7 +81,8 @@ def test_rhs_zero_is_not_solved(scene, method, zero):
 def test_parameters_that_are_not_finite_or_negative(method, bad):
     grid = stretched(9, 8)
     solve = elliptic(dp.divergence(grid), dp.gradient(grid, dp.dirichlet), method)
-    k, b = np.ones(grid.faces.size), np.ones(grid.shape)
+    k = np.ones(grid.faces.size)
+    b = np.ones(grid.shape)
     k[[17, 23]] = bad
     slope = dp.value_and_grad(lambda k: anp.sum(solve(k, b)))
     for call in (lambda k: solve(k, b), slope):
@@ -100,7 +105,9 @@ def test_parameters_that_are_not_finite_or_negative(method, bad):
 def test_neumann_defect(method, defect, rng):
     """Rounding passes, a small defect is recorded, a large one refused; the adjoint is projected in any case."""
     op = SCENES["neumann"]()
-    inv, inverse, w = solver(op, method), exact(op), op.domain.volumes
+    inv = solver(op, method)
+    inverse = exact(op)
+    w = op.domain.volumes
     b, g = data(op, rng)
     b -= np.sum(w * b) / np.sum(w)
     b += defect * np.linalg.norm(b) * w / np.linalg.norm(w)
@@ -124,8 +131,11 @@ def test_neumann_defect(method, defect, rng):
 def test_cotangents_of_singular_solves_are_projected(method, rng):
     """Data that are compatible, nullspace="raise", and a cotangent that is not."""
     grid = stretched(12, 11)
-    D, G, inside = dp.divergence(grid), dp.gradient(grid), dp.interior(grid)
-    inv, inverse = solver(-D @ G, method), exact(-D @ G)
+    D = dp.divergence(grid)
+    G = dp.gradient(grid)
+    inside = dp.interior(grid)
+    inv = solver(-D @ G, method)
+    inverse = exact(-D @ G)
     v = rng.standard_normal(grid.faces.size)
     slope = dp.value_and_grad(lambda v: anp.sum(inv(inv(D(inside(v))))))(v)[1]
     agree(slope, (inverse @ inverse @ dense(D) @ dense(inside)).T @ np.ones(grid.cells.size))
@@ -139,10 +149,12 @@ def test_isolated_regions_and_islands(method, count, rng):
     solid = regions(count)
     grid = stretched(*solid.shape)
     op = neumann(grid, solid)
-    inv, inverse = solver(op, method, nullspace="project"), exact(op)
+    inv = solver(op, method, nullspace="project")
+    inverse = exact(op)
     b, g = data(op, rng)
     check_all(inv, inverse, b, g)
-    x, w = inv(b), grid.volumes
+    x = inv(b)
+    w = grid.volumes
     blocks = [np.s_[3 * n : 3 * n + 2, :2] for n in range(count)]
     for block in blocks:
         assert abs(np.sum((w * x)[block])) <= 1e-13 * np.sum((w * np.abs(x))[block])
@@ -160,8 +172,10 @@ def test_isolated_regions_and_islands(method, count, rng):
 def test_all_cells_solid(method, boundary):
     grid = stretched(4, 3)
     op = -dp.laplacian(grid, boundary, np.ones(grid.shape, dtype=bool))
-    zeros, ones = np.zeros(grid.shape), np.ones(grid.shape)
-    inv, lenient = solver(op, method), solver(op, method, nullspace="project")
+    zeros = np.zeros(grid.shape)
+    ones = np.ones(grid.shape)
+    inv = solver(op, method)
+    lenient = solver(op, method, nullspace="project")
     for x in (inv(zeros), inv.T(ones), lenient(ones), slope_of(lenient, ones, ones), slope_of(inv, zeros, ones)):
         same_bits(x, zeros)
     with pytest.raises(INCOMPATIBLE, match=r"must be 0 where there is no unknown .*, but is not in cell \(0, 0\)"):
@@ -198,7 +212,8 @@ def test_coefficients_that_jump(name, boundary, method, rng):
     results = inv(b), inv.T(g), slope_of(inv, b, g)
     for record in (inv.info.forward, inv.info.adjoint):
         assert record.status.startswith("converged") and record.backward_error <= 1e-12
-    x, y = solved(matrix, projection @ b.ravel()), solved(matrix.T, projection.T @ g.ravel())
+    x = solved(matrix, projection @ b.ravel())
+    y = solved(matrix.T, projection.T @ g.ravel())
     z = y + solved(matrix.T, projection.T @ x)
     for got, wanted in zip(results, (x, y, z)):
         agree(got.ravel(), wanted, rel=3e-6)
@@ -222,7 +237,8 @@ def test_anisotropy_and_aspect(name, boundary, method, rng):
     options = OPTIONS.get(method, {})
     inv = solver(op, method, nullspace="project", **options)
     (matrix, projection), (b, g) = regular(op), data(op, rng)
-    x, y = solved(matrix, projection @ b.ravel()), solved(matrix.T, projection.T @ g.ravel())
+    x = solved(matrix, projection @ b.ravel())
+    y = solved(matrix.T, projection.T @ g.ravel())
     agree(inv(b).ravel(), x, rel=1e-5)
     agree(inv.T(g).ravel(), y, rel=1e-5)
     for record in (inv.info.forward, inv.info.adjoint):

@@ -21,7 +21,9 @@ import sparsedp as dp
 from sparsedp._utils.validation import place
 from sparsedp.autodiff.derivative import pullback
 
-NONFINITE, SHAPE, DERIVATIVE = dp.errors.NonFiniteError, dp.errors.ShapeError, dp.errors.DerivativeError
+NONFINITE = dp.errors.NonFiniteError
+SHAPE = dp.errors.ShapeError
+DERIVATIVE = dp.errors.DerivativeError
 
 HARD = {name: (grid, coefficient(name, grid)) for name in COEFFICIENTS for grid in [dp.Grid((16, 14))]}
 for name, spacing in {"flat cells": (1.0, 1e-4), "high cells": (1e-4, 1.0)}.items():
@@ -73,7 +75,8 @@ def test_field_not_finite(column, method, bad, rng):
     x.flat[at] = g.flat[at] = bad
     with np.errstate(invalid="ignore"):
         wrong = ~np.isfinite(reaches(x))
-        count, first = np.count_nonzero(wrong), place(np.argmax(wrong), wrong.shape)
+        count = np.count_nonzero(wrong)
+        first = place(np.argmax(wrong), wrong.shape)
         words = re.escape(f"got {count} that are NaN or infinite, the first at {first}")
         for call in (run, dp.value_and_grad(lambda x: anp.sum(run(x)))):
             with pytest.raises(NONFINITE, match=rf"^(inverse|elliptic_solver).* numbers, {words}$"):
@@ -110,7 +113,8 @@ def test_kinds_of_arrays(column, method, kind, rng):
     check_kind(run, x)
     check_gradient_of_kind(lambda x: anp.sum(run(x) ** 2), x)
     g = KINDS[kind](rng.standard_normal(shape))
-    before, wanted = g.copy(), pull(run, np.ones(shape), g.astype(float))
+    before = g.copy()
+    wanted = pull(run, np.ones(shape), g.astype(float))
     agree(pull(run, np.ones(shape), g), wanted, 2e-6 * (kind == "float32"))
     assert np.array_equal(g, before)
 
@@ -154,7 +158,9 @@ def test_projection_everywhere(method, where, rng):
 def test_projection_of_a_flow_through_the_walls(method, defect, rng):
     """Without closed walls the divergence has a mean: it is taken out and recorded, and never refused."""
     grid = stretched(12, 11)
-    G, D, w = dp.gradient(grid), dp.divergence(grid), grid.volumes
+    G = dp.gradient(grid)
+    D = dp.divergence(grid)
+    w = grid.volumes
     pressure = solver(-D @ G, method, nullspace="project")
     v, g = rng.standard_normal((2, grid.faces.size)) * dp.interior(grid)(np.ones(grid.faces.size))
     size = np.linalg.norm(w) * np.linalg.norm(D(v)) / np.sum(w)
@@ -176,7 +182,8 @@ def test_projection_with_jumps_and_flat_cells(method, name, rng):
     flat = name not in COEFFICIENTS
     column = projection(method, grid, None, k, rtol=1e-10 if flat else 1e-13, **OPTIONS.get(method, {}))
     v, g = rng.standard_normal((2, *column.shape))
-    u, y = column.run(v), pull(column.run, v, g)
+    u = column.run(v)
+    y = pull(column.run, v, g)
     for record in (column.infos[0].forward, column.infos[0].adjoint):
         assert record.backward_error <= (1e-10 if flat else 1e-12)
         assert record.iterations <= (30 if flat and method != "krylov" else 5000)
@@ -188,13 +195,18 @@ def test_projection_with_jumps_and_flat_cells(method, name, rng):
 
 def check_rollout(grid, method, k, shift, rng, boundary=dp.neumann, solid=None, rel=1e-7):
     """Loss of three steps and its gradient in (u, k, shift), against autograd through dense solves."""
-    D, G = dp.divergence(grid), dp.gradient(grid, boundary, solid)
+    D = dp.divergence(grid)
+    G = dp.gradient(grid, boundary, solid)
     solve = elliptic(D, G, method, **OPTIONS.get(method, {}))
-    d, gr, n = dense(D), dense(G), grid.cells.size
+    d = dense(D)
+    gr = dense(G)
+    n = grid.cells.size
     u, w = rng.standard_normal((2, *grid.shape))
 
     def reference(x):
-        state, k, shift = anp.reshape(x[0], n), x[1], x[2]
+        state = anp.reshape(x[0], n)
+        k = x[1]
+        shift = x[2]
         for _ in range(3):
             state = anp.linalg.solve(shift * np.eye(n) - anp.dot(d * k, gr), shift * state)
         return anp.sum(w.ravel() * state) + anp.sum(state**2)
@@ -244,9 +256,11 @@ def test_rollout_everywhere(method, where, rng):
 def test_rollout_at_velocity_zero(method, rng):
     """Central advection of a state: at rest it is the diffusion alone, and the gradient in v is not 0."""
     grid = stretched(12, 11)
-    D, A = dp.divergence(grid), dp.average(grid)
+    D = dp.divergence(grid)
+    A = dp.average(grid)
     op = dp.identity(grid.cells) - 0.3 * dp.laplacian(grid)
-    inv, rest = solver(op, method), np.zeros(grid.faces.size)
+    inv = solver(op, method)
+    rest = np.zeros(grid.faces.size)
     u, w = rng.standard_normal((2, *grid.shape))
 
     def run(v, inv, D, A, u):
@@ -288,7 +302,8 @@ def test_parameters_of_a_rollout(method, rng):
     """NaN, overflow on the way, negative numbers, whole numbers, single precision, shapes."""
     grid = stretched(9, 8)
     solve = elliptic(dp.divergence(grid), dp.gradient(grid, dp.dirichlet), method)
-    u, k = rng.standard_normal(grid.shape), np.round(1.0 + speeds(grid))
+    u = rng.standard_normal(grid.shape)
+    k = np.round(1.0 + speeds(grid))
     slope = dp.value_and_grad(lambda x: anp.sum(march(solve, *x) ** 2))
     wrong = np.where(np.arange(k.size) % 13 == 4, np.nan, k)
     for bad, shift, error, words in (

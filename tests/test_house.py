@@ -115,7 +115,8 @@ def room(name):
 
 def may_import(importer, target):
     """Whether a module may import another module of the package, both by dotted name."""
-    here, there = room(importer), room(target)
+    here = room(importer)
+    there = room(target)
     if here in ROOF or here == there:
         return True
     if there in ROOF:
@@ -173,7 +174,9 @@ def test_no_import_cycles():
 @pytest.mark.parametrize("name", CLOSURES)
 def test_importing_one_thing_does_not_load_everything(name):
     """Counted are the files of our own at the top of whose importers they stand."""
-    files, found, waiting = {m.name: m for m in modules()}, set(), [f"sparsedp.{name}"]
+    files = {m.name: m for m in modules()}
+    found = set()
+    waiting = [f"sparsedp.{name}"]
     while waiting:
         module = waiting.pop()
         if module in files and module not in found:

@@ -115,7 +115,8 @@ def pages(site):
 def dead_links(site):
     """Links of all pages that lead to no file, to no place in it, or to another site; and how many were followed."""
     read = functools.cache(Page)
-    dead, followed = set(), 0
+    dead = set()
+    followed = 0
     for path in pages(site):
         for link in read(path).links:
             parts = urlsplit(link)
@@ -178,7 +179,8 @@ def browser():
 
 def opened(browser, width):
     """A page of the browser, and the list that its errors, and what it asks of the network, go to."""
-    tab, wrong = browser.new_page(viewport=dict(zip(("width", "height"), WIDTHS[width]))), []
+    tab = browser.new_page(viewport=dict(zip(("width", "height"), WIDTHS[width])))
+    wrong = []
     tab.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
     tab.on("pageerror", lambda error: wrong.append(str(error)))
     tab.on("requestfailed", lambda request: wrong.append(f"failed {request.url}"))
@@ -245,7 +247,8 @@ def test_the_report_in_a_browser(tmp_path, browser, width):
     assert not tab.locator("details li").first.is_visible()
     tab.locator("summary").first.click()
     assert tab.locator("details li").first.is_visible()
-    head, column = tab.locator("th").first, tab.locator("table").first.locator("td:first-child")
+    head = tab.locator("th").first
+    column = tab.locator("table").first.locator("td:first-child")
     head.click()
     rising = list(map(float, column.all_inner_texts()))
     head.press("Enter")

@@ -89,7 +89,8 @@ def terrain(path):
 
 def run_demo(arguments, folder):
     """The demo as the page calls it, but small and into a folder of its own."""
-    kept, options = [], iter(arguments)
+    kept = []
+    options = iter(arguments)
     for word in options:
         if word in ("--size", "--out"):
             next(options)

@@ -9,8 +9,11 @@ from sparsedp.autodiff.derivative import pullback, pushforward, value_and_grad
 from sparsedp.operators.structure.base import Structure, compact
 
 LINE = dp.Grid(3)
-SHAPE, TYPE, VALUE = dp.errors.ShapeError, TypeError, ValueError
-FINITE, DERIVATIVE = dp.errors.NonFiniteError, dp.errors.DerivativeError
+SHAPE = dp.errors.ShapeError
+TYPE = TypeError
+VALUE = ValueError
+FINITE = dp.errors.NonFiniteError
+DERIVATIVE = dp.errors.DerivativeError
 
 
 def wrong(pulled):
@@ -28,7 +31,8 @@ class Mute(Structure):
 class Crowd:
     """As many entries as no 32-bit index can count."""
 
-    nnz, shape = 2**31, (3, 3)
+    nnz = 2**31
+    shape = (3, 3)
 
 
 MUTE = dp.Operator(Mute(), LINE.cells, LINE.cells, "mute", "matrix-free")

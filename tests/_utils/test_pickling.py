@@ -70,9 +70,12 @@ def test_same_bits_in_a_fresh_process(tmp_path):
 
 def test_twins_are_apart_from_what_the_caller_writes(rng):
     """A recipe holds copies: what is made again is what was made."""
-    solid, boundary = travellers.SOLID.copy(), {"x": (dp.no_slip, dp.outflow)}
-    grid, v = travellers.GRID, rng.standard_normal(travellers.GRID.faces.size)
-    convect, P = dp.convection(grid, boundary, solid), dp.projection(grid, solid, boundary)
+    solid = travellers.SOLID.copy()
+    boundary = {"x": (dp.no_slip, dp.outflow)}
+    grid = travellers.GRID
+    v = rng.standard_normal(travellers.GRID.faces.size)
+    convect = dp.convection(grid, boundary, solid)
+    P = dp.projection(grid, solid, boundary)
     step = dp.flow_step(grid, 0.01, boundary=boundary, solid=solid)
     wanted = convect(v, v), P(v), step(step.start(v))["v"]
     solid[:], boundary["x"] = False, dp.free_slip

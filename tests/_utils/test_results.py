@@ -50,7 +50,8 @@ def test_the_memory_of_a_result_that_is_gone_serves_again():
 def test_what_somebody_sees_is_never_handed_out(hold):
     first = results.empty(SHAPE, float)
     first[:] = 7.0
-    where, seen = first.ctypes.data, hold(first)
+    where = first.ctypes.data
+    seen = hold(first)
     del first
     gc.collect(1)  # what is new; a whole one looks at all that the tests before have left
     others = [results.empty(SHAPE, float) for _ in range(3)]

@@ -51,7 +51,8 @@ def hurried():
 
 def at_once(work, times):
     """work(0) ... work(3), each by a thread of its own, several times -> for each thread its results."""
-    begin, found = Barrier(FOUR), [[] for _ in range(FOUR)]
+    begin = Barrier(FOUR)
+    found = [[] for _ in range(FOUR)]
 
     def act(number):
         begin.wait()
@@ -95,7 +96,8 @@ def through(op):
     """An Operator -> work: its values, those of its transpose, and a gradient."""
 
     def work(number):
-        u, g = numbers(number, op.domain.shape), numbers(number + 9, op.codomain.shape)
+        u = numbers(number, op.domain.shape)
+        g = numbers(number + 9, op.codomain.shape)
         return op(u), op.T(g), slope(lambda u: np.sum(np.abs(op(u)) ** 3), u)
 
     return work
@@ -138,7 +140,8 @@ def wind(grid):
     return heat(grid) + 0.3 * dp.upwind(grid, 0, 1, dp.dirichlet)
 
 
-PLANE, ROOM = dp.Grid((16, 17), size=1.0), dp.Grid((8, 7, 9), size=1.0)
+PLANE = dp.Grid((16, 17), size=1.0)
+ROOM = dp.Grid((8, 7, 9), size=1.0)
 OPERATORS = {
     "dense": ("direct", lambda: wind(dp.Grid((8, 8), size=1.0))),
     "dense and complex": ("direct", lambda: dp.from_matrix(wind(dp.Grid(40)).matrix * (1 + 2j))),
@@ -186,7 +189,8 @@ def test_matrix_solver(check):
     def make():
         matrix = wind(dp.Grid((7, 7), size=1.0)).matrix
         solve = dp.matrix_solver(matrix)
-        data, b = matrix.data, numbers(1, matrix.shape[0])
+        data = matrix.data
+        b = numbers(1, matrix.shape[0])
         return lambda number: slope(lambda data: np.sum(solve(data, b) ** 2), data * (1 + 0.01 * number))
 
     check(make)
@@ -194,7 +198,8 @@ def test_matrix_solver(check):
 
 @pytest.mark.parametrize("cells", [5, 40, 300])
 def test_implicit(check, cells):
-    L, b = dp.laplacian(dp.Grid(cells, size=1.0), dp.dirichlet), np.ones(cells)
+    L = dp.laplacian(dp.Grid(cells, size=1.0), dp.dirichlet)
+    b = np.ones(cells)
 
     def make():
         root = dp.implicit(lambda u, p: p * u**3 - 0.01 * L(u) - b)
@@ -213,7 +218,8 @@ def test_transport(check, scheme, cells):
 
     def make():
         move = dp.transport(grid, scheme)
-        u, v = numbers(1, grid.shape), 0.1 * numbers(2, grid.faces.shape)
+        u = numbers(1, grid.shape)
+        v = 0.1 * numbers(2, grid.faces.shape)
         return lambda number: slope(lambda a: np.sum(move(a[0], a[1], 0.01 / (number + 9)) ** 2), (u + number, v))
 
     check(make, 1)
@@ -227,8 +233,10 @@ def test_projection_and_flow_step(check, solid):
 
     def make():
         P = dp.projection(grid, mask if solid else None)
-        step, carry = dp.flow_step(grid, 0.01, viscosity=0.01, solid=mask if solid else None), dp.convection(grid)
-        state, project = step.start(np.zeros(grid.faces.size)), through(P)
+        step = dp.flow_step(grid, 0.01, viscosity=0.01, solid=mask if solid else None)
+        carry = dp.convection(grid)
+        state = step.start(np.zeros(grid.faces.size))
+        project = through(P)
 
         def run(v):
             flow = dp.rollout(step, {**state, "v": v}, None, 3)["v"]
@@ -408,7 +416,8 @@ def test_grids(check):
 
 def bowl(number):
     """A loss with a small solve in it."""
-    solve, b = dp.inverse(-dp.laplacian(dp.Grid(6, size=1.0), dp.dirichlet)), numbers(number, 6)
+    solve = dp.inverse(-dp.laplacian(dp.Grid(6, size=1.0), dp.dirichlet))
+    b = numbers(number, 6)
     return lambda x: np.sum((solve(x) - b) ** 2) + 0.01 * np.sum(x**4)
 
 
@@ -432,7 +441,8 @@ def test_instruments(check):
     """Each sees its own loss only, and disturbs no other thread."""
 
     def work(number):
-        b, loss = numbers(5, PLANE.shape), scene()
+        b = numbers(5, PLANE.shape)
+        loss = scene()
         if number == 0:
             plan = dp.explain(loss, b)
             return sorted((kind, many) for (_, kind), many in plan.counts.items())

@@ -304,10 +304,12 @@ def test_references_of_workprec_in_another_order():
 
 
 def test_tangents_in_another_order():
-    x, tangent = {"a": 0.3, "b": 0.7}, {"b": 2.0, "a": 1.0}
+    x = {"a": 0.3, "b": 0.7}
+    tangent = {"b": 2.0, "a": 1.0}
     assert dp.jvp(loss, x, tangent)[1] == pytest.approx(2 * (0.3 - 1) + 2 * 20 * (0.7 - 2))
     assert dp.hvp(loss, x, tangent) == {"a": 2.0, "b": 40.0}
-    x, tangent = Pair(2.0, 5.0), Turned(b=0.0, a=1.0)
+    x = Pair(2.0, 5.0)
+    tangent = Turned(b=0.0, a=1.0)
     assert dp.jvp(lambda x: x.a * x.b, x, tangent)[1] == 5.0
 
 
@@ -379,7 +381,8 @@ def test_other_floors_are_refused(method, floor, words):
 def test_rates_in_another_order(method):
     step = dp.stepper(method, decay, 0.1)
     straight = dp.stepper(method, lambda u, p: dict(reversed(decay(u, p).items())), 0.1)
-    one, other = step(FIELDS), straight(FIELDS)
+    one = step(FIELDS)
+    other = straight(FIELDS)
     assert list(one) == ["fast", "slow"]
     assert all(np.array_equal(one[name], other[name]) for name in FIELDS)
     turned = dp.stepper(method, lambda u, p: Turned(b=-5.0 * u.b, a=-u.a), 0.1)(Pair(np.array([3.0]), FIELDS["fast"]))
@@ -418,7 +421,8 @@ def test_damping_in_another_order_and_for_a_branch():
 
 def test_stiff_terms_in_another_order():
     grid = dp.Grid(4, size=1.0)
-    L, u = dp.laplacian(grid, dp.dirichlet), np.arange(4.0) + 1.0
+    L = dp.laplacian(grid, dp.dirichlet)
+    u = np.arange(4.0) + 1.0
     given = {"v": None, "u": (L, 0.1)}, {"u": (L, 0.1), "v": None}, Turned(b=None, a=(L, 0.1))
     states = {"u": u, "v": u}, {"u": u, "v": u}, Pair(u, u)
     results = [dp.stepper("backward_euler", None, 0.1, linear=terms)(state) for terms, state in zip(given, states)]

@@ -9,7 +9,8 @@ import sparsedp as dp
 from sparsedp.errors import NonFiniteError
 
 GRID = dp.Grid((3, 2))
-U, V = np.ones((3, 2)), np.zeros(17)
+U = np.ones((3, 2))
+V = np.zeros(17)
 
 
 def bad(array, index, value=np.nan):
@@ -66,7 +67,8 @@ def test_message(case):
 @pytest.mark.parametrize("of", ["faces", "cells"])
 def test_whatever_is_not_finite_is_found(scheme, velocity, of):
     move = dp.transport(GRID, scheme, velocity=velocity, of=of)
-    u, v = np.zeros(move.space.shape), np.zeros((2, 3, 2) if velocity == "cells" else 17)
+    u = np.zeros(move.space.shape)
+    v = np.zeros((2, 3, 2) if velocity == "cells" else 17)
     for number in range(v.size):
         v.flat[number] = np.nan
         with pytest.raises(NonFiniteError, match="needs a finite velocity, got 1 that are NaN or infinite"):

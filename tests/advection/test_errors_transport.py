@@ -10,7 +10,8 @@ from sparsedp.autodiff.derivative import value_and_grad
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError, UnstableStepError
 
 GRID = dp.Grid((3, 2))
-U, V = np.ones((3, 2)), np.zeros(17)
+U = np.ones((3, 2))
+V = np.zeros(17)
 
 
 def bad(array, index, value=np.nan):

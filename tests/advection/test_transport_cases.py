@@ -14,7 +14,10 @@ class Recovery:
     """Case A1: a marker carried round a periodic line by an unknown velocity in each cell."""
 
     def __init__(self, n=64, steps=60):
-        self.grid, self.n, self.steps, self.dt = dp.Grid(n, size=1.0, periodic=True), n, steps, 0.5 / n / 1.3
+        self.grid = dp.Grid(n, size=1.0, periodic=True)
+        self.n = n
+        self.steps = steps
+        self.dt = 0.5 / n / 1.3
         self.x = self.grid.centres()[0]
         self.start = np.exp(-(((self.x - 0.3) / 0.06) ** 2) / 2)
         self.hidden = 1 + 0.3 * np.sin(2 * np.pi * self.x)
@@ -32,15 +35,20 @@ class Recovery:
 
     def by_hand(self, u):
         """The formula of the literature: slices forward, slices backward."""
-        c, states = self.dt * self.n, [self.start]
+        c = self.dt * self.n
+        states = [self.start]
         for _ in range(self.steps):
             d = states[-1]
-            up, down = np.roll(d, -1) - d, d - np.roll(d, 1)
+            up = np.roll(d, -1) - d
+            down = d - np.roll(d, 1)
             states.append(d - c * (np.minimum(u, 0) * up + np.maximum(u, 0) * down))
-        g, total = 2 * (states[-1] - self.target), 0.0
-        p, m = c * np.maximum(u, 0), c * np.minimum(u, 0)
+        g = 2 * (states[-1] - self.target)
+        total = 0.0
+        p = c * np.maximum(u, 0)
+        m = c * np.minimum(u, 0)
         for d in states[-2::-1]:
-            up, down = np.roll(d, -1) - d, d - np.roll(d, 1)
+            up = np.roll(d, -1) - d
+            down = d - np.roll(d, 1)
             total = total - c * g * np.where(u < 0, up, np.where(u > 0, down, 0.5 * (up + down)))
             g = g * (1 - p + m) - np.roll(g * m, 1) + np.roll(g * p, -1)
         return total
@@ -59,7 +67,8 @@ def test_a1_gradient_is_the_hand_formula(start):
 
 def test_a1_gradient_is_the_central_difference():
     case = Recovery()
-    u, d = 0.4 + 0.5 * np.cos(7 * case.x), np.sin(3 * np.arange(64.0))
+    u = 0.4 + 0.5 * np.cos(7 * case.x)
+    d = np.sin(3 * np.arange(64.0))
     slope = value_and_grad(case.loss)(u)[1] @ d
     errors = [abs((case.loss(u + h * d) - case.loss(u - h * d)) / (2 * h) - slope) / abs(slope) for h in (1e-5, 1e-6)]
     assert min(errors) <= 1e-8
@@ -76,7 +85,8 @@ def test_a1_from_rest():
 
 def amplitude(c, steps, **options):
     grid = dp.Grid(100, size=1.0, periodic=True)
-    move, x = dp.transport(grid, **options), grid.centres()[0]
+    move = dp.transport(grid, **options)
+    x = grid.centres()[0]
     u = np.sin(2 * np.pi * x)
     for _ in range(steps):
         u = move(u, np.ones(100), c / 100)
@@ -93,7 +103,8 @@ def test_a2_damping(velocity):
 @pytest.mark.parametrize("speed", [1.0, -1.0, 3.0])
 def test_a2_shift_and_growth(velocity, form, speed):
     grid = dp.Grid(100, size=1.0, periodic=True)
-    u, v = np.random.default_rng(0).random(100), np.full(100, speed)
+    u = np.random.default_rng(0).random(100)
+    v = np.full(100, speed)
     move = dp.transport(grid, velocity=velocity, form=form)
     np.testing.assert_array_equal(move(u, v, 0.01 / abs(speed)), np.roll(u, int(np.sign(speed))))
     sawtooth = (-1.0) ** np.arange(100)
@@ -112,7 +123,8 @@ def rotate(n, scheme, steps):
     v = grid.join(-2 * np.pi * (grid.face_centres(0)[1] - 0.5), 2 * np.pi * (grid.face_centres(1)[0] - 0.5))
     x, y = grid.centres()
     hump = (1 + np.cos(np.pi * np.minimum(np.hypot(x - 0.25, y - 0.5) / 0.15, 1))) / 2
-    move, u = dp.transport(grid, scheme, dp.dirichlet), hump
+    move = dp.transport(grid, scheme, dp.dirichlet)
+    u = hump
     for _ in range(steps):
         u = move(u, v, 1 / steps)
     error = np.abs(u - hump)
@@ -142,7 +154,8 @@ def error(n, scheme, form, velocity, stretched):
     s = np.linspace(0, 1, n + 1)
     widths = np.diff(s + 0.1 * np.sin(2 * np.pi * s) / (2 * np.pi)) if stretched else np.full(n, 1 / n)
     grid = dp.Grid(n, spacing=widths, periodic=True)
-    move, x = dp.transport(grid, scheme, velocity=velocity, form=form), grid.centres()[0]
+    move = dp.transport(grid, scheme, velocity=velocity, form=form)
+    x = grid.centres()[0]
     u = profile(x)
     for _ in range(2 * n):
         u = move(u, np.ones(n), 0.25 / n)
@@ -170,12 +183,16 @@ def test_inflow_through_a_wall():
     for scheme in ("upwind", "van_leer"):
         errors = []
         for n in (100, 200):
-            grid, t, dt = dp.Grid(n, size=1.0), 0.0, 0.25 / n
-            move, x = dp.transport(grid, scheme, {"x": (dp.dirichlet, dp.neumann)}), grid.centres()[0]
+            grid = dp.Grid(n, size=1.0)
+            t = 0.0
+            dt = 0.25 / n
+            move = dp.transport(grid, scheme, {"x": (dp.dirichlet, dp.neumann)})
+            x = grid.centres()[0]
             u = profile(0.3 * x)
             for _ in range(2 * n):
                 value = profile(0.3 * -(t + 0.5 * dt))
-                u, t = move(u, np.ones(n + 1), dt, np.array([value, 0.0])), t + dt
+                u = move(u, np.ones(n + 1), dt, np.array([value, 0.0]))
+                t = t + dt
             errors.append(np.mean(np.abs(u - profile(0.3 * (x - t)))))
         found[scheme] = np.log2(errors[0] / errors[1])
     assert 0.9 <= found["upwind"] <= 1.1 and found["van_leer"] >= 1.8, found
@@ -193,7 +210,8 @@ def test_flux_form_conserves(scheme, of, shape):
     for periodic in (True, False):
         grid = dp.Grid(shape, spacing=[rng.uniform(0.5, 1.5, n) for n in shape], periodic=periodic)
         move = dp.transport(grid, scheme, of=of, solid=solid)
-        u, v = rng.random(move.space.shape), dp.interior(grid)(rng.normal(size=grid.faces.size))
+        u = rng.random(move.space.shape)
+        v = dp.interior(grid)(rng.normal(size=grid.faces.size))
         mass = np.sum(move.space.volumes * u)
         for _ in range(5):
             u = move(u, v, 0.02)
@@ -213,7 +231,8 @@ def test_a_flow_without_divergence_keeps_constants(scheme, of):
 
 def test_van_leer_makes_no_new_extrema():
     grid = dp.Grid(60, size=1.0, periodic=True)
-    move, u = dp.transport(grid, "van_leer"), np.random.default_rng(4).random(60)
+    move = dp.transport(grid, "van_leer")
+    u = np.random.default_rng(4).random(60)
     variation = lambda u: np.sum(np.abs(u - np.roll(u, 1)))
     for _ in range(50):
         new = move(u, np.ones(60), 0.5 / 60)
@@ -223,7 +242,8 @@ def test_van_leer_makes_no_new_extrema():
 
 def test_solids_stay_and_let_nothing_through():
     rng = np.random.default_rng(5)
-    grid, solid = dp.Grid((9, 8), size=1.0), np.zeros((9, 8), bool)
+    grid = dp.Grid((9, 8), size=1.0)
+    solid = np.zeros((9, 8), bool)
     solid[3:5, 2:6] = solid[7, 7] = solid[0, 0] = True
     for scheme in ("upwind", "van_leer"):
         for velocity, form in (("faces", "flux"), ("faces", "advective"), ("cells", "advective"), ("cells", "flux")):
@@ -231,6 +251,7 @@ def test_solids_stay_and_let_nothing_through():
             v = rng.normal(size=move.setting.velocity_shapes[0])
             u = rng.random(grid.shape)
             other = np.where(solid, rng.random(grid.shape), u)
-            new, same = move(u, v, 0.005), move(other, v, 0.005)
+            new = move(u, v, 0.005)
+            same = move(other, v, 0.005)
             np.testing.assert_array_equal(new[solid], u[solid])
             np.testing.assert_allclose(new[~solid], same[~solid], rtol=0, atol=1e-15)

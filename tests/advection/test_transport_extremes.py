@@ -16,7 +16,8 @@ EVERY = list(product(("faces", "cells"), ("flux", "advective"), ("cells", "faces
 
 def scene(scheme, shape=(6, 5), velocity="faces", form=None, of="cells", **options):
     grid = dp.Grid(shape, size=1.0, periodic=options.pop("periodic", False))
-    move, rng = dp.transport(grid, scheme, dp.dirichlet, velocity, of, form=form, **options), np.random.default_rng(0)
+    move = dp.transport(grid, scheme, dp.dirichlet, velocity, of, form=form, **options)
+    rng = np.random.default_rng(0)
     v = rng.normal(size=move.setting.velocity_shapes[0])
     return move, rng.normal(size=move.space.shape), v, rng.normal(size=move.walls.shape)
 
@@ -93,7 +94,8 @@ def test_scaling_keeps_the_bits(scheme, power):
 def test_a_derivative_beyond_the_floats_is_an_error(scheme, velocity):
     """Field and cotangent of 2^900: their product, the gradient in the velocity, is refused, not infinity."""
     move, u, v, q = scene(scheme, velocity=velocity)
-    u, scale = 2.0**900 * u, 2.0**900
+    u = 2.0**900 * u
+    scale = 2.0**900
     through = lambda x, dt=0.01: scale * anp.sum(move(u, x, dt, q) * u / scale)
     shared = lambda x: through(x) + anp.sum(move(u / scale, x, 0.01, q))  # the second of two that are added up
     for loss, x, name in ((through, v, "v"), (shared, v, "v"), (lambda dt: through(v, dt), 0.01, "dt")):
@@ -179,7 +181,8 @@ def test_all_solid_is_the_identity(scheme, of):
 def test_islands_and_cells_of_high_aspect(scheme):
     grid = dp.Grid((12, 10), size=(1.0, 1e4))
     solid = np.random.default_rng(1).random((12, 10)) < 0.5
-    move, rng = dp.transport(grid, scheme, solid=solid), np.random.default_rng(2)
+    move = dp.transport(grid, scheme, solid=solid)
+    rng = np.random.default_rng(2)
     u = rng.random(grid.shape)
     v = dp.interior(grid)(grid.join(rng.normal(size=(13, 10)), 1e4 * rng.normal(size=(12, 11))))
     new = u
@@ -190,7 +193,9 @@ def test_islands_and_cells_of_high_aspect(scheme):
 
 def test_ten_thousand_steps():
     grid = dp.Grid(16, size=1.0, periodic=True)
-    move, u, v = dp.transport(grid), np.random.default_rng(3).random(16), np.ones(16)
+    move = dp.transport(grid)
+    u = np.random.default_rng(3).random(16)
+    v = np.ones(16)
     mass = u.sum()
     for _ in range(10_000):
         u = move(u, v, 0.03)

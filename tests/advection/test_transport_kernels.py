@@ -34,7 +34,8 @@ def scenes():
 
 def results(move, u, v, q):
     """Step and all cotangents, through the plain forms."""
-    law, args = move.law, (u.ravel(), v.ravel(), 0.01, q)
+    law = move.law
+    args = (u.ravel(), v.ravel(), 0.01, q)
     new = law.forward(*args)
     g = np.cos(np.arange(new.size))
     tasks = ((0, 1, 3), (0,), (1,), (3,))
@@ -90,14 +91,17 @@ def test_parts_that_are_asked_alone_are_the_same():
 def test_lines_that_are_short_everywhere():
     """A grid whose last axis has few cells is gathered instead of cut into segments."""
     grid = dp.Grid((3000, 2), size=1.0)
-    move, rng = dp.transport(grid), np.random.default_rng(1)
-    u, v = rng.random(grid.shape), rng.normal(size=grid.faces.size)
+    move = dp.transport(grid)
+    rng = np.random.default_rng(1)
+    u = rng.random(grid.shape)
+    v = rng.normal(size=grid.faces.size)
     np.testing.assert_allclose(move(u, v, 1e-5), move.operator(v, 1e-5)(u), rtol=1e-13)
 
 
 def minmod(a, b, c, e):
     """The difference to the nearer neighbour in value, halved; for equal cells."""
-    low, same = np.abs(a) <= np.abs(b), a * b > 0
+    low = np.abs(a) <= np.abs(b)
+    same = a * b > 0
     slope = 0.5 * (low * a + (1.0 - low) * b) * same
     return slope, slope, 0.5 * low * same, 0.5 * (1.0 - low) * same, 0.5 * low * same, 0.5 * (1.0 - low) * same
 
@@ -128,13 +132,15 @@ def test_other_limiters(limiter, velocity, form, monkeypatch):
         move = dp.transport(grid, "van_leer", dp.dirichlet, velocity, form=form, solid=obstacle)
         v = rng.normal(size=move.setting.velocity_shapes[0])
         scene = move, rng.normal(size=move.space.shape), v, rng.normal(size=move.walls.shape)
-        found, law = results(*scene), move.law
+        found = results(*scene)
+        law = move.law
         with monkeypatch.context() as patch:
             patch.setattr(kernels, "compiled", lambda: False)
             for one, other in zip(found, results(*scene)):
                 np.testing.assert_allclose(one, other, rtol=1e-13, atol=1e-13)
         u, v, q = (x.ravel() for x in scene[1:])
-        along, g = {n: rng.normal(size=x.size) for n, x in ((0, u), (1, v), (3, q))}, rng.normal(size=u.size)
+        along = {n: rng.normal(size=x.size) for n, x in ((0, u), (1, v), (3, q))}
+        g = rng.normal(size=u.size)
         back = dict(zip(along, law.vjp(tuple(along), g, u, v, 0.01, q)[0]))
         ahead = law.jvp(along, u, v, 0.01, q)
         np.testing.assert_allclose(g @ ahead, sum(along[n] @ back[n] for n in along), rtol=1e-12)
@@ -143,8 +149,11 @@ def test_other_limiters(limiter, velocity, form, monkeypatch):
 @NUMBA
 def test_arrays_kept_between_calls_change_nothing():
     grid = dp.Grid((200, 190), size=1.0)
-    move, rng = dp.transport(grid, "van_leer"), np.random.default_rng(2)
-    u, v, q = rng.normal(size=grid.shape), 0.02 * rng.normal(size=grid.faces.size), rng.normal(size=move.walls.size)
+    move = dp.transport(grid, "van_leer")
+    rng = np.random.default_rng(2)
+    u = rng.normal(size=grid.shape)
+    v = 0.02 * rng.normal(size=grid.faces.size)
+    q = rng.normal(size=move.walls.size)
     first = [x.tobytes() for x in results(move, u, v, q)]
     for spare in memory._spare.values():
         spare[: spare.size // 8 * 8].view(float)[:] = np.nan
@@ -153,8 +162,11 @@ def test_arrays_kept_between_calls_change_nothing():
 
 def test_cotangents_need_not_be_contiguous():
     for scheme in ("upwind", "van_leer", "semi_lagrangian", "maccormack"):
-        move, rng = dp.transport(dp.Grid(8, periodic=True), scheme), np.random.default_rng(0)
-        u, v, g = rng.random(8), rng.normal(size=8), rng.normal(size=16)
+        move = dp.transport(dp.Grid(8, periodic=True), scheme)
+        rng = np.random.default_rng(0)
+        u = rng.random(8)
+        v = rng.normal(size=8)
+        g = rng.normal(size=16)
         _, pull = pullback(lambda x, move=move, v=v: move(x, v, 0.1), u)
         for strided in (g[::2], g[7::-1], np.broadcast_to(1.5, (8,))):
             np.testing.assert_array_equal(pull(strided), pull(strided.copy()))

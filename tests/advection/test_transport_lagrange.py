@@ -147,16 +147,20 @@ def test_second_derivatives(without_numba):
 def test_loops_against_the_matrix_and_nothing_is_read_beside_the_samples(shape, interpolation):
     """Departure points far out on all sides and at the points; what lies around the samples is NaN."""
     periodic = (False, True, False)[: len(shape)]
-    points, rng = departure_samples.Points.of(shape, periodic, interpolation), np.random.default_rng(1)
-    n, scale = points.size, np.array([1.0, 0.5, 2.0])[: len(shape)]
+    points = departure_samples.Points.of(shape, periodic, interpolation)
+    rng = np.random.default_rng(1)
+    n = points.size
+    scale = np.array([1.0, 0.5, 2.0])[: len(shape)]
     samples = np.full(points.samples + 200, np.nan)[100:-100]
     samples[:] = rng.standard_normal(points.samples)
-    g, axes = rng.standard_normal(n), range(len(shape))
+    g = rng.standard_normal(n)
+    axes = range(len(shape))
     for w in [np.full((len(shape), n), far) for far in (-50.0, -1.0, 0.0, 0.3, 1.0, 50.0, np.nan, -np.inf)] + [
         rng.standard_normal((len(shape), n)),
         np.where(rng.random((len(shape), n)) < 0.5, 0.0, 1.3),
     ]:
-        value, slope = _dense(points, w, scale), [_dense(points, w, scale, axis) for axis in axes]
+        value = _dense(points, w, scale)
+        slope = [_dense(points, w, scale, axis) for axis in axes]
         close = dict(rtol=1e-13, atol=1e-13)
         found = departure_samples.interpolate(points, samples, w, scale, np.empty(n))
         np.testing.assert_allclose(found, value @ samples, **close)

@@ -13,12 +13,10 @@ from sparsedp.autodiff.derivative import pullback
 def burgers(cells=128):
     """Case A7: explicit diffusion, then the diffused field carries itself."""
     grid = dp.Grid(cells, size=2.0, origin=-1.0, periodic=True)
-    L, carry, dt, nu = (
-        dp.laplacian(grid),
-        dp.transport(grid, "semi_lagrangian", velocity="cells"),
-        1 / 32,
-        0.01 / 128 / np.pi,
-    )
+    L = dp.laplacian(grid)
+    carry = dp.transport(grid, "semi_lagrangian", velocity="cells")
+    dt = 1 / 32
+    nu = 0.01 / 128 / np.pi
 
     def step(u, _=None):
         u = u + dt * nu * L(u)
@@ -89,7 +87,8 @@ def turned_blob(n, **options):
     x, y = grid.centres()
     blob = lambda cx, cy: np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / 0.01)
     wind = np.stack([0.5 - y, x - 0.5])
-    move, steps = dp.transport(grid, velocity="cells", **options), n // 4
+    move = dp.transport(grid, velocity="cells", **options)
+    steps = n // 4
     u = blob(0.7, 0.5)
     for _ in range(steps):
         u = move(u, wind, np.pi / 4 / steps)
@@ -136,7 +135,8 @@ def test_value_at_a_bound_takes_half_of_each_side():
 def test_far_outside(boundary, interpolation):
     """What comes from far away has the value at the wall, and no slope in the velocity."""
     move = dp.transport(dp.Grid(3), "semi_lagrangian", boundary, "cells", interpolation=interpolation)
-    u, v = np.array([1.0, 5.0, 7.0]), np.array([1e3, 1e300, -1e6])
+    u = np.array([1.0, 5.0, 7.0])
+    v = np.array([1e3, 1e300, -1e6])
     value, pull = pullback(lambda x: move(u, x[0], 1.0, x[1]), (v, np.array([2.0, 3.0])))
     assert value == pytest.approx([1, 1, 7] if boundary is dp.neumann else [2, 2, 3])
     of_v, of_inflow = pull(np.ones(3))
@@ -193,7 +193,8 @@ LAYOUTS = {
 def test_layouts(scheme, layout):
     grid = dp.Grid((4, 3))
     move = dp.transport(grid, scheme, dp.dirichlet)
-    u, v = LAYOUTS[layout](np.arange(12.0).reshape(4, 3)), np.sin(np.arange(grid.faces.size))
+    u = LAYOUTS[layout](np.arange(12.0).reshape(4, 3))
+    v = np.sin(np.arange(grid.faces.size))
     for array in (u, v):
         array.flags.writeable = False
     kept = u.copy()
@@ -219,7 +220,9 @@ def test_step(scheme):
     move = dp.transport(grid, scheme)
     step = lambda u, v: move(u, v, 0.3)
     rng = np.random.default_rng(1)
-    u, v, g = rng.standard_normal((6, 5)), rng.standard_normal(grid.faces.size), rng.standard_normal((6, 5))
+    u = rng.standard_normal((6, 5))
+    v = rng.standard_normal(grid.faces.size)
+    g = rng.standard_normal((6, 5))
     wanted, pull = pullback(lambda x: step(*x), (u, v))
     of_u, of_v = pull(g)
     assert np.array_equal(step(u, v), wanted)

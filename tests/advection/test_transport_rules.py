@@ -188,11 +188,13 @@ def test_steps_share_a_velocity(scheme, velocity):
 def test_a_field_that_carries_itself(dtype):
     """Field and velocity are one array, whose two cotangents meet."""
     grid = dp.Grid(12, periodic=True)
-    move, u = dp.transport(grid, "upwind", velocity="cells"), RNG.uniform(0.5, 1, 12).astype(dtype)
+    move = dp.transport(grid, "upwind", velocity="cells")
+    u = RNG.uniform(0.5, 1, 12).astype(dtype)
 
     def run(u, w):
         for _ in range(3):
-            u, w = move(u, w, 0.1), w
+            u = move(u, w, 0.1)
+            w = w
         return anp.sum(move(u, u, 0.1) * anp.sin(u)) + anp.sum(w**3)
 
     slopes = dp.grad(lambda pair: run(*pair))((u, u))
@@ -214,12 +216,16 @@ def test_inflow_as_one_number_gets_the_sum():
 def test_kinks_get_the_mean_of_both_sides(velocity, kink):
     """At v = 0 the derivative is that of the central difference."""
     grid = dp.Grid((5, 4), size=1.0)
-    move, rng = dp.transport(grid, boundary=dp.dirichlet, velocity=velocity), np.random.default_rng(3)
-    u, shape, q = rng.normal(size=grid.shape), move.setting.velocity_shapes[0], rng.normal(size=18)
+    move = dp.transport(grid, boundary=dp.dirichlet, velocity=velocity)
+    rng = np.random.default_rng(3)
+    u = rng.normal(size=grid.shape)
+    shape = move.setting.velocity_shapes[0]
+    q = rng.normal(size=18)
     v = np.zeros(shape) if kink == "rest" else np.where(rng.random(shape) < 0.5, 0.0, rng.normal(size=shape))
     g = rng.normal(size=grid.shape)
     loss = lambda v: anp.sum(g * move(u, v, 0.01, q))
-    slope, h = value_and_grad(loss)(v)[1], 2.0**-20
+    slope = value_and_grad(loss)(v)[1]
+    h = 2.0**-20
     for index in np.ndindex(shape):
         unit = np.zeros(shape)
         unit[index] = h

@@ -17,7 +17,8 @@ FORMS = list(product(("faces", "cells"), ("flux", "advective")))
 
 def grids(dim):
     """Uniform and stretched; bounded, periodic and mixed."""
-    rng, shape = np.random.default_rng(dim), SHAPES[dim]
+    rng = np.random.default_rng(dim)
+    shape = SHAPES[dim]
     mixed = tuple(a % 2 == 0 for a in range(dim)) if dim > 1 else (True,)
     yield dp.Grid(shape, spacing=0.5)
     yield dp.Grid(shape, spacing=[rng.uniform(0.5, 1.5, n) for n in shape])

@@ -7,8 +7,10 @@ import pytest
 import sparsedp as dp
 
 GRID = dp.Grid((5, 4), size=1.0)
-CELLS, FACES = GRID.cells, GRID.faces
-G, D = dp.gradient(GRID, dp.dirichlet), dp.divergence(GRID)
+CELLS = GRID.cells
+FACES = GRID.faces
+G = dp.gradient(GRID, dp.dirichlet)
+D = dp.divergence(GRID)
 LAPLACIAN = D @ G
 OPERATORS = {
     "explicit": LAPLACIAN.explicit(),
@@ -47,7 +49,8 @@ def test_a_batch_through_an_operator(name, lead, turned, rng):
 @pytest.mark.parametrize("name", ["explicit", "matrix-free", "inverse", "projection", "flux"])
 def test_derivatives_of_a_batch(name, rng):
     op = OPERATORS[name]
-    batch, direction = rng.normal(size=(2, 3, *op.domain.shape)), rng.normal(size=(2, 3, *op.domain.shape))
+    batch = rng.normal(size=(2, 3, *op.domain.shape))
+    direction = rng.normal(size=(2, 3, *op.domain.shape))
     weights = rng.normal(size=(2, 3, *op.codomain.shape))
     gradient = dp.grad(lambda u: anp.sum(weights * op(u)))(batch)
     assert np.array_equal(gradient, one_by_one(op.T, weights, op.codomain.shape))
@@ -76,7 +79,8 @@ def test_second_order_of_a_batch_of_numbers(lead, rng):
 
 @pytest.mark.parametrize("k", [0.7, np.linspace(0.5, 2.0, FACES.size)])
 def test_many_right_hand_sides_of_one_coefficient(k, rng):
-    solve, batch = dp.elliptic_solver(D, G), rng.normal(size=(4, *GRID.shape))
+    solve = dp.elliptic_solver(D, G)
+    batch = rng.normal(size=(4, *GRID.shape))
     assert np.array_equal(solve(k, batch, 0.3), one_by_one(lambda b: solve(k, b, 0.3), batch, GRID.shape))
 
     def loss(some):
@@ -98,7 +102,8 @@ def test_many_right_hand_sides_of_one_coefficient(k, rng):
 
 def test_many_right_hand_sides_of_one_matrix(rng):
     solve = dp.matrix_solver(LAPLACIAN.matrix, domain=CELLS)
-    data, batch = LAPLACIAN.matrix.data * rng.uniform(0.9, 1.1, LAPLACIAN.matrix.nnz), rng.normal(size=(3, *GRID.shape))
+    data = LAPLACIAN.matrix.data * rng.uniform(0.9, 1.1, LAPLACIAN.matrix.nnz)
+    batch = rng.normal(size=(3, *GRID.shape))
     assert np.array_equal(solve(data, batch), one_by_one(lambda b: solve(data, b), batch, GRID.shape))
 
     def loss(some):
@@ -152,6 +157,7 @@ def test_a_start_is_for_one_field():
 
 
 def test_unrolled_solves_of_a_batch_take_steps_of_their_own(rng):
-    unrolled, batch = dp.inverse(-LAPLACIAN, method="krylov", diff="unrolled"), rng.normal(size=(3, *GRID.shape))
+    unrolled = dp.inverse(-LAPLACIAN, method="krylov", diff="unrolled")
+    batch = rng.normal(size=(3, *GRID.shape))
     assert np.array_equal(unrolled(batch), one_by_one(unrolled, batch, GRID.shape))
     assert dp.check.gradient(lambda b: anp.sum(unrolled(b) ** 2), batch, quick=True).verdict == "agrees"

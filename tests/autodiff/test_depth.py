@@ -25,7 +25,8 @@ def horner(depth, base=ONE):
 
 @pytest.mark.whole
 def test_the_deepest_operators_work_in_every_way():
-    op, u = horner(99), np.ones(GRID.shape)
+    op = horner(99)
+    u = np.ones(GRID.shape)
     v = u
     for _ in range(99):
         v = 1e-3 * LAPLACIAN(WEIGHTS(v)) + u  # each power of the product commutes with it
@@ -39,7 +40,8 @@ def test_the_deepest_operators_work_in_every_way():
 
 @pytest.mark.whole
 def test_sums_and_products_of_many_operators_are_not_nested():
-    many_terms, many_factors = LAPLACIAN, ONE
+    many_terms = LAPLACIAN
+    many_factors = ONE
     for _ in range(300):
         many_terms = many_terms + LAPLACIAN @ WEIGHTS
         many_factors = many_factors @ WEIGHTS @ LAPLACIAN * 1e-3

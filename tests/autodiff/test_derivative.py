@@ -78,8 +78,10 @@ def test_eigenvectors_forward():
     def chain(k):
         return anp.diag(k[:-1] + k[1:]) - anp.diag(k[1:-1], 1) - anp.diag(k[1:-1], -1)
 
-    k, t = np.linspace(1.0, 2.0, 7), np.arange(7.0)
-    shape, lowest = lambda k: anp.linalg.eigh(chain(k))[1][:, 0] ** 2, lambda k: anp.linalg.eigh(chain(k))[0][0]
+    k = np.linspace(1.0, 2.0, 7)
+    t = np.arange(7.0)
+    shape = lambda k: anp.linalg.eigh(chain(k))[1][:, 0] ** 2
+    lowest = lambda k: anp.linalg.eigh(chain(k))[0][0]
     np.testing.assert_allclose(dp.jvp(shape, k, t)[1], difference(shape, k, t), rtol=1e-6)
     np.testing.assert_allclose(dp.hvp(lowest, k, t), difference(dp.grad(lowest), k, t), rtol=1e-6)
     goal = shape(k[::-1])
@@ -101,7 +103,8 @@ def test_full_like_of_a_traced_value():
 @pytest.mark.parametrize("name", ["sum", "mean", "prod", "var", "std", "max", "min", "amax", "amin"])
 @pytest.mark.parametrize("library", [np, anp])
 def test_reductions_of_some_entries_are_refused(name, library):
-    x, mask = np.array([1.0, 2.0, 4.0]), np.array([True, False, True])
+    x = np.array([1.0, 2.0, 4.0])
+    mask = np.array([True, False, True])
     told = name if library is anp else name.removeprefix("a")  # NumPy's asks the traced value for its `max`
     options = [{"initial": 9.0}] if name not in ("mean", "var", "std") else []
     options += [{"where": mask, **({"initial": 9.0} if name[-3:] in ("max", "min") else {})}]

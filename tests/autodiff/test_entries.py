@@ -35,7 +35,8 @@ def dense(solve, data):
 
 def test_solution_and_gradients_are_the_dense_formulas(rng):
     solve, data, b = system(rng)
-    A, g = dense(solve, data), rng.standard_normal(b.size)
+    A = dense(solve, data)
+    g = rng.standard_normal(b.size)
     x, pull = pullback(lambda p: solve(*p), (data, b))
     np.testing.assert_allclose(x, np.linalg.solve(A, b), rtol=1e-12)
     y = np.linalg.solve(A.T, g)
@@ -54,7 +55,8 @@ def test_planted_mistakes_are_seen(rng, monkeypatch):
         patch.setattr(solve, "_solve", lambda transposed, *rest: solved(False, *rest))
         assert dp.check.gradient(loss, (data, b), directions=1).verdict == "disagrees"
     wrong = matrix_solver(dense(solve, data))
-    wrong.rows, wrong.columns = solve.columns, solve.rows
+    wrong.rows = solve.columns
+    wrong.columns = solve.rows
     wrong.D, wrong.G = -wrong.G.T, -wrong.D.T
     assert dp.check.gradient(lambda p: anp.sum(wrong(*p) ** 2), (data, b), directions=1).verdict == "disagrees"
 
@@ -62,12 +64,15 @@ def test_planted_mistakes_are_seen(rng, monkeypatch):
 def test_taylor_rates_and_every_mode_of_second_order(rng):
     solve, data, b = system(rng, 12)
     w = rng.standard_normal(b.size)
-    p, d = (data, b), (0.5 * rng.standard_normal(data.size), rng.standard_normal(b.size))
+    p = (data, b)
+    d = (0.5 * rng.standard_normal(data.size), rng.standard_normal(b.size))
     loss = lambda p: anp.sum(w * solve(*p) ** 3)
     dot = lambda one, other: sum(anp.sum(a * c) for a, c in zip(one, other))
     slope = lambda p: value_and_grad(loss)(p)[1]
     along = lambda p: pushforward(loss, p, d)[1]
-    value, first, hessian = loss(p), dot(slope(p), d), pushforward(slope, p, d)[1]
+    value = loss(p)
+    first = dot(slope(p), d)
+    hessian = pushforward(slope, p, d)[1]
     for found in (value_and_grad(lambda p: dot(slope(p), d))(p)[1], value_and_grad(along)(p)[1]):
         for one, other in zip(found, hessian):
             np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12 * np.max(np.abs(other)))
@@ -147,8 +152,10 @@ def graph_laplacian(weights, ends, n):
 
 
 def test_singular_systems_follow_the_null_space_contract(rng):
-    n, ends = 9, (np.array([0, 1, 2, 3, 0, 5, 6, 7]), np.array([1, 2, 3, 4, 2, 6, 7, 8]))  # two islands
-    weights, b = rng.uniform(1, 2, 8), rng.standard_normal(n)
+    n = 9  # two islands
+    ends = (np.array([0, 1, 2, 3, 0, 5, 6, 7]), np.array([1, 2, 3, 4, 2, 6, 7, 8]))
+    weights = rng.uniform(1, 2, 8)
+    b = rng.standard_normal(n)
     places, entries = graph_laplacian(weights, ends, n)
     refusing, projecting = (matrix_solver(places, nullspace=word) for word in ("raise", "project"))
     with pytest.raises(IncompatibleError, match="subtract the weighted mean or write nullspace='project'"):
@@ -218,10 +225,14 @@ def test_what_is_refused(rng):
 
 
 def test_values_on_one_place_are_summed_and_differentiable(rng):
-    n, many = 6, 40
-    rows, columns = rng.integers(0, n, many), rng.integers(0, n, many)
-    rows, columns = np.append(rows, np.arange(n)), np.append(columns, np.arange(n))
-    values, b = np.append(rng.standard_normal(many), np.full(n, 30.0)), rng.standard_normal(n)
+    n = 6
+    many = 40
+    rows = rng.integers(0, n, many)
+    columns = rng.integers(0, n, many)
+    rows = np.append(rows, np.arange(n))
+    columns = np.append(columns, np.arange(n))
+    values = np.append(rng.standard_normal(many), np.full(n, 30.0))
+    b = rng.standard_normal(n)
     solve = matrix_solver.from_coo(rows, columns)
     A = sp.coo_array((values, (rows, columns)), shape=(n, n)).toarray()
     x, pull = pullback(lambda p: solve(*p), (values, b))

@@ -259,7 +259,8 @@ def test_every_builder_is_here():
 
 
 def test_results_of_jvp_are_the_callers_own():
-    x, t = np.ones(3), np.full(3, 2.0)
+    x = np.ones(3)
+    t = np.full(3, 2.0)
     value, slope = dp.jvp(lambda u: u, x, t)
     value[0], slope[0] = 9.0, 9.0
     assert np.array_equal(x, np.ones(3)) and np.array_equal(t, np.full(3, 2.0))

@@ -42,7 +42,8 @@ def test_every_public_name_is_looked_at():
 
 def total(fun, makers, place, reused, x):
     """The sum of weighted results of CALLS calls, x at one place, constants elsewhere."""
-    rooms, result = {}, 0.0
+    rooms = {}
+    result = 0.0
     for seed in range(CALLS):
         args = []
         for number, make in enumerate(makers):
@@ -145,7 +146,9 @@ def test_differences_agree(name, place):
 
 def test_a_solve_by_hand():
     """y_n = A_n^-1 ... A_1^-1 y, dense: the gradient of w.y_n is A_1^-T ... A_n^-T w."""
-    solve, work, w = dp.matrix_solver(PLACES), np.empty(16), field(6, 5)
+    solve = dp.matrix_solver(PLACES)
+    work = np.empty(16)
+    w = field(6, 5)
 
     def loss(y):
         for seed in range(4):
@@ -187,7 +190,8 @@ def test_what_cannot_change_is_not_copied():
     fixed.flags.writeable = False
     assert constant(fixed) is fixed and constant(fixed[3:]).base is fixed
     work = field(20000, 2)
-    first, again = constant(work), constant(work)
+    first = constant(work)
+    again = constant(work)
     assert first is again and first is not work and not first.flags.writeable
     work[-1] = 0.0
     assert constant(work) is not first and first[-1] != 0.0
@@ -206,7 +210,8 @@ def test_what_cannot_change_is_not_copied():
 def test_copies_live_as_long_as_their_tape():
     from sparsedp.autodiff.tape_constants import copies
 
-    before, work = len(copies), field(20000, 1)
+    before = len(copies)
+    work = field(20000, 1)
     value, pull = pullback(lambda x: work * x * work, np.ones(20000))
     assert len(copies) == before + 1
     del value, pull
@@ -216,7 +221,8 @@ def test_copies_live_as_long_as_their_tape():
 @pytest.mark.parametrize("size", [4, 20000])
 def test_the_array_that_is_differentiated(size):
     """The caller writes into x, into the value and into the cotangent, and into one gradient of two."""
-    x, g = np.full(size, 2.0), np.full(size, 3.0)
+    x = np.full(size, 2.0)
+    g = np.full(size, 3.0)
     value, pull = pullback(lambda x: anp.exp(x) * x, x)
     expected = 3.0 * np.exp(2.0) * 3.0
     x[:], value[:] = 0.0, 0.0
@@ -270,7 +276,8 @@ def test_a_rule_that_writes_into_its_own_result(form):
 
 def test_tapes_of_autograd_itself():
     """Rules keep their constants on the tape of autograd.grad too."""
-    solve, work = dp.matrix_solver(PLACES), entries(1)
+    solve = dp.matrix_solver(PLACES)
+    work = entries(1)
 
     def loss(b):
         y = solve(work, b)
@@ -315,7 +322,8 @@ def test_threads_share_nothing_but_content():
 @pytest.mark.parametrize("when", ["inside", "after"])
 def test_a_step_whose_own_array_changes(memory, when):
     """In a rollout: the gradient of what was computed, or an error that says that the step changed."""
-    work, w = np.ones(6), field(6, 3)
+    work = np.ones(6)
+    w = field(6, 3)
 
     def step(u, p):
         if when == "inside":
@@ -348,13 +356,16 @@ def test_a_step_whose_own_array_changes(memory, when):
 
 def test_set_ups_own_their_coefficients():
     """What is kept by content must not change with the array that it was made for."""
-    solve, work, b = dp.matrix_solver(PLACES, method="krylov"), entries(1), np.ones(6)
+    solve = dp.matrix_solver(PLACES, method="krylov")
+    work = entries(1)
+    b = np.ones(6)
     expected = solve(work.copy(), b)
     fresh = dp.matrix_solver(PLACES, method="krylov")
     fresh(work, b)
     work[:] = entries(2)
     assert np.array_equal(fresh(entries(1), b), expected)
-    elliptic, k = dp.elliptic_solver(dp.divergence(LINE), dp.gradient(LINE, dp.dirichlet)), field(7, 1)
+    elliptic = dp.elliptic_solver(dp.divergence(LINE), dp.gradient(LINE, dp.dirichlet))
+    k = field(7, 1)
     expected = dp.elliptic_solver(dp.divergence(LINE), dp.gradient(LINE, dp.dirichlet))(k.copy(), b)
     elliptic(k, b)
     k[:] = 2.0
@@ -364,11 +375,13 @@ def test_set_ups_own_their_coefficients():
 @pytest.mark.parametrize("method", ["lbfgs", "gd", "adam", "newton_cg"])
 def test_minimize_hands_out_copies(method):
     options = {"rate": 0.1} if method in ("gd", "adam") else {}
-    start, lower = np.full(3, 2.0), np.full(3, 0.5)
+    start = np.full(3, 2.0)
+    lower = np.full(3, 0.5)
     options["bounds"] = lower, None
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        known, seen = [], []
+        known = []
+        seen = []
         best = dp.minimize(
             lambda x: anp.sum((x - 0.3) ** 4), start, method, 4, callback=lambda r, x: known.append(x.copy()), **options
         )

@@ -103,15 +103,18 @@ def test_rules_of_users_cannot_write_into_what_they_are_given(part):
         return lambda g: (act(g, "pull"),)
 
     rule = dp.differentiable("change", lambda x: act(x, "forward"), vjp, lambda nums, ts, ans, x: act(ts[0], "jvp"))
-    x, t = np.arange(1.0, 4.0), np.ones(3)
+    x = np.arange(1.0, 4.0)
+    t = np.ones(3)
     with pytest.raises(ValueError, match="read-only"):
         dp.jvp(rule, x, t) if part == "jvp" else dp.grad(lambda x: anp.sum(x * x + rule(x)))(x)
     assert np.array_equal(x, [1, 2, 3]) and np.array_equal(t, [1, 1, 1])
 
 
 def test_physical_gradient(rng):
-    physics, inverse = reusing(lambda x: 2 * x), reusing(lambda y, x: y / 2)
-    f, x = dp.physical_gradient(physics, inverse), rng.standard_normal(N)
+    physics = reusing(lambda x: 2 * x)
+    inverse = reusing(lambda y, x: y / 2)
+    f = dp.physical_gradient(physics, inverse)
+    x = rng.standard_normal(N)
     value, g = dp.value_and_grad(lambda x: anp.sum(f(x) * f(x + 1)))(x)
     assert value == pytest.approx(np.sum(2 * x * 2 * (x + 1)), rel=1e-14)
     assert np.allclose(g, 2 * (x + 1) / 2 + 2 * x / 2)  # x - inverse(y - g) = g / 2 of each call
@@ -120,7 +123,8 @@ def test_physical_gradient(rng):
 @pytest.mark.parametrize("kind", ["functions", "linear operator"])
 def test_operators_of_users(rng, kind):
     A = rng.standard_normal((N, N))
-    forward, backward = reusing(lambda u: A @ u), reusing(lambda g: A.T @ g)
+    forward = reusing(lambda u: A @ u)
+    backward = reusing(lambda g: A.T @ g)
     op = dp.from_functions(forward, backward, N, N)
     if kind == "linear operator":
         op = dp.from_linear_operator(LinearOperator((N, N), matvec=forward, rmatvec=backward, dtype=float))
@@ -145,7 +149,8 @@ def test_residuals_and_jacobians(rng, form, size):
         return stored
 
     jacobian = {"dense": reusing(lambda x, b: np.diag(3 * x**2 + 1)), "sparse": sparse, "none": None}[form]
-    root, guess = dp.implicit(residual, jacobian), np.zeros(size)
+    root = dp.implicit(residual, jacobian)
+    guess = np.zeros(size)
     one, other, g = rng.standard_normal((3, size))
     x, pull = pullback(lambda b: root(guess, b), one)
     y, pull_other = pullback(lambda b: root(guess, b), other)
@@ -185,8 +190,10 @@ def _in_tree(rate):
 @pytest.mark.parametrize("method", ["imex", "etdrk4"])
 @pytest.mark.parametrize("tolerance", [None, 1e-4])
 def test_split_rates_and_sources(rng, method, tolerance):
-    L, u = dp.laplacian(dp.Grid(N, size=1.0)), rng.standard_normal(N)
-    rate, source = lambda u, p, t: anp.sin(u) * p, lambda p, t: anp.cos(t + p) * np.ones(N)
+    L = dp.laplacian(dp.Grid(N, size=1.0))
+    u = rng.standard_normal(N)
+    rate = lambda u, p, t: anp.sin(u) * p
+    source = lambda p, t: anp.cos(t + p) * np.ones(N)
     make = lambda f, s: dp.stepper(method, f, 0.01, linear=(L, 0.1), source=s, tolerance=tolerance)
     wanted, found = (make(*pair)((u, 0.3), 0.5) for pair in ((rate, source), (reusing(rate), reusing(source))))
     assert np.array_equal(wanted[0], found[0])
@@ -194,7 +201,8 @@ def test_split_rates_and_sources(rng, method, tolerance):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_sources_of_linear_problems(rng, method):
-    L, u = 1e-3 * dp.laplacian(dp.Grid(N, size=1.0)), rng.standard_normal(N)
+    L = 1e-3 * dp.laplacian(dp.Grid(N, size=1.0))
+    u = rng.standard_normal(N)
     source = lambda p, t: anp.cos(t + p) * np.ones(N)
     wanted, found = (dp.stepper(method, L, 0.01, source=s)((u, 0.3), 0.5) for s in (source, reusing(source)))
     assert np.array_equal(wanted[0], found[0])
@@ -210,8 +218,10 @@ def test_rates_in_float32_and_of_numbers():
 @pytest.mark.parametrize("convective", [True, False])
 def test_forces_and_viscosities(rng, convective):
     grid = dp.Grid((6, 5), size=1.0)
-    force, viscosity = lambda v, p: -p * v, lambda p: 0.01 * p
-    v, held = rng.standard_normal(grid.faces.size), np.arange(grid.faces.size)
+    force = lambda v, p: -p * v
+    viscosity = lambda p: 0.01 * p
+    v = rng.standard_normal(grid.faces.size)
+    held = np.arange(grid.faces.size)
     friction = lambda p: p * held
     for f, nu, rub in ((force, viscosity, friction), tuple(map(reusing, (force, viscosity, friction)))):
         step = dp.flow_step(grid, 1e-3, viscosity=nu, force=f, convective=convective, friction=rub)
@@ -248,7 +258,8 @@ ROOM = np.empty(N)
 @pytest.mark.parametrize("memory", [None, 3000])
 @pytest.mark.parametrize("keep", ["last", "all", "each"])
 def test_steps(rng, memory, keep):
-    u, g = 0.1 + rng.random(N), rng.standard_normal(N)
+    u = 0.1 + rng.random(N)
+    g = rng.standard_normal(N)
     kept = (lambda i, state: state) if keep == "each" else keep
     total = lambda made: sum(anp.sum(g * (one + one**2)) for one in ([made] if keep == "last" else made))
     states = [u]
@@ -285,7 +296,8 @@ def rosenbrock_slope(x):
 
 @pytest.mark.parametrize("method", ["lbfgs", "gd", "adam"])
 def test_gradients_for_minimize(method):
-    start, options = np.full(4, 0.5), dict(method=method, maxiter=30)
+    start = np.full(4, 0.5)
+    options = dict(method=method, maxiter=30)
     wanted = dp.minimize(rosenbrock, start, gradient=rosenbrock_slope, **options)
     found = dp.minimize(reusing(rosenbrock), start, gradient=reusing(rosenbrock_slope), **options)
     assert np.array_equal(found.x, wanted.x) and found.value == wanted.value
@@ -294,7 +306,8 @@ def test_gradients_for_minimize(method):
 
 def test_batches_for_minimize():
     data = np.arange(12.0).reshape(4, 3)
-    loss, room = lambda x, batch: anp.sum((x - batch) ** 2), np.empty(3)
+    loss = lambda x, batch: anp.sum((x - batch) ** 2)
+    room = np.empty(3)
 
     def batches(i):
         room[:] = data[i % 4]
@@ -311,7 +324,8 @@ def test_batches_for_minimize():
 
 def test_checks_of_reused_losses(rng):
     x = rng.standard_normal(5)
-    loss, slope = reusing(lambda x: np.sum(x**3)), reusing(lambda x: 3 * x**2)
+    loss = reusing(lambda x: np.sum(x**3))
+    slope = reusing(lambda x: 3 * x**2)
     assert dp.check.gradient(loss, x, gradient=slope).verdict == "agrees"
     assert dp.check.gradient(loss, x, gradient=reusing(lambda x: 3.001 * x**2)).verdict == "disagrees"
     assert dp.check.order(reusing(lambda n: 1 / n**2), expected=2).verdict == "agrees"
@@ -319,7 +333,8 @@ def test_checks_of_reused_losses(rng):
 
 def test_a_reused_preconditioner(rng):
     A = np.diag(2 + rng.random(60)) + np.diag(0.5 * np.ones(59), 1)
-    b, scale = rng.standard_normal(60), 1 / np.diag(A)
+    b = rng.standard_normal(60)
+    scale = 1 / np.diag(A)
     op = dp.from_matrix(A)
     solve = dp.inverse(op, "krylov", preconditioner=reusing(lambda r: scale * r))
     assert np.allclose(solve(b), np.linalg.solve(A, b)) and np.allclose(solve.T(b), np.linalg.solve(A.T, b))

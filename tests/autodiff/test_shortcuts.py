@@ -83,8 +83,11 @@ QUOTIENTS = {
 def test_derivatives_of_quotients_of_small_numbers(name):
     """A quotient does not change when both operands are scaled: its derivative scales with the inverse."""
     loss = lambda z: anp.sum(anp.sin(QUOTIENTS[name](z[0], z[1])))
-    x, y, t = (X, Y), (SMALL * X, SMALL * Y), (Y, X**2)
-    known, found = autograd.grad(loss)(x), dp.grad(loss)(y)
+    x = (X, Y)
+    y = (SMALL * X, SMALL * Y)
+    t = (Y, X**2)
+    known = autograd.grad(loss)(x)
+    found = dp.grad(loss)(y)
     assert all(np.allclose(SMALL * a, b, rtol=1e-13, atol=1e-13) for a, b in zip(found, known, strict=True))
     along = sum(np.sum(a * b) for a, b in zip(known, t, strict=True))
     assert dp.jvp(loss, y, tuple(SMALL * one for one in t))[1] == pytest.approx(along, rel=1e-12)
@@ -109,7 +112,8 @@ def test_lists_that_hold_traced_values():
     """Beside an operator they are arrays; autograd's functions do not see what is inside, and lost its derivative."""
     made = lambda x: x * [x[0], 1.0] + (x[1], 2.0) - [x[0] * x[1], 0.0] / x
     known = lambda x: x * anp.array([x[0], 1.0]) + anp.array([x[1], 2.0]) - anp.array([x[0] * x[1], 0.0]) / x
-    x, g = np.array([2.0, 3.0]), np.array([1.0, 5.0])
+    x = np.array([2.0, 3.0])
+    g = np.array([1.0, 5.0])
     assert np.array_equal(dp.vjp(made, x)[1](g), dp.vjp(known, x)[1](g))
     assert np.array_equal(dp.jvp(made, x, g)[1], dp.jvp(known, x, g)[1])
     products = anp.inner, anp.matmul, lambda x, y: anp.einsum("i,i->", x, y), lambda x, y: anp.tensordot(x, y, 1)
@@ -156,7 +160,8 @@ def test_forward_shortcuts_have_the_bits_of_autograd(name):
     def ends(z):
         return anp.sin(FORWARD[name](z[:3], z[3:]))
 
-    z, t = np.concatenate([X, Y]), np.concatenate([Y, X])
+    z = np.concatenate([X, Y])
+    t = np.concatenate([Y, X])
     value, slope = pushforward(ends, z, t)
     known, along = autograd.make_jvp(ends)(z)(t)
     assert np.array_equal(value, known) and np.array_equal(slope, along) and slope.dtype == along.dtype
@@ -169,7 +174,8 @@ def test_second_derivatives_pass_through_the_forward_shortcuts(name):
     def loss(z):
         return anp.sum(anp.sin(FORMULAS[name](z[:3], z[3:])))
 
-    z, t = np.concatenate([X, Y]), np.concatenate([Y, X])
+    z = np.concatenate([X, Y])
+    t = np.concatenate([Y, X])
     known = autograd.grad(lambda z: anp.sum(t * autograd.grad(loss)(z)))(z)
     back = dp.value_and_grad(lambda z: pushforward(loss, z, t)[1])(z)[1]
     along = pushforward(lambda z: dp.value_and_grad(loss)(z)[1], z, t)[1]
@@ -178,17 +184,20 @@ def test_second_derivatives_pass_through_the_forward_shortcuts(name):
 
 @pytest.mark.parametrize("kind", ["f", "D"])
 def test_other_kinds_of_numbers_are_left_to_autograd(kind):
-    x, y = X.astype(kind), Y.astype(kind)
+    x = X.astype(kind)
+    y = Y.astype(kind)
 
     def loss(z):
         return anp.sum(anp.real(z[0] * z[1] - z[0] / z[1]) ** 2)
 
-    ours, known = dp.value_and_grad(loss)((x, y))[1], autograd.grad(loss)((x, y))
+    ours = dp.value_and_grad(loss)((x, y))[1]
+    known = autograd.grad(loss)((x, y))
     assert all(a.dtype == kind and np.allclose(a, b, rtol=1e-6) for a, b in zip(ours, known, strict=True))
 
 
 def test_a_primitive_that_a_user_made_of_a_function_of_numpy_keeps_its_own_derivative():
-    total, average = primitive(np.sum), primitive(np.mean)
+    total = primitive(np.sum)
+    average = primitive(np.mean)
     defvjp(total, lambda ans, x: lambda g: 2.0 * g * np.ones(x.shape))
     defvjp(average, lambda ans, x: lambda g: 3.0 * g * np.ones(x.shape))
     assert np.all(dp.value_and_grad(lambda x: total(x) + average(x))(X)[1] == 5.0)
@@ -227,13 +236,15 @@ def test_an_operand_that_acts_itself_is_still_asked():
         def __array_ufunc__(self, ufunc, how, *args, **options):
             return ufunc.__name__
 
-    other, found = Louder(), []
+    other = Louder()
+    found = []
     pushforward(lambda x: found.extend([x * other, other + x]) or x, X, Y)
     assert found == ["multiply", "add"]
 
 
 RATE = lambda u, p: anp.array([u[0] * (p[0] - p[1] * u[1]), u[1] * (p[2] * u[0] - 1.0)])
-STEPS, POINT = 100, np.array([1.3, 0.9, 0.9])
+STEPS = 100
+POINT = np.array([1.3, 0.9, 0.9])
 
 
 def of_rates(p):
@@ -241,7 +252,8 @@ def of_rates(p):
 
 
 def test_small_steps_do_without_the_dispatch_of_autograd(monkeypatch):
-    calls, found = [], autograd.tracer.find_top_boxed_args
+    calls = []
+    found = autograd.tracer.find_top_boxed_args
     monkeypatch.setattr(autograd.tracer, "find_top_boxed_args", lambda args: calls.append(1) or found(args))
     pushforward(of_rates, POINT, np.ones(3))
     dp.value_and_grad(of_rates)(POINT)
@@ -266,7 +278,8 @@ def test_powers_have_the_bits_of_the_plain_ones():
     """A rollout that runs a step again, without a tape, compares bits."""
     for seed in range(40):
         rng = np.random.default_rng(seed)
-        s, u = np.float64(rng.random() + 0.3), rng.random(7) + 0.3
+        s = np.float64(rng.random() + 0.3)
+        u = rng.random(7) + 0.3
         for power in (2, 3, 1.5, -1, 0.5, np.float64(2.5)):
             for x in (s, u):
                 plain = []

@@ -56,14 +56,16 @@ def test_a_float32_state_beside_arrays_alone_must_keep_its_dtype():
 @pytest.mark.parametrize("method", ["backward_euler", "crank_nicolson", "tr_bdf2"])
 def test_cotangents_beyond_the_root_of_the_range_pass_in_silence(method):
     grid = dp.Grid((5, 4), size=1.0)
-    step, w = dp.stepper(method, dp.laplacian(grid), 0.01), np.arange(1.0, 21.0).reshape(5, 4)
+    step = dp.stepper(method, dp.laplacian(grid), 0.01)
+    w = np.arange(1.0, 21.0).reshape(5, 4)
 
     def slopes(k):
         return dp.value_and_grad(lambda a: anp.sum(np.ldexp(w, k) * step(a[0], a[1])))((np.sqrt(w), 0.75))[1]
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        high, plain = slopes(900), slopes(0)
+        high = slopes(900)
+        plain = slopes(0)
     assert np.array_equal(high[0], np.ldexp(plain[0], 900)) and high[1] == np.ldexp(plain[1], 900)
 
 

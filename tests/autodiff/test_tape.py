@@ -53,7 +53,8 @@ def test_one_pullback_serves_all_arguments_and_none_is_run_when_nothing_asks():
 def test_every_mode_of_second_order():
     """forward over reverse, reverse over reverse, reverse over forward, forward over forward."""
     f = lambda x: anp.sum(SQUARE(x) * anp.sin(x))
-    x, v = np.array([0.3, -1.2]), np.array([0.7, 0.4])
+    x = np.array([0.3, -1.2])
+    v = np.array([0.7, 0.4])
     wanted = v * (2 * np.sin(x) + 4 * x * np.cos(x) - x**2 * np.sin(x))
     slope = lambda x: value_and_grad(f)(x)[1]
     along = lambda x: pushforward(f, x, v)[1]
@@ -73,7 +74,8 @@ def test_float32_has_second_derivatives_in_every_mode():
     op = dp.laplacian(dp.Grid(4))
     scale = np.arange(1.0, 5.0)  # float64 meets float32: cotangents are cast on the way back
     f = lambda u: anp.sum(op(u * scale) ** 2)
-    u, v = np.ones(4, np.float32), np.arange(4, dtype=np.float32)
+    u = np.ones(4, np.float32)
+    v = np.arange(4, dtype=np.float32)
     wanted = 2 * scale * op.T(op(scale * v))
     slope = lambda u: value_and_grad(f)(u)[1]
     for product in (pushforward(slope, u, v)[1], value_and_grad(lambda u: anp.sum(slope(u) * v))(u)[1]):
@@ -192,7 +194,8 @@ def test_an_exception_in_an_inner_derivative_leaves_the_outer_one_right():
 def test_linear_rules_are_each_others_derivative():
     rows = np.array([[1.0, 2.0], [0.0, 3.0], [4.0, 0.0]])
     there, back = linear("rows", lambda x: rows @ x, lambda g: rows.T @ g)
-    x, g = np.array([1.0, -1.0]), np.array([1.0, 2.0, 3.0])
+    x = np.array([1.0, -1.0])
+    g = np.array([1.0, 2.0, 3.0])
     np.testing.assert_array_equal(pullback(there, x)[1](g), rows.T @ g)
     np.testing.assert_array_equal(pullback(back, g)[1](x), rows @ x)
     hessian = pushforward(lambda x: value_and_grad(lambda x: anp.sum(there(x) ** 2))(x)[1], x, x)[1]
@@ -210,7 +213,8 @@ def test_tape_cost_of_one_operator_call():
                 u = call(u)
             return anp.sum(u)
 
-        slope, u = value_and_grad(loss), np.ones((2, 2))
+        slope = value_and_grad(loss)
+        u = np.ones((2, 2))
         slope(u)
         return min(repeat(lambda: slope(u), timer=process_time, number=1, repeat=30))
 

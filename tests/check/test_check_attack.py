@@ -150,7 +150,8 @@ def scene(seed):
     if seed % 5 > 2:
         matrix = -spread if seed % 5 == 4 else dp.identity(grid.cells) - 0.3 * spread
         acts.append(dp.inverse(matrix, ("krylov", "multigrid", "direct")[rng.integers(3)]))
-    weights, offset = rng.standard_normal(grid.shape), 10.0 ** rng.uniform(-3, 3) * rng.integers(2)
+    weights = rng.standard_normal(grid.shape)
+    offset = 10.0 ** rng.uniform(-3, 3) * rng.integers(2)
     order = int(rng.integers(1, 3))
 
     def loss(u):

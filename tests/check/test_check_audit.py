@@ -77,7 +77,8 @@ def test_numbers_linear_losses_and_solves():
 
 def test_what_is_judged_is_not_recorded():
     """A ledger that is open may change how things are called; one run on its own tells which solves there are."""
-    solve, seen = dp.inverse(-dp.laplacian(GRID, dp.dirichlet), "krylov", rtol=1e-9), []
+    solve = dp.inverse(-dp.laplacian(GRID, dp.dirichlet), "krylov", rtol=1e-9)
+    seen = []
 
     def loss(b):
         seen.append(bool(thread.calls))

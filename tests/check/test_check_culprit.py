@@ -351,8 +351,10 @@ def test_loose_solves_are_inconclusive():
 
 def test_a_fault_inside_rollout_transport_and_steps():
     grid = dp.Grid((6, 5), size=1.0)
-    L, move = dp.laplacian(grid, dp.dirichlet), dp.transport(grid, "upwind")
-    ink, wind = np.cos(np.arange(30.0)).reshape(6, 5), 0.1 * np.sin(np.arange(float(grid.faces.size)))
+    L = dp.laplacian(grid, dp.dirichlet)
+    move = dp.transport(grid, "upwind")
+    ink = np.cos(np.arange(30.0)).reshape(6, 5)
+    wind = 0.1 * np.sin(np.arange(float(grid.faces.size)))
     cube = dp.differentiable(
         "cube", lambda u: u**3, lambda nums, ans, u: lambda g: (3.003 * u**2 * g,), lambda n, t, ans, u: 3 * u**2 * t[0]
     )

@@ -52,7 +52,8 @@ def test_a_right_gradient_is_not_accused_for_noise_of_any_size(size):
     """Noise that is new at every point: a table of differences measures it, wherever the steps of the sweep are."""
     rng = np.random.default_rng(1)
     for scale in (0.1, 1.0, 10.0, 1.0, 0.1, 10.0):
-        x, weights = scale * rng.normal(size=3), np.arange(1.0, 4.0)
+        x = scale * rng.normal(size=3)
+        weights = np.arange(1.0, 4.0)
 
         def loss(z, size=size, weights=weights):
             return np.sum(np.sin(z) * np.exp(z / 3)) + size * (weights @ z * 1e9 % 1.0 - 0.5)
@@ -74,11 +75,13 @@ def test_a_point_where_every_line_is_straight_but_no_derivative_exists():
     weights = np.random.default_rng(4).standard_normal(6)
 
     def loss(u):
-        x, y = u[::2], u[1::2]
+        x = u[::2]
+        y = u[1::2]
         return anp.sum(weights * x**3 / (x**2 + y**2 + 1e-300)) + 3 * anp.sum(u)
 
     def slope(u):
-        x, y = u[::2], u[1::2]
+        x = u[::2]
+        y = u[1::2]
         square = np.where(x**2 + y**2 > 0, x**2 + y**2, 1.0)
         pairs = np.stack([(x**4 + 3 * x**2 * y**2) / square**2, -2 * x**3 * y / square**2])
         return 3 + np.ravel(weights * pairs, "F")
@@ -156,7 +159,8 @@ def test_a_right_gradient_is_not_accused_for_a_ripple_that_its_curvature_hides(s
 
 def test_a_constant_far_above_the_rest_makes_no_ripple():
     """Steps of 1e11 see no curvature at all, and are no measure of the usual one."""
-    x, off = np.random.default_rng(0).uniform(0.5, 1.0, 7), lambda factor: lambda u: factor * np.cos(u)
+    x = np.random.default_rng(0).uniform(0.5, 1.0, 7)
+    off = lambda factor: lambda u: factor * np.cos(u)
     loss = lambda u: 1e8 + anp.sum(anp.sin(u))
     assert AUDIT(loss, x, gradient=off(1.01)).verdict == "disagrees"
     assert AUDIT(loss, x, gradient=off(1.0)).verdict == "agrees"

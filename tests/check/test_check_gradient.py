@@ -89,7 +89,8 @@ def test_a_minimum_and_a_gradient_of_zero():
 
 def advance(mistake):
     """u + dt A u with a rule of our own; `mistake` spoils its VJP."""
-    op, dt = dp.upwind(GRID, "x", boundary=dp.dirichlet), 0.05
+    op = dp.upwind(GRID, "x", boundary=dp.dirichlet)
+    dt = 0.05
     vjps = {
         "none": lambda g: g + dt * op.T(g),
         "A for the transpose": lambda g: g + dt * op(g),
@@ -108,7 +109,8 @@ def advance(mistake):
 
 @pytest.mark.parametrize("mistake", advance("none")[1])
 def test_planted_mistakes(mistake, rng):
-    step, x = advance(mistake)[0], rng.standard_normal(GRID.shape)
+    step = advance(mistake)[0]
+    x = rng.standard_normal(GRID.shape)
     result = AUDIT(lambda u: anp.sum(anp.tanh(step(anp.sin(step(u)))) ** 2), x)
     assert result.verdict == ("agrees" if mistake == "none" else "disagrees"), result
 
@@ -134,7 +136,8 @@ def test_random_scenes(rng):
     for _ in range(4):
         grid = dp.Grid(tuple(rng.integers(3, 9, 2)), spacing=rng.uniform(0.5, 2.0))
         mix = dp.identity(grid.cells) + 0.1 * dp.laplacian(grid, dp.dirichlet)
-        weights, x = rng.standard_normal(grid.shape), rng.standard_normal(grid.shape)
+        weights = rng.standard_normal(grid.shape)
+        x = rng.standard_normal(grid.shape)
         assert AUDIT(scene(0.0), x)
         assert AUDIT(scene(1e-3), x).verdict == "disagrees"
 

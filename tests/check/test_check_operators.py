@@ -106,7 +106,8 @@ def test_the_card_as_text_and_data():
 class Mutating(Structure):
     """Twice a field, which it writes into; `from_functions` would hand it a read-only one."""
 
-    shape, has_entries = (CELLS.size,) * 2, False
+    shape = (CELLS.size,) * 2
+    has_entries = False
 
     def apply(self, x, out):
         x *= 2
@@ -173,7 +174,9 @@ class Torn(Structure):
     """Factor-like: a matrix, and an application that forgets the 1 / h of the last row."""
 
     def __init__(self, matrix, factor, transposed=False):
-        self.matrix, self.factor, self.transposed = sp.csr_array(matrix), factor, transposed
+        self.matrix = sp.csr_array(matrix)
+        self.factor = factor
+        self.transposed = transposed
         self.shape = self.matrix.shape
 
     def apply(self, x, out):
@@ -234,7 +237,8 @@ def test_norms_from_products_are_bounds_from_below():
 
     op = dp.laplacian(GRID, dp.dirichlet)
     free = given(op.apply, op.T.apply)
-    exact, bound = Probe(op).size, Probe(free).size
+    exact = Probe(op).size
+    bound = Probe(free).size
     assert 0.3 * exact <= bound <= exact * (1 + 1e-12)
     assert Probe(given(op.apply, None)).size <= exact * (1 + 1e-12)
 
@@ -242,7 +246,8 @@ def test_norms_from_products_are_bounds_from_below():
 def test_a_check_draws_from_its_own_generator():
     np.random.seed(5)  # noqa: NPY002
     before = np.random.get_state()[1].copy()  # noqa: NPY002
-    one, two = dp.check.transpose(RIGHT["gradient"]), dp.check.transpose(RIGHT["gradient"])
+    one = dp.check.transpose(RIGHT["gradient"])
+    two = dp.check.transpose(RIGHT["gradient"])
     assert np.array_equal(before, np.random.get_state()[1])  # noqa: NPY002
     assert one.to_dict() == two.to_dict()
     assert dp.check.transpose(RIGHT["gradient"], seeds=2, rng=7).ok

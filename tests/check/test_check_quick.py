@@ -30,7 +30,8 @@ def test_a_quick_audit_takes_a_third_and_says_what_it_did_not_look_at():
     def loss(x):
         return np.sum(np.sin(x["a"])) ** 2 + np.sum(np.exp(x["b"])) * np.sum(x["a"])
 
-    whole, quick = dp.check.gradient(loss, x), dp.check.gradient(loss, x, quick=True)
+    whole = dp.check.gradient(loss, x)
+    quick = dp.check.gradient(loss, x, quick=True)
     assert whole.verdict == quick.verdict == "agrees"
     assert 3 * quick.evaluations <= whole.evaluations + 10
     assert [one.direction for one in quick.lines] == ["random 1", "gradient"]

@@ -7,7 +7,8 @@ from scipy.optimize import brentq
 
 import sparsedp as dp
 
-GAMMA, GRAVITY = 1.4, 9.81
+GAMMA = 1.4
+GRAVITY = 9.81
 
 
 def pressure(u):
@@ -16,13 +17,15 @@ def pressure(u):
 
 
 def euler_flux(u, params, axis):
-    v, p = u[1 + axis] / u[0], pressure(u)
+    v = u[1 + axis] / u[0]
+    p = pressure(u)
     rows = [u[k] * v + (p if k == 1 + axis else 0.0) for k in range(len(u) - 1)]
     return anp.stack([*rows, v * (u[-1] + p)])
 
 
 def euler_speed(u, params, axis):
-    v, c = u[1 + axis] / u[0], anp.sqrt(GAMMA * pressure(u) / u[0])
+    v = u[1 + axis] / u[0]
+    c = anp.sqrt(GAMMA * pressure(u) / u[0])
     return v - c, v + c
 
 
@@ -34,7 +37,8 @@ def water_flux(u, params, axis):
 
 
 def water_speed(u, params, axis):
-    v, c = u[1 + axis] / u[0], anp.sqrt(GRAVITY * u[0])
+    v = u[1 + axis] / u[0]
+    c = anp.sqrt(GRAVITY * u[0])
     return v - c, v + c
 
 
@@ -50,9 +54,12 @@ def run(law, u, end, cfl=0.4, params=None):
 
 def sod(x, time):
     """Density of Sod's tube (J. Comput. Phys. 27, 1978) by the exact solution: fan, contact, shock."""
-    left, right, wave = (1.0, 1.0), (0.125, 0.1), (GAMMA - 1) / (GAMMA + 1)
+    left = (1.0, 1.0)
+    right = (0.125, 0.1)
+    wave = (GAMMA - 1) / (GAMMA + 1)
     cl, cr = (np.sqrt(GAMMA * p / rho) for rho, p in (left, right))
-    a, b = 2 / ((GAMMA + 1) * right[0]), wave * right[1]
+    a = 2 / ((GAMMA + 1) * right[0])
+    b = wave * right[1]
 
     def excess(p):
         expansion = 2 * cl / (GAMMA - 1) * ((p / left[1]) ** ((GAMMA - 1) / 2 / GAMMA) - 1)
@@ -63,7 +70,8 @@ def sod(x, time):
     behind_fan = left[0] * (p / left[1]) ** (1 / GAMMA)
     behind_shock = right[0] * (p / right[1] + wave) / (wave * p / right[1] + 1)
     shock = cr * np.sqrt((GAMMA + 1) / 2 / GAMMA * p / right[1] + (GAMMA - 1) / 2 / GAMMA)
-    s, c = (x - 0.5) / time, cl * (p / left[1]) ** ((GAMMA - 1) / 2 / GAMMA)
+    s = (x - 0.5) / time
+    c = cl * (p / left[1]) ** ((GAMMA - 1) / 2 / GAMMA)
     fan = left[0] * np.maximum(2 / (GAMMA + 1) - wave / cl * s, 0) ** (2 / (GAMMA - 1))
     return np.select([s < -cl, s < v - c, s < v, s < shock], [left[0], fan, behind_fan, behind_shock], right[0])
 
@@ -88,7 +96,9 @@ def stoker(x, time, deep, shallow):
         )
 
     h = brentq(excess, shallow, deep)
-    v, c, s = 2 * (np.sqrt(GRAVITY * deep) - np.sqrt(GRAVITY * h)), np.sqrt(GRAVITY * deep), x / time
+    v = 2 * (np.sqrt(GRAVITY * deep) - np.sqrt(GRAVITY * h))
+    c = np.sqrt(GRAVITY * deep)
+    s = x / time
     fan = (2 * c - s) ** 2 / 9 / GRAVITY
     shock = h * v / (h - shallow)
     return np.select([s < -c, s < v - np.sqrt(GRAVITY * h), s < shock], [deep, fan, h], shallow)
@@ -132,7 +142,8 @@ def test_lake_at_rest(dim):
 def river(n, flow, equilibrium="lake", bump=True):
     """A channel of 25 m with a bump (Goutal and Maurel, 1997), depth 2 m and discharge `flow` at both ends."""
     grid = dp.Grid(n, size=25.0)
-    x, h = grid.centres()[0], 25.0 / n
+    x = grid.centres()[0]
+    h = 25.0 / n
     ground = bump * np.maximum(0.2 - 0.05 * (x - 10) ** 2, 0.0)
     slope = np.gradient(ground, h)
     lake = np.stack([2.0 - ground, 0.0 * ground])
@@ -197,7 +208,8 @@ def test_wave_of_euler_in_a_plane():
         x, y = grid.centres()
 
         def state(time, x=x, y=y):
-            rho, one = 1 + 0.2 * np.sin(2 * np.pi * (x + y - 2 * time)), 1 + 0 * x
+            rho = 1 + 0.2 * np.sin(2 * np.pi * (x + y - 2 * time))
+            one = 1 + 0 * x
             return np.stack([rho, rho, rho, one / (GAMMA - 1) + rho])
 
         end = run(dp.conservation_law(grid, euler_flux, euler_speed), state(0.0), 0.1)
@@ -212,7 +224,8 @@ def test_every_axis_is_the_same(axis):
     """A flow along any axis of a box with walls, inflow and stretched cells is the one-dimensional one."""
     widths = np.linspace(0.5, 1.5, 12)
     line = dp.Grid(12, spacing=[widths])
-    shape, spacing = [2, 3, 2], [1.0, 1.0, 1.0]
+    shape = [2, 3, 2]
+    spacing = [1.0, 1.0, 1.0]
     shape[axis], spacing[axis] = 12, widths
     box = dp.Grid(tuple(shape), spacing=spacing)
     u = np.stack([1.0 + 0.2 * np.sin(np.arange(12)), 0.1 * np.cos(np.arange(12))])
@@ -220,7 +233,8 @@ def test_every_axis_is_the_same(axis):
     one = dp.conservation_law(line, water_flux, water_speed, boundary={"x": sides}, momentum=1, inflow=[1.2, 0.3])(u)
     fields = np.zeros((4, 12))
     fields[0], fields[1 + axis] = u
-    given, inside = np.zeros(4), [1, 1, 1]
+    given = np.zeros(4)
+    inside = [1, 1, 1]
     given[0], given[1 + axis], inside[axis] = 1.2, 0.3, 12
     conditions = {"xyz"[a]: sides if a == axis else dp.free_slip for a in range(3)}
     law = dp.conservation_law(
@@ -238,15 +252,20 @@ def twin(u, widths, flux, speed):
     u = anp.concatenate([u[:, 1::-1] * [[1], [-1]], u, u[:, :-3:-1] * [[1], [-1]]], 1)
     h = np.concatenate([widths[1::-1], widths, widths[:-3:-1]])
     step = u[:, 1:] - u[:, :-1]
-    a, b = step[:, :-1], step[:, 1:]
-    c, e = (h[1:-1] + h[:-2]) / h[1:-1], (h[1:-1] + h[2:]) / h[1:-1]
+    a = step[:, :-1]
+    b = step[:, 1:]
+    c = (h[1:-1] + h[:-2]) / h[1:-1]
+    e = (h[1:-1] + h[2:]) / h[1:-1]
     q = a / anp.where(a * b > 0, a + b, 1.0)
-    p, m = 1 - q, (c + e - 2) * c * e
+    p = 1 - q
+    m = (c + e - 2) * c * e
     share = q * p * (q * e**2 + p * c**2) / (q * q * e**2 + m * q * p + p * p * c**2)
     slope = anp.where(a * b > 0, (a + b) * share, 0.0)
-    lower, upper = u[:, 1:-2] + slope[:, :-1], u[:, 2:-1] - slope[:, 1:]
+    lower = u[:, 1:-2] + slope[:, :-1]
+    upper = u[:, 2:-1] - slope[:, 1:]
     (s0, f0), (s1, f1) = speed(lower, None, 0), speed(upper, None, 0)
-    a, b = anp.minimum(anp.minimum(s0, s1), 0.0), anp.maximum(anp.maximum(f0, f1), 0.0)
+    a = anp.minimum(anp.minimum(s0, s1), 0.0)
+    b = anp.maximum(anp.maximum(f0, f1), 0.0)
     f = (b * flux(lower, None, 0) - a * flux(upper, None, 0) + a * b * (upper - lower)) / (b - a)
     return (f[:, :-1] - f[:, 1:]) / widths
 
@@ -256,7 +275,9 @@ def test_twin_and_derivatives():
     grid = dp.Grid(9, spacing=[widths])
     law = dp.conservation_law(grid, water_flux, water_speed, boundary=dp.free_slip, momentum=1)
     rng = np.random.default_rng(0)
-    u, g, t = np.stack([1 + 0.3 * rng.random(9), rng.random(9) - 0.5]), rng.random((2, 9)), rng.random((2, 9))
+    u = np.stack([1 + 0.3 * rng.random(9), rng.random(9) - 0.5])
+    g = rng.random((2, 9))
+    t = rng.random((2, 9))
 
     def other(u):
         return twin(u, widths, water_flux, water_speed)
@@ -309,7 +330,8 @@ def test_a_front_that_runs_into_zero_has_a_gradient(name):
     grid = dp.Grid(60, size=1.0)
     law = dp.conservation_law(grid, *FRONTS[name], scheme="upwind")
     step = dp.stepper("ssprk3", law, 0.3 / 60)
-    start, along = np.where(grid.centres()[0] < 0.3, 1.0, 0.0), np.exp(-((grid.centres()[0] - 0.1) ** 2) / 0.002)
+    start = np.where(grid.centres()[0] < 0.3, 1.0, 0.0)
+    along = np.exp(-((grid.centres()[0] - 0.1) ** 2) / 0.002)
     weights = np.sin(np.arange(60.0))
     loss = lambda u: anp.sum(weights * dp.rollout(step, u, None, 40))
     slope = np.sum(dp.grad(loss)(start) * along)
@@ -472,7 +494,8 @@ def test_one_field_is_the_momentum_of_one_axis():
 
 def test_a_lone_field_may_be_the_momentum():
     """Burgers' equation between walls: u is its own momentum, as a field of the grid and as one of a stack."""
-    half, walls = lambda u, p, axis: 0.5 * u**2, dict(boundary=dp.free_slip, momentum=0)
+    half = lambda u, p, axis: 0.5 * u**2
+    walls = dict(boundary=dp.free_slip, momentum=0)
     law = dp.conservation_law(LINE, half, lambda u, p, axis: (u, u), **walls)
     stack = dp.conservation_law(LINE, half, lambda u, p, axis: (u[0], u[0]), **walls)
     u = np.array([1.0, 2.0, 4.0, 3.0])

@@ -8,7 +8,8 @@ import pytest
 
 import sparsedp as dp
 
-SHAPE, NONFINITE = dp.errors.ShapeError, dp.errors.NonFiniteError
+SHAPE = dp.errors.ShapeError
+NONFINITE = dp.errors.NonFiniteError
 SCHEMES = ("upwind", "van_leer", "semi_lagrangian", "maccormack")
 SPLIT = ("imex", "etdrk4")
 METHODS = ("euler", "heun", "ssprk3", "rk4", "backward_euler", "crank_nicolson", "tr_bdf2", "radau", *SPLIT)
@@ -105,7 +106,8 @@ def test_a_complex_rate_of_a_real_state(method):
 @pytest.mark.parametrize("method", METHODS)
 def test_what_is_not_finite_is_named(method):
     """Also where a solver on the way is the first to meet it."""
-    step, timed = made(method, lambda u, p: -p * u), made(method, lambda u, p, t: -p * u * anp.cos(t))
+    step = made(method, lambda u, p: -p * u)
+    timed = made(method, lambda u, p, t: -p * u * anp.cos(t))
     u = np.ones(5)
     wrong = np.array([1.0, 1.0, np.nan, 1.0, np.inf])
     at = "got 2 that are NaN or infinite, the first at 2$"
@@ -134,7 +136,8 @@ def test_kinds_of_numbers_in_a_loop_of_linear_steps(method, rng):
     for kind, other in product("fdFD", "fd"):
         start = (u + 1j * u[::-1]).astype(kind) if kind in "FD" else u.astype(kind)
         point = (start, np.dtype(other).type(0.3))
-        found, wanted = slopes(point)[1], plain(point)[1]
+        found = slopes(point)[1]
+        wanted = plain(point)[1]
         assert found[0].dtype == kind and np.asarray(found[1]).dtype == other
         for one, two in zip(found, wanted):
             assert np.max(np.abs(one - two)) <= (1e-13 if kind + other in ("dd", "Dd") else 1e-5) * np.max(np.abs(two))
@@ -148,7 +151,9 @@ def test_a_rollout_of_whole_numbers_that_become_floats_is_refused():
 @pytest.mark.parametrize("method", ["backward_euler", "crank_nicolson", "tr_bdf2", "imex"])
 def test_a_fixed_operator_over_n_steps(method, rng):
     """One set-up; a solve a stage forward and one back, in nu too; the same bits on any budget."""
-    step, u, n = dp.stepper(method, dp.laplacian(dp.Grid((9, 8)), dp.dirichlet), 0.7), rng.random((9, 8)), 6
+    step = dp.stepper(method, dp.laplacian(dp.Grid((9, 8)), dp.dirichlet), 0.7)
+    u = rng.random((9, 8))
+    n = 6
     stages = 2 if method in ("tr_bdf2", "imex") else 1
 
     def loss(memory=None):

@@ -63,7 +63,8 @@ def test_obstacles_by_hand(word):
     solid[2, 2] = True
     L = dp.face_laplacian(grid, dp.no_slip, solid, word)
     v = dp.interior(grid, solid)(field(grid))
-    u, bent = grid.split(v)[0], grid.split(L(v))[0]
+    u = grid.split(v)[0]
+    bent = grid.split(L(v))[0]
     below = -u[2, 3] if word == dp.no_slip else u[2, 3]  # the mirror image in the upper side of the obstacle
     wanted = u[1, 3] + u[3, 3] + u[2, 4] + below - 4 * u[2, 3]
     assert bent[2, 3] == pytest.approx(wanted, rel=1e-13)
@@ -77,7 +78,8 @@ def test_moving_wall_drags_the_fluid_along(stretched):
     """Couette flow between a wall at rest and a moving one is linear, exactly."""
     widths = np.linspace(1, 2, 6) if stretched else np.ones(6)
     grid = dp.Grid((3, 6), spacing=(1.0, widths), periodic=(True, False))
-    L, B = dp.face_laplacian(grid), dp.face_lift(grid)
+    L = dp.face_laplacian(grid)
+    B = dp.face_lift(grid)
     y = grid.face_centres(0)[1]
     v = grid.join(2.0 * y / grid.size[1], 0.0)
     np.testing.assert_allclose(L(v) + B(B.domain.join(0.0, 2.0)), 0, atol=1e-13)
@@ -91,7 +93,8 @@ def test_channel_is_of_second_order():
         solve = dp.inverse(
             dp.mask(grid.faces, ~dp.interior(grid)(np.ones(grid.faces.size)).astype(bool)) - dp.face_laplacian(grid)
         )
-        u, y = grid.split(solve(grid.join(1.0, 0.0)))[0], grid.face_centres(0)[1]
+        u = grid.split(solve(grid.join(1.0, 0.0)))[0]
+        y = grid.face_centres(0)[1]
         errors.append(np.max(np.abs(u - 0.5 * y * (1 - y))))
     assert 1.9 <= np.log2(errors[0] / errors[1]) <= 2.2 and 1.9 <= np.log2(errors[1] / errors[2]) <= 2.2
 
@@ -134,8 +137,10 @@ def test_convection_and_its_derivatives_against_slices():
 def test_convection_conserves(shape):
     """Momentum on periodic grids, and energy wherever nothing enters, when the carrier has no divergence."""
     for grid in grids(shape):
-        w, v = dp.projection(grid)(field(grid)), dp.interior(grid)(field(grid, 1))
-        convect, W = dp.convection(grid), grid.faces.volumes
+        w = dp.projection(grid)(field(grid))
+        v = dp.interior(grid)(field(grid, 1))
+        convect = dp.convection(grid)
+        W = grid.faces.volumes
         rate = convect(v, w)
         if all(grid.periodic):
             for part in grid.split(W * rate):
@@ -170,7 +175,8 @@ def vortex(grid):
 def test_order_two_in_time(implicit):
     """Velocity of a vortex between four walls, incremental pressure: order 1.8 or more; its gradient in nu too."""
     grid = dp.Grid((10, 10), size=1.0)
-    start, end = vortex(grid), 0.16
+    start = vortex(grid)
+    end = 0.16
 
     def run(steps):
         step = dp.flow_step(grid, end / steps, 0.05, implicit=implicit)
@@ -187,7 +193,8 @@ def test_order_two_in_time(implicit):
 @pytest.mark.parametrize("implicit", [False, True])
 def test_a_force_on_walls_and_inflows_does_nothing(implicit):
     """Implicit viscosity once carried it into the fluid: a first-order error. What flows in is given."""
-    grid, end = dp.Grid((8, 8), size=1.0), 0.016
+    grid = dp.Grid((8, 8), size=1.0)
+    end = 0.016
     x, y = grid.centres()
     force = dp.average(grid)(100 * np.sin(3 * x) * y) * grid.join(0.0, 1.0)
     answers = []
@@ -304,7 +311,9 @@ def test_what_is_refused():
 @pytest.mark.parametrize("convective", [False, True])
 def test_a_short_step_drags_alike_with_explicit_and_implicit_viscosity(convective):
     """Moving walls drag the field at both ends of an implicit step: a short one ends where the explicit one does."""
-    grid, dt, nu = dp.Grid((6, 5), size=1.0), 1e-6, 0.3
+    grid = dp.Grid((6, 5), size=1.0)
+    dt = 1e-6
+    nu = 0.3
     lid = dp.face_lift(grid)
     walls = lid(lid.domain.join(0.0, -0.5, 0.0, 1.0))
     shorts = [
@@ -320,7 +329,8 @@ def test_a_source_has_the_shape_of_its_field_and_changes_none():
         s["heat"] *= 2.0
         return s["heat"]
 
-    grid, heat = dp.Grid((4, 5)), np.ones((4, 5))
+    grid = dp.Grid((4, 5))
+    heat = np.ones((4, 5))
     for source, error, message in (
         (
             lambda s, params: np.ones(5),

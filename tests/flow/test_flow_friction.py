@@ -16,19 +16,24 @@ def scene(shape=(8, 6), **given):
     """A grid, a distance from its middle on its faces, and a friction of any radius."""
     grid = dp.Grid(shape, size=(1.0, 0.75), **given)
     x, y = (grid.join(*(grid.face_centres(axis)[a] for axis in (0, 1))) for a in (0, 1))
-    distance, rub = np.hypot(x - 0.4, y - 0.4), dp.brinkman(grid)
+    distance = np.hypot(x - 0.4, y - 0.4)
+    rub = dp.brinkman(grid)
     return grid, distance, lambda radius: 0.05 * rub(distance - radius)
 
 
 def twin(grid, dt, v, f, n):
     """The same steps with the velocity before, as the docstring of flow_step.py writes them."""
-    project, slope = dp.projection(grid), dp.gradient(grid)
-    viscous, convect = dp.face_laplacian(grid), dp.convection(grid)
+    project = dp.projection(grid)
+    slope = dp.gradient(grid)
+    viscous = dp.face_laplacian(grid)
+    convect = dp.convection(grid)
     rate = lambda v: 0.05 * viscous(v) - convect(v, v)
     v = older = project(v)
-    p, a = np.zeros(grid.shape), rate(v)
+    p = np.zeros(grid.shape)
+    a = rate(v)
     for _ in range(n):
-        before, a = a, rate(v)
+        before = a
+        a = rate(v)
         ahead = v + dt * (1.5 * a - 0.5 * before - slope(p)) + 0.5 * dt * f * (v - older)
         ahead = ahead / (1 + dt * f)
         q = project.pressure(ahead)
@@ -38,7 +43,8 @@ def twin(grid, dt, v, f, n):
 
 def test_the_steps_of_a_twin_and_its_gradient():
     grid, _, friction = scene()
-    f, start = np.minimum(friction(0.2), 500.0), 0.1 * np.sin(np.arange(grid.faces.size))
+    f = np.minimum(friction(0.2), 500.0)
+    start = 0.1 * np.sin(np.arange(grid.faces.size))
     step = dp.flow_step(grid, 0.01, 0.05, friction=lambda f: f)
     runs = [
         lambda f: anp.sum(dp.rollout(step, step.start(start, f), f, 6)["v"] ** 3),
@@ -51,22 +57,26 @@ def test_the_steps_of_a_twin_and_its_gradient():
 
 def test_derivatives_in_the_radius_of_an_obstacle():
     grid, _, friction = scene()
-    step, wind = dp.flow_step(grid, 0.02, 0.05, boundary=SIDES, friction=friction), grid.join(1.0, 0.0)
+    step = dp.flow_step(grid, 0.02, 0.05, boundary=SIDES, friction=friction)
+    wind = grid.join(1.0, 0.0)
 
     def loss(radius):
         return anp.sum(dp.rollout(step, step.start(wind, radius), radius, 5)["v"] ** 2)
 
     assert dp.check.gradient(loss, 0.17, quick=True).verdict == "agrees"
-    slope, h = dp.grad(loss), 1e-5
+    slope = dp.grad(loss)
+    h = 1e-5
     assert dp.jvp(loss, 0.17, 1.0)[1] == pytest.approx(slope(0.17), rel=1e-9)
     assert dp.hvp(loss, 0.17, 1.0) == pytest.approx((slope(0.17 + h) - slope(0.17 - h)) / (2 * h), rel=1e-5)
 
 
 def test_order_two_in_time():
     grid, distance, _ = scene((10, 8))
-    friction, end = 30 * np.exp(-20 * distance**2), 0.16
+    friction = 30 * np.exp(-20 * distance**2)
+    end = 0.16
     x, y = np.meshgrid(*(grid.coordinates(a, "nodes") for a in (0, 1)), indexing="ij")
-    start, answers = dp.curl(grid)((np.sin(np.pi * x) * np.sin(np.pi * y / 0.75)) ** 2), []
+    start = dp.curl(grid)((np.sin(np.pi * x) * np.sin(np.pi * y / 0.75)) ** 2)
+    answers = []
     for steps in (16, 32, 64):
         step = dp.flow_step(grid, end / steps, 0.05, friction=friction)
         answers.append(dp.rollout(step, step.start(start), None, steps)["v"])
@@ -87,7 +97,9 @@ def test_stable_for_any_friction(large):
 
 def test_alone_it_damps_as_its_formula():
     """A uniform wind on a periodic line, under a uniform friction; bits are those of a function of params."""
-    grid, dt, m = dp.Grid(4, periodic=True), 0.5, 2.0
+    grid = dp.Grid(4, periodic=True)
+    dt = 0.5
+    m = 2.0
     step = dp.flow_step(grid, dt, friction=np.full(4, m / dt))
     other = pickle.loads(pickle.dumps(dp.flow_step(grid, dt, friction=np.full(4, m / dt))))
     third = dp.flow_step(grid, dt, friction=lambda f: f * np.ones(4))

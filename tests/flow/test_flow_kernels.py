@@ -27,12 +27,17 @@ def projections(shape):
 @pytest.mark.skipif(not kernels.compiled(), reason="numba is not installed")
 @pytest.mark.parametrize("shape", SHAPES)
 def test_passes_are_what_the_operators_do(shape):
-    rng, many = np.random.default_rng(1), 0
+    rng = np.random.default_rng(1)
+    many = 0
     for grid, setup in projections(shape):
         assert setup.passes is not setup.products or min(shape) == 1
         for passes, products in zip(setup.passes, setup.products):
-            x, p, many = rng.standard_normal(grid.faces.size), rng.standard_normal(grid.cells.size), many + 1
-            b, out, inner = np.full(p.size, np.nan), np.full(x.size, np.nan), setup.open * x
+            x = rng.standard_normal(grid.faces.size)
+            p = rng.standard_normal(grid.cells.size)
+            many = many + 1
+            b = np.full(p.size, np.nan)
+            out = np.full(x.size, np.nan)
+            inner = setup.open * x
             norms = passes.net_flow(x, b)
             passes.push(x, p, out)
             np.testing.assert_allclose(b, products.first.product(inner), rtol=0, atol=1e-11)

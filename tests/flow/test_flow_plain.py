@@ -43,7 +43,8 @@ def scene(shape=(8, 6), spacing=0.2, periodic=False, walls=None, dtype=float, **
     if walls:
         lid = dp.face_lift(grid)
         walls = lid(np.linspace(0.0, 1.0, lid.domain.size))
-    step, rng = dp.flow_step(grid, 0.05, walls=walls, **options), np.random.default_rng(3)
+    step = dp.flow_step(grid, 0.05, walls=walls, **options)
+    rng = np.random.default_rng(3)
     v, p, a = (rng.standard_normal(n).astype(dtype) for n in (grid.faces.size, grid.cells.size, grid.faces.size))
     state = {"v": dp.projection(grid, options.get("solid"))(0.3 * v), "p": p.reshape(grid.shape), "a": 0.3 * a}
     return step, state, {"push": np.ones(1, dtype), "nu": 0.1, "name": "ink", "count": 3}

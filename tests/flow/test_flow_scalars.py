@@ -9,8 +9,11 @@ import sparsedp as dp
 
 def cavity(n, dt, implicit=True, rayleigh=1e4, **options):
     """A square, hot at x = 0, cold at x = 1 (de Vahl Davis, 1983)."""
-    grid, hot = dp.Grid((n, n), size=1.0), {"x": dp.dirichlet}
-    values, mean, up = dp.lift(grid, hot).domain.join(1.0, 0.0, 0.0, 0.0), dp.average(grid), grid.join(0.0, 1.0)
+    grid = dp.Grid((n, n), size=1.0)
+    hot = {"x": dp.dirichlet}
+    values = dp.lift(grid, hot).domain.join(1.0, 0.0, 0.0, 0.0)
+    mean = dp.average(grid)
+    up = grid.join(0.0, 1.0)
     heat = {"diffusivity": 1.0, "boundary": hot, "values": values}
     push = lambda v, s, params: 0.71 * params * up * mean(s["heat"])
     step = dp.flow_step(grid, dt, 0.71, push, implicit=implicit, scalars={"heat": heat}, **options)
@@ -22,7 +25,8 @@ def heat_flow(n, implicit, dt):
     """Through each plane across x, carried and conducted, in the end."""
     grid, step, state = cavity(n, dt, implicit)
     end = dp.rollout(step, state, 1e4, round(0.25 / dt))
-    u, heat = grid.split(end["v"])[0], end["s"]["heat"]
+    u = grid.split(end["v"])[0]
+    heat = end["s"]["heat"]
     return np.mean(u[1:-1] * 0.5 * (heat[1:] + heat[:-1]) - np.diff(heat, axis=0) * n, axis=1)
 
 
@@ -59,14 +63,16 @@ def test_dye_that_flows_in_and_past_a_solid():
     solid = np.zeros(grid.shape, bool)
     solid[5:7, 3:6] = True
     sides = {"x": (dp.inflow, dp.outflow), "y": dp.free_slip}
-    D, ends = dp.divergence(grid), {"x": (dp.dirichlet, dp.neumann)}
+    D = dp.divergence(grid)
+    ends = {"x": (dp.dirichlet, dp.neumann)}
     values = dp.lift(grid, ends).domain.join(1.0, 0.0, 0.0, 0.0)
     dye = {"diffusivity": 0.5, "boundary": ends, "values": values}
     step = dp.flow_step(grid, 0.1, 0.5, boundary=sides, solid=solid, scalars={"dye": dye})
     v = grid.join(1.0, 0.0)
     state = step.start(v, None, {"dye": np.zeros(grid.shape)})
     end = dp.rollout(step, state, None, 100)
-    u, flow = end["s"]["dye"], grid.split(end["v"])[0]
+    u = end["s"]["dye"]
+    flow = grid.split(end["v"])[0]
     assert np.all(u[solid] == 0)
     assert np.max(np.abs(D(end["v"])[~solid])) < 1e-9
     assert np.max(u) < 1.1 and np.min(u) > -0.1
@@ -116,9 +122,11 @@ def test_the_limit_is_where_waves_grow(implicit):
     from sparsedp.flow.flow_step import _growth
 
     for courant, damping in ((0.3, 0.0), (0.9, 0.2), (0.7, 0.9), (1.5, 0.3)):
-        angles, fastest = np.linspace(0, np.pi, 200), 0.0
+        angles = np.linspace(0, np.pi, 200)
+        fastest = 0.0
         for angle in angles:
-            c, d = 1j * courant * np.sin(angle), damping * np.sin(angle / 2) ** 2
+            c = 1j * courant * np.sin(angle)
+            d = damping * np.sin(angle / 2) ** 2
             left = 1 + d / 2 if implicit else 1.0
             now = (1 - d / 2 + 1.5 * c if implicit else 1 + 1.5 * (c - d)) / left
             matrix = np.array([[now, -0.5 * (c if implicit else c - d) / left], [1, 0]])
@@ -151,7 +159,8 @@ def test_refusals():
 
 @pytest.mark.parametrize("implicit", [False, True])
 def test_a_wall_does_not_heat_an_obstacle_beside_it(implicit):
-    grid, solid = dp.Grid((4, 3), size=1.0), np.zeros((4, 3), bool)
+    grid = dp.Grid((4, 3), size=1.0)
+    solid = np.zeros((4, 3), bool)
     solid[0, 1] = True
     hot = {"diffusivity": 0.1, "boundary": {"x": dp.dirichlet}, "values": np.array([1.0] * 3 + [0.0] * 11)}
     step = dp.flow_step(grid, 0.01, 0.1, solid=solid, implicit=implicit, scalars={"heat": hot})

@@ -13,11 +13,13 @@ BOX = {1: np.s_[1:3], 2: np.s_[1:3, 2:], 3: np.s_[1:3, :2, :]}
 @pytest.mark.parametrize("shape", SHAPES)
 def test_flux_is_the_divergence_in_the_box(shape, rng):
     for grid in grids(shape, rng):
-        D, v = dp.divergence(grid), rng.standard_normal(grid.faces.size)
+        D = dp.divergence(grid)
+        v = rng.standard_normal(grid.faces.size)
         cells = np.zeros(shape, bool)
         cells[BOX[len(shape)]] = True
         for box, inside in ((BOX[len(shape)], cells), (solid(grid), solid(grid))):
-            out, terms = dp.flux(grid, box), grid.volumes * D(v)
+            out = dp.flux(grid, box)
+            terms = grid.volumes * D(v)
             assert np.isclose(out(v), np.sum(terms[inside]), rtol=0, atol=1e-14 * np.sum(abs(terms)))
     everywhere = dp.flux(dp.Grid(shape, periodic=True), np.ones(shape, bool))
     assert not everywhere.matrix.count_nonzero()
@@ -35,7 +37,8 @@ def obstacles(periodic, rng):
     sides = {axis: SIDES[axis] for axis in grid.axes[periodic:]}
     cells = np.zeros((9, 7), bool)
     cells[3:5, 2:4] = cells[6, 4] = True
-    v, p = dp.projection(grid, cells, sides)(rng.standard_normal(grid.faces.size)), rng.standard_normal(grid.shape)
+    v = dp.projection(grid, cells, sides)(rng.standard_normal(grid.faces.size))
+    p = rng.standard_normal(grid.shape)
     return grid, sides, cells, v, p
 
 
@@ -62,7 +65,8 @@ def test_sums_telescope(periodic, slip, rng):
 
 def test_parts_add_up_and_a_box_holds_what_is_in_it(rng):
     grid, sides, cells, v, p = obstacles(False, rng)
-    one, other = cells.copy(), cells.copy()
+    one = cells.copy()
+    other = cells.copy()
     one[6], other[:6] = False, False
     on = [dp.forces(grid, cells, sides, cells=part, about=(1.0, 3.0)) for part in (cells, one, other)]
     whole, first, second = (each(v, p, 0.3) for each in on)
@@ -95,7 +99,8 @@ def test_torque(rng):
 
 def test_derivatives_of_forces(rng):
     grid, sides, cells, v, p = obstacles(False, rng)
-    on, weights = dp.forces(grid, cells, sides), rng.standard_normal(3)
+    on = dp.forces(grid, cells, sides)
+    weights = rng.standard_normal(3)
     x = {"v": v, "p": p, "nu": 0.3}
     loss = lambda x: anp.sum(weights * on(x["v"], x["p"], x["nu"])) ** 2
     assert dp.check.gradient(loss, x, quick=True).verdict == "agrees"
@@ -114,7 +119,8 @@ def flat_wall(grid, angle, place):
 @pytest.mark.parametrize("angle", [0.0, 0.4, np.pi / 4, 2.0])
 def test_a_flat_wall_is_felt_where_it_stands(angle):
     """The profile of the formula solves the equation on the grid, at every slope and every place."""
-    grid, h = dp.Grid((12, 12), size=3.0), 0.25
+    grid = dp.Grid((12, 12), size=3.0)
+    h = 0.25
     for place in (1.3, 1.41, 1.5):
         s = flat_wall(grid, angle, place)
         U = np.logaddexp(0.0, 8 * s / h) * h / 8
@@ -142,7 +148,8 @@ def test_order_of_brinkman():
 @pytest.mark.parametrize(("shape", "periodic"), [((6, 5), False), ((6, 5), True), ((1, 4), False), ((3, 4, 2), False)])
 def test_derivatives_of_brinkman(shape, periodic, rng):
     grid = dp.Grid(shape, spacing=0.3, periodic=periodic)
-    friction, weights = dp.brinkman(grid), rng.standard_normal(grid.faces.size)
+    friction = dp.brinkman(grid)
+    weights = rng.standard_normal(grid.faces.size)
     level = 0.2 * rng.standard_normal(grid.faces.size)
     loss = lambda level: anp.sum(weights * anp.log1p(friction(level)))
     far = np.zeros(level.size)
@@ -156,7 +163,8 @@ def test_derivatives_of_brinkman(shape, periodic, rng):
 
 def test_levels_as_they_come(rng):
     grid = dp.Grid((5, 4), spacing=0.5)
-    friction, s = dp.brinkman(grid), flat_wall(dp.Grid((5, 4), spacing=0.5), 0.7, 1.0)
+    friction = dp.brinkman(grid)
+    s = flat_wall(dp.Grid((5, 4), spacing=0.5), 0.7, 1.0)
     want = friction(s)
     for k in (900, -900):
         assert np.array_equal(friction(2.0**k * s), want)
@@ -164,7 +172,8 @@ def test_levels_as_they_come(rng):
         assert np.array_equal(friction(given), want)
     assert np.allclose(friction(s.astype(np.float32)), want, rtol=1e-3) and np.all(want >= 0)
     assert np.array_equal(friction(np.sign(s).astype(int)), friction(np.sign(s)))
-    nowhere, everywhere = friction(0.5 + 0 * s), friction(-0.5 + 0 * s)
+    nowhere = friction(0.5 + 0 * s)
+    everywhere = friction(-0.5 + 0 * s)
     assert not np.any(nowhere) and np.all(everywhere >= 1e4) and not np.any(friction(0 * s))
     for h, words in ((2.0**-600, "spacing is too small, rescale"), (2.0**600, "the spacing is too large; rescale")):
         with pytest.raises(dp.errors.NonFiniteError, match=words):

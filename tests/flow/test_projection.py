@@ -62,7 +62,8 @@ def scenes(shape, drawn):
 @pytest.mark.parametrize("shape", SHAPES[:-1])
 def test_it_is_the_dense_map_and_its_transpose(shape, scenes):
     for grid, solid in scenes:
-        P, matrix = dp.projection(grid, solid), dense(grid, solid, {})
+        P = dp.projection(grid, solid)
+        matrix = dense(grid, solid, {})
         v = velocity(grid)
         np.testing.assert_allclose(P(v), matrix @ v, atol=1e-9)
         np.testing.assert_allclose(P.T(v), matrix.T @ v, atol=1e-9)
@@ -71,9 +72,11 @@ def test_it_is_the_dense_map_and_its_transpose(shape, scenes):
 @pytest.mark.parametrize("shape", SHAPES)
 def test_divergence_idempotence_and_symmetry(shape, scenes):
     for grid, solid in scenes:
-        D, W = dp.divergence(grid), grid.faces.volumes
+        D = dp.divergence(grid)
+        W = grid.faces.volumes
         P = dp.projection(grid, solid)
-        v, w = velocity(grid), velocity(grid, 1)
+        v = velocity(grid)
+        w = velocity(grid, 1)
         once = P(v)
         size = np.linalg.norm(v)
         assert np.linalg.norm(D(once)) <= 1e-8 * size
@@ -119,7 +122,8 @@ def test_pressure_is_the_potential():
 
 def test_one_node_and_two_solves():
     grid = dp.Grid((32, 40))
-    P, target = dp.projection(grid), velocity(grid, 1)
+    P = dp.projection(grid)
+    target = velocity(grid, 1)
     with recording() as calls:
         value_and_grad(lambda v: 0.5 * anp.sum((P(v) - target) ** 2))(velocity(grid))
     assert calls == {
@@ -215,7 +219,8 @@ def test_extremes():
 
 def test_kinds_of_arrays():
     grid = dp.Grid((6, 5))
-    P, v = dp.projection(grid), velocity(grid)
+    P = dp.projection(grid)
+    v = velocity(grid)
     w = P(v)
     assert P(v.astype(np.float32)).dtype == np.float32
     np.testing.assert_allclose(P(v.astype(np.float32)), w, atol=1e-6)

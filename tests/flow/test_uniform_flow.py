@@ -74,8 +74,10 @@ def rounding(flow):
 @pytest.mark.parametrize(("shape", "every"), KINDS)
 def test_terms(shape, every):
     for flow in flows(shape, every):
-        grid, v = flow.grid, flow.v
-        convect, viscous = dp.convection(grid, flow.sides), dp.face_laplacian(grid, flow.sides)
+        grid = flow.grid
+        v = flow.v
+        convect = dp.convection(grid, flow.sides)
+        viscous = dp.face_laplacian(grid, flow.sides)
         close = dict(rtol=0, atol=rounding(flow))
         np.testing.assert_allclose(convect(v, v, flow.walls), 0.0, **close)
         np.testing.assert_allclose(viscous(v) + flow.lift(flow.walls), 0.0, **close)
@@ -109,7 +111,8 @@ STEPPING += [pytest.param(shape, True, name, id=f"{shape}-{name}", marks=WHOLE) 
 def test_steps(shape, every, name):
     """With wall velocities as a function, and, where they can be told apart, as what `face_lift` makes of them."""
     for flow in flows(shape, every):
-        grid, options = flow.grid, {"boundary": flow.sides, "unstable": "allow", **STEPS[name]}
+        grid = flow.grid
+        options = {"boundary": flow.sides, "unstable": "allow", **STEPS[name]}
         steps = [dp.flow_step(grid, 0.02, walls=lambda params, flow=flow: flow.walls, **options)]
         if len(flow.bounded) < 2 or grid.dim < 3:  # else two walls add up on faces along the edge between them
             steps.append(dp.flow_step(grid, 0.02, walls=flow.lift(flow.walls), **options))
@@ -121,7 +124,8 @@ def test_steps(shape, every, name):
 def test_scalars_and_friction_leave_it_as_it_is():
     """Heat that is 1 everywhere, at the walls too; a friction that is far away."""
     flow = Uniform((4, 5), (False, False), True)
-    grid, sides = flow.grid, dict.fromkeys(flow.grid.axes, dp.dirichlet)
+    grid = flow.grid
+    sides = dict.fromkeys(flow.grid.axes, dp.dirichlet)
     heat = {"diffusivity": 0.01, "boundary": sides, "values": np.ones(18)}
     rub = dp.brinkman(grid)(np.full(grid.faces.size, 1e3))
     step = dp.flow_step(
@@ -150,12 +154,18 @@ def free_of(grid, sides):
 
 def steady_flow(grid, sides, given, walls, nu, friction=0.0):
     """Velocity and pressure of a steady flow; `given`: faces, with the normal velocity at inflows."""
-    convect, viscous, lift = dp.convection(grid, sides), dp.face_laplacian(grid, sides), dp.face_lift(grid, sides)
+    convect = dp.convection(grid, sides)
+    viscous = dp.face_laplacian(grid, sides)
+    lift = dp.face_lift(grid, sides)
     pressures = {axis: tuple(side.pressure for side in pair) for axis, pair in sides.items()}
-    free, slope, D = free_of(grid, sides), dp.gradient(grid, pressures), dp.divergence(grid)
+    free = free_of(grid, sides)
+    slope = dp.gradient(grid, pressures)
+    D = dp.divergence(grid)
 
     def residual(x, scale):
-        v, wind, along = x["v"], scale * given, scale * walls
+        v = x["v"]
+        wind = scale * given
+        along = scale * walls
         rate = nu * (viscous(v) + lift(along) - friction * v) - convect(v, v, along) - slope(x["p"])
         return {"v": free(rate) + (v - wind) - free(v - wind), "p": D(v)}
 
@@ -193,7 +203,8 @@ def cylinder(angle, cells=10, far=8.0):
     sides = {"x": (dp.inflow, dp.outflow), "y": (dp.inflow, dp.outflow) if angle else (dp.free_slip, dp.free_slip)}
     walls = dp.face_lift(grid, sides).domain.join(*(along[::-1] if angle else [0.0]))
     x, y = (grid.join(*(grid.face_centres(c)[a] for c in (0, 1))) for a in (0, 1))
-    rub, nu = dp.brinkman(grid)(np.hypot(x, y) - 0.5), 1 / 40
+    rub = dp.brinkman(grid)(np.hypot(x, y) - 0.5)
+    nu = 1 / 40
     state = steady_flow(grid, sides, grid.join(*along), walls, nu, rub)
     on = [part.sum() for part in grid.split(grid.faces.volumes * nu * rub * state["v"])]
     around = dp.forces(grid, boundary=sides, cells=np.hypot(*grid.centres()) < 0.9)(state["v"], state["p"], nu, walls)
@@ -239,7 +250,8 @@ def by_hand(grid, v, w, walls):
 
 
 def test_convection_with_wall_velocities_and_its_derivatives_by_hand(rng):
-    grid, sides = dp.Grid((4, 3), spacing=0.3), {"x": (dp.inflow, dp.outflow), "y": dp.inflow}
+    grid = dp.Grid((4, 3), spacing=0.3)
+    sides = {"x": (dp.inflow, dp.outflow), "y": dp.inflow}
     walls = dp.face_lift(grid, sides).domain
     parts = [int(np.prod(part)) for part in walls.parts]
     cut = lambda flat: [flat[end - n : end] for end, n in zip(np.cumsum(parts), parts, strict=True)]
@@ -249,7 +261,8 @@ def test_convection_with_wall_velocities_and_its_derivatives_by_hand(rng):
     flat, along, g = *rng.standard_normal((2, walls.size)), rng.standard_normal(grid.faces.size)
     np.testing.assert_allclose(convect(v, w, flat), twin(v, w, flat), atol=1e-13)
     loss = lambda rule: lambda x: anp.sum(g * anp.sin(rule(x[0], x[1], x[2])))
-    point, tangent = (v, w, flat), (w, g, along)
+    point = (v, w, flat)
+    tangent = (w, g, along)
     (value, slopes), (other, wanted) = (dp.value_and_grad(loss(rule))(point) for rule in (convect, twin))
     assert value == pytest.approx(other, rel=1e-12)
     for one, two in zip(slopes, wanted, strict=True):
@@ -336,7 +349,8 @@ def test_an_array_as_walls_says_how_flow_enters():
     """What `face_lift` makes of velocities that differ along the inflow, with the same value and gradient."""
     grid = dp.Grid((4, 3), size=1.0)
     lift = dp.face_lift(grid, CHANNEL)
-    wind, speeds = grid.join(1.0, 0.0), np.cos(np.arange(float(lift.domain.size)))
+    wind = grid.join(1.0, 0.0)
+    speeds = np.cos(np.arange(float(lift.domain.size)))
 
     def loss(speeds, walls):
         step = dp.flow_step(grid, 0.02, 0.05, boundary=CHANNEL, walls=walls(speeds))
@@ -365,10 +379,12 @@ def test_a_batch_of_velocities_and_of_walls(rng):
 @pytest.mark.parametrize("given", [lambda lift, values: lift(values), lambda lift, values: lambda params: values])
 def test_an_obstacle_beside_a_moving_wall(given):
     """The wall does not drag the faces of the obstacle, from which an implicit viscosity would drag the fluid."""
-    grid, solid = dp.Grid((6, 5), size=1.0), np.zeros((6, 5), bool)
+    grid = dp.Grid((6, 5), size=1.0)
+    solid = np.zeros((6, 5), bool)
     solid[2:4, 3:] = True
     lift = dp.face_lift(grid)
-    walls, ends = given(lift, lift.domain.join(0.0, 0.3, 0.0, 1.0)), []
+    walls = given(lift, lift.domain.join(0.0, 0.3, 0.0, 1.0))
+    ends = []
     for implicit in (False, True):
         step = dp.flow_step(grid, 0.01, 0.2, solid=solid, implicit=implicit, convective=False, walls=walls)
         ends.append(dp.rollout(step, step.start(np.zeros(grid.faces.size)), None, 150)["v"])
@@ -384,7 +400,8 @@ def test_forces_on_fluid_beside_a_moving_wall(part):
     v = grid.join(2.0 * grid.face_centres(0)[1], 0.0)
     cells = np.zeros(grid.shape, bool)
     cells[part] = True
-    on, walls = dp.forces(grid, cells=cells), dp.face_lift(grid).domain.join(0.0, 2.0)
+    on = dp.forces(grid, cells=cells)
+    walls = dp.face_lift(grid).domain.join(0.0, 2.0)
     np.testing.assert_allclose(on(v, np.zeros(grid.shape), 0.1, walls), 0.0, atol=1e-13)
     loss = lambda speed: on(v, np.zeros(grid.shape), 0.1, speed * walls)[0]
     moved = cells[0, -1]  # beside the moving wall: nu times its area over half a cell
@@ -403,7 +420,8 @@ class Case(NamedTuple):
 
 
 SIDES = {"x": (dp.inflow, dp.outflow)}
-SQUARE, ROOM = dp.Grid((3, 3)), dp.Grid((3, 3, 3))
+SQUARE = dp.Grid((3, 3))
+ROOM = dp.Grid((3, 3, 3))
 ONES = np.ones(SQUARE.faces.size)
 EVERYWHERE = dp.face_lift(ROOM, SIDES)(np.ones(dp.face_lift(ROOM, SIDES).domain.size))
 REFUSED = [

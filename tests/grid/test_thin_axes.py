@@ -93,7 +93,8 @@ def test_what_acts_on_a_velocity(shape, grids, most, rng):
 @pytest.mark.parametrize("shape", [(1,), (2,), (1, 3), (3, 1), (1, 1), (1, 2, 1), (2, 1, 2)])
 def test_flow_step(shape, grids, most, rng):
     """Value, and gradient against the step written with dense matrices."""
-    dt, nu = 0.01, 0.05
+    dt = 0.01
+    nu = 0.05
     for grid in grids:
         for boundary, solid, dense in scenes(grid, rng, most):
             try:
@@ -101,7 +102,8 @@ def test_flow_step(shape, grids, most, rng):
             except ValueError:
                 continue
             P, q = dense.projection()
-            L, G = dense.viscous(), dense.pressure().gradient()
+            L = dense.viscous()
+            G = dense.pressure().gradient()
             v, before = (P @ u for u in rng.standard_normal((2, grid.faces.size)))
             p = rng.standard_normal(shape)
 
@@ -140,7 +142,8 @@ def test_catalogue(shape, grids, rng):
     for grid in grids:
         for boundary, solid, dense in walls(grid, rng):
             empty = Dense(grid, dense.sides)
-            D, G = dense.divergence(), dense.gradient(dp.dirichlet)
+            D = dense.divergence()
+            G = dense.gradient(dp.dirichlet)
             pairs = [
                 (dp.divergence(grid), D),
                 (dp.gradient(grid, boundary, solid, dp.dirichlet), G),
@@ -150,7 +153,8 @@ def test_catalogue(shape, grids, rng):
                 (dp.lift(grid, boundary), empty.lift()),
             ]
             for op, matrix in pairs:
-                u, g = rng.standard_normal(op.domain.shape), rng.standard_normal(op.codomain.shape)
+                u = rng.standard_normal(op.domain.shape)
+                g = rng.standard_normal(op.codomain.shape)
                 for form in (op, op.explicit()):
                     near(form(u).ravel(), matrix @ u.ravel())
                     near(form.T(g).ravel(), matrix.T @ g.ravel())
@@ -181,7 +185,8 @@ def test_inverses(shape, grids, drawn, rng):
         A = -dense.divergence() @ dense.gradient()
         k = rng.uniform(0.5, 2.0, grid.faces.size)
         scaled = -dense.divergence() @ (k[:, None] * dense.gradient())
-        D, G = dp.divergence(grid), dp.gradient(grid, boundary, solid)
+        D = dp.divergence(grid)
+        G = dp.gradient(grid, boundary, solid)
         b, g = rng.standard_normal((2, grid.cells.size))
         for matrix, method in ((scaled if varied else A, method) for n, varied, method in tried if n == number):
             right, left = (m @ (np.linalg.pinv(m, rcond=1e-12) @ x) for m, x in ((matrix, b), (matrix.T, g)))
@@ -208,7 +213,8 @@ def test_transport(scheme, condition, rng):
     for n, also in product((1, 2, 5), (False, True)):
         line = dp.Grid(n, spacing=[rng.uniform(0.5, 1.0, n)], periodic=condition is None)
         wide = dp.Grid((1, n), spacing=[0.7, line.widths[0]], periodic=(also, condition is None))
-        u, v = rng.standard_normal(n), rng.standard_normal(line.faces.size)
+        u = rng.standard_normal(n)
+        v = rng.standard_normal(line.faces.size)
         sides = {} if condition is None else {"y": condition}
         found = dp.transport(wide, scheme, sides)(u[None], wide.join(0.0, v[None]), 0.05)[0]
         wanted = dp.transport(line, scheme, condition or dp.neumann)(u, v, 0.05)

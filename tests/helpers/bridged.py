@@ -23,7 +23,8 @@ def in_trees(p):
     return {"a": anp.sin(p["x"]) * p["y"], "more": (anp.sum(p["x"] ** 2 * p["y"]), p["x"])}
 
 
-FIELD, SIDES = numbers(*GRID.shape), np.exp(0.3 * numbers(GRID.faces.size))
+FIELD = numbers(*GRID.shape)
+SIDES = np.exp(0.3 * numbers(GRID.faces.size))
 SCENES = {  # function of arrays, its arguments
     "operator": (dp.gradient(GRID), (FIELD,)),
     "inverse": (INVERSE, (FIELD,)),

@@ -21,7 +21,10 @@ class Dense:
     """
 
     def __init__(self, grid, sides, solid=None):
-        self.shape, self.h, self.periodic, self.sides = grid.shape, grid.widths, grid.periodic, sides
+        self.shape = grid.shape
+        self.h = grid.widths
+        self.periodic = grid.periodic
+        self.sides = sides
         self.dim = len(self.shape)
         self.solid = np.zeros(self.shape, bool) if solid is None else solid
         self.cells = {place: number for number, place in enumerate(product(*map(range, self.shape)))}
@@ -33,7 +36,8 @@ class Dense:
 
     def beyond(self, place, axis, step):
         """The neighbour of a cell along an axis, or None beyond a wall."""
-        n, there = self.shape[axis], place[axis] + step
+        n = self.shape[axis]
+        there = place[axis] + step
         if not 0 <= there < n:
             if not self.periodic[axis]:
                 return None
@@ -51,7 +55,8 @@ class Dense:
 
     def beside(self, axis, place):
         """The cells below and above a face; None beyond a wall."""
-        i, n = place[axis], self.shape[axis]
+        i = place[axis]
+        n = self.shape[axis]
         cell = lambda j: (*place[:axis], j, *place[axis + 1 :])
         if self.periodic[axis]:
             return cell((i - 1) % n), cell(i)
@@ -104,7 +109,8 @@ class Dense:
         for (axis, place), row in self.faces.items():
             low, high = self.beside(axis, place)
             if low is None or high is None:
-                wall, cell = self.sides[axis][int(high is None)], low or high
+                wall = self.sides[axis][int(high is None)]
+                cell = low or high
                 A[row, self.cells[cell]] = wall.b / (0.5 * wall.a * self.width(cell, axis) + wall.b)
             else:
                 both = self.width(low, axis) + self.width(high, axis)
@@ -133,9 +139,11 @@ class Dense:
 
     def regions(self, A):
         """Flags of the cells of each singular part of A: linked cells whose rows sum to 0."""
-        left, found = set(range(len(A))), []
+        left = set(range(len(A)))
+        found = []
         while left:
-            part, new = set(), {left.pop()}
+            part = set()
+            new = {left.pop()}
             while new:
                 part |= new
                 new = {j for i in new for j in np.flatnonzero(A[i])} - part
@@ -147,7 +155,9 @@ class Dense:
 
     def projection(self):
         """(P, pressure) as matrices: v + G p without divergence, p of mean 0 on each closed part."""
-        D, G, K = self.divergence(), self.pressure().gradient(), np.diag(1.0 * self.flags((dp.inflow, dp.outflow)))
+        D = self.divergence()
+        G = self.pressure().gradient()
+        K = np.diag(1.0 * self.flags((dp.inflow, dp.outflow)))
         G = self.flags((dp.outflow, dp.inflow))[:, None] * G
         p = -np.linalg.pinv(D @ G, rcond=1e-12) @ D @ K
         volumes = np.array([np.prod([self.width(cell, a) for a in range(self.dim)]) for cell in self.cells])
@@ -157,7 +167,8 @@ class Dense:
 
     def viscous(self, solid_boundary=dp.no_slip):
         """The Laplacian of a velocity, 0 on faces that are not free."""
-        L, free = np.zeros((len(self.faces),) * 2), self.flags((dp.outflow,))
+        L = np.zeros((len(self.faces),) * 2)
+        free = self.flags((dp.outflow,))
         for (c, place), row in self.faces.items():
             for a in range(self.dim) if free[row] else ():
                 i = place[a]
@@ -169,7 +180,8 @@ class Dense:
                             L[row, self.face(c, place, i + step)] += 1 / (self.width(cell, c) * d)
                             L[row, row] -= 1 / (self.width(cell, c) * d)
                     continue
-                h, n = self.h[a], self.shape[a]
+                h = self.h[a]
+                n = self.shape[a]
                 for step in (-1, 1):
                     j = i + step
                     inside = 0 <= j < n or self.periodic[a]
@@ -191,7 +203,8 @@ class Dense:
 
     def convection(self, v, w):
         """div(w v) by loops over the sides of each control volume."""
-        out, free = np.zeros(len(self.faces)), self.flags((dp.outflow,))
+        out = np.zeros(len(self.faces))
+        free = self.flags((dp.outflow,))
         for (c, place), row in self.faces.items():
             for a in range(self.dim) if free[row] else ():
                 if a == c:
@@ -220,11 +233,14 @@ class Dense:
 
     def _mean(self, axis, node, value):
         """Of what stands at the cells along an axis, at a node."""
-        n, h = self.shape[axis], self.h[axis]
+        n = self.shape[axis]
+        h = self.h[axis]
         if self.periodic[axis]:
-            low, high = (node - 1) % n, node % n
+            low = (node - 1) % n
+            high = node % n
         elif 0 < node < n:
-            low, high = node - 1, node
+            low = node - 1
+            high = node
         else:
             side = int(node > 0)
             return 0.0 if OPPOSITE[self.sides[axis][side]] is dp.dirichlet else value((n - 1) * side)

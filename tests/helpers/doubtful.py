@@ -16,7 +16,8 @@ def kinked(seed):
     """Seed -> (loss, x): a right gradient, whatever its convention, at one or many kinks of any size."""
     rng = np.random.default_rng(seed)
     loss, x, _ = scene(seed)
-    kind, where = KINKS[seed % len(KINKS)], rng.random(x.shape) < rng.choice([0.1, 0.5, 1.0])
+    kind = KINKS[seed % len(KINKS)]
+    where = rng.random(x.shape) < rng.choice([0.1, 0.5, 1.0])
     where.flat[0] = True
     size = 10.0 ** rng.uniform(-4, 0.3) * np.linalg.norm(dp.value_and_grad(loss)(x)[1])
     weights = rng.standard_normal(x.shape) * where
@@ -44,10 +45,13 @@ def noisy(seed):
     """Seed -> (loss, x): a right gradient of the smooth part, noise of 3e-8 to 1e-2 of it."""
     rng = np.random.default_rng(10000 + seed)
     loss, x, _ = scene(seed)
-    size, kind, base = 10.0 ** rng.uniform(-7.5, -2), NOISES[seed % len(NOISES)], abs(loss(x))
+    size = 10.0 ** rng.uniform(-7.5, -2)
+    kind = NOISES[seed % len(NOISES)]
+    base = abs(loss(x))
 
     def rough(u):
-        value, place = loss(u), getattr(u, "_value", u)
+        value = loss(u)
+        place = getattr(u, "_value", u)
         plain = getattr(value, "_value", value)
         if kind == "hash":
             return value * (1 + size * bits(place))

@@ -146,7 +146,8 @@ def exact(op):
 
 def agree(got, wanted, rel=1e-8, size=0.0):
     """Same shape, no NaN, and the largest difference small beside the largest value wanted, or beside `size`."""
-    got, wanted = np.asarray(got), np.asarray(wanted)
+    got = np.asarray(got)
+    wanted = np.asarray(wanted)
     assert got.shape == wanted.shape
     assert np.max(np.abs(got - wanted), initial=0.0) <= rel * np.max(np.abs(wanted), initial=size)
 
@@ -177,7 +178,9 @@ def poisson(scene, method):
 
 def projection(method, grid, solid=None, k=1.0, **options):
     """Also with a coefficient: v + k G p without divergence."""
-    G, D, inside = dp.gradient(grid, solid=solid), dp.divergence(grid), dp.interior(grid, solid)
+    G = dp.gradient(grid, solid=solid)
+    D = dp.divergence(grid)
+    inside = dp.interior(grid, solid)
     KG = G if np.ndim(k) == 0 else dp.diagonal(grid.faces, k) @ G
     pressure = solver(-D @ KG, method, nullspace="project", **options)
 
@@ -200,8 +203,10 @@ def implicit(method):
 def varied(method):
     """Three implicit steps with a coefficient that varies."""
     grid = stretched(12, 11)
-    D, G = dp.divergence(grid), dp.gradient(grid, dp.dirichlet)
-    k, solve = speeds(grid), elliptic(D, G, method)
+    D = dp.divergence(grid)
+    G = dp.gradient(grid, dp.dirichlet)
+    k = speeds(grid)
+    solve = elliptic(D, G, method)
     op = 2.0 * dp.identity(grid.cells) - D @ dp.diagonal(grid.faces, k) @ G
     matrix = np.linalg.matrix_power(2.0 * exact(op), 3)
     return Column(lambda u: march(solve, u, k, 2.0), grid.shape, matrix, (solve.info,))
@@ -271,7 +276,8 @@ def check_kind(fun, given):
     """fun(given) is fun(contiguous float64 copy), in single precision for float32; `given` is left as it was."""
     before = given.copy()
     plain = np.ascontiguousarray(given, dtype=float)
-    got, wanted = fun(given), fun(plain)
+    got = fun(given)
+    wanted = fun(plain)
     if given.dtype == np.float32:
         assert got.dtype == np.float32
         agree(got, wanted, 2e-6)

@@ -37,7 +37,8 @@ class Field:
 
     def __call__(self, xs, orders=None):
         """At points, or on the full arrays of a grid: there each coordinate changes along its own axis only."""
-        orders, dim = orders or (0,) * len(xs), len(xs)
+        orders = orders or (0,) * len(xs)
+        dim = len(xs)
         if all(x.ndim == dim for x in xs):
             xs = [x[tuple(slice(None if a == b else 1) for b in range(dim))] for a, x in enumerate(xs)]
         return reduce(np.multiply, [self.line(x, order) for x, order in zip(xs, orders)])
@@ -89,7 +90,9 @@ class Field:
             parts.append(field[a] * self(np.meshgrid(*lines, indexing="ij")))
         wanted = []
         for a in range(3):
-            b, c, at = (a + 1) % 3, (a + 2) % 3, grid.face_centres(a)
+            b = (a + 1) % 3
+            c = (a + 2) % 3
+            at = grid.face_centres(a)
             wanted.append(field[c] * self.along(at, b, 1) - field[b] * self.along(at, c, 1))
         return grid.join(*parts), grid.join(*wanted)
 

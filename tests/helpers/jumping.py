@@ -43,12 +43,15 @@ def layer(c, s, w, end):
 
 def jumping(rng):
     """A problem of which the rate jumps in time or with the state."""
-    s, c, end = rng.uniform(0.2, 1.7), rng.uniform(0.1, 2.0), rng.uniform(1.8, 2.5)
+    s = rng.uniform(0.2, 1.7)
+    c = rng.uniform(0.1, 2.0)
+    end = rng.uniform(1.8, 2.5)
     a, b = rng.uniform(-3, 3, 2)
     p, q, r = rng.uniform(0.5, 2.0, 3)
     decay = np.exp(-c * (end - s))
     kind = rng.integers(8)
-    one, zero = np.ones(1), np.zeros(1)
+    one = np.ones(1)
+    zero = np.zeros(1)
     if kind == 0:
         return Scene(
             "time", lambda u, x, t: anp.where(t < x, a, b) - c * u, one, np.array([s]), end, False, (a - b) * decay
@@ -92,8 +95,11 @@ def jumping(rng):
 
 def smooth(rng):
     """A problem of which the rate is smooth: steep in time or in the state, or not at all."""
-    s, c, end = rng.uniform(0.2, 1.7), rng.uniform(0.1, 2.0), rng.uniform(1.8, 2.5)
-    p, w = rng.uniform(0.5, 2.0), 10 ** rng.uniform(-4, 0)
+    s = rng.uniform(0.2, 1.7)
+    c = rng.uniform(0.1, 2.0)
+    end = rng.uniform(1.8, 2.5)
+    p = rng.uniform(0.5, 2.0)
+    w = 10 ** rng.uniform(-4, 0)
     kind = rng.integers(4)
     if kind <= 1:
         rate = lambda u, x, t: anp.tanh((t - x) / w) - c * u
@@ -101,7 +107,8 @@ def smooth(rng):
             "layer" if w < 0.02 else "gentle", rate, np.ones(1), np.array([s]), end, False, layer(c, s, w, end)
         )
     if kind == 2:
-        w, f = 10 * rng.uniform(0.05, 1.0), rng.uniform(1.0, 8.0)
+        w = 10 * rng.uniform(0.05, 1.0)
+        f = rng.uniform(1.0, 8.0)
         rate = lambda u, x, t: x[0] * anp.cos(f * t) - c * u
         wave = (c * np.cos(f * end) + f * np.sin(f * end) - c * np.exp(-c * end)) / (c**2 + f**2)
         return Scene("forced", rate, np.ones(1), np.array([p]), end, False, wave)
@@ -129,7 +136,8 @@ def outcome(scene, method, tolerance):
 
 def counted(make, count, seed, methods=TOLERANCES, coarsest=2):
     """{(kind, outcome): how often}, and the problems with a wrong derivative: (number, method, tolerance, scene)."""
-    found, wrong = {}, []
+    found = {}
+    wrong = []
     for number in range(count):
         rng = np.random.default_rng((seed, number))
         scene = make(rng)

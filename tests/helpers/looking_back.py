@@ -15,7 +15,9 @@ def look(u, places, sides, inflow, cubic=False):
     axes = [_weights(p, n, side, cubic) for p, n, side in zip(places, u.shape, sides)]
     total = 0.0
     for corner in product(*(range(len(weights)) for _, weights in axes)):
-        share, index, inside = 1.0, [], True
+        share = 1.0
+        index = []
+        inside = True
         for (first, weights), k, n, side in zip(axes, corner, u.shape, sides):
             i = first + k
             share = share * weights[k]
@@ -71,7 +73,8 @@ def up(part, axis, wraps, widths):
     line = [-1 if a == axis else 1 for a in range(part.ndim)]
     before = np.roll(widths, 1) if wraps else np.append(widths[:1], widths)
     after = widths if wraps else np.append(widths, widths[-1:])
-    before, after = before.reshape(line), after.reshape(line)
+    before = before.reshape(line)
+    after = after.reshape(line)
     lower = anp.roll(part, 1, axis) if wraps else anp.concatenate([_cut(part, axis, 0, 1), part], axis)
     upper = part if wraps else anp.concatenate([part, _cut(part, axis, n - 1, n)], axis)
     return (after * lower + before * upper) / (before + after)
@@ -144,18 +147,21 @@ def number(line, x, cubic, period):
         steep = (c - a) / 2, (2 * a - 5 * b + 4 * c - d) / 2, (3 * b - a - 3 * c + d) / 2
         return b + t * (steep[0] + t * (steep[1] + t * steep[2])), steep[0] + t * (2 * steep[1] + 3 * t * steep[2])
 
-    low, high = np.full(np.shape(x), -2.0), np.full(np.shape(x), n + 1.0)
+    low = np.full(np.shape(x), -2.0)
+    high = np.full(np.shape(x), n + 1.0)
     for _ in range(60):
         middle = 0.5 * (low + high)
         above = curve(middle)[0] > getval(x)
-        low, high = np.where(above, low, middle), np.where(above, middle, high)
+        low = np.where(above, low, middle)
+        high = np.where(above, middle, high)
     value, slope = curve(low)
     return low + (x - value) / slope + turns * n
 
 
 def _component(move, u, w, lines, dt, sides, inflow):
     setting = move.setting
-    cubic, midpoint = setting.interpolation == "cubic", setting.backtrace == "midpoint"
+    cubic = setting.interpolation == "cubic"
+    midpoint = setting.backtrace == "midpoint"
     at = np.meshgrid(*(line[3 : 3 + n] for line, n in zip(lines, u.shape)), indexing="ij")
     periods = [np.sum(h) if side == "wrap" else None for h, side in zip(setting.grid.widths, sides)]
 
@@ -196,5 +202,6 @@ def against_twin(move, point, share):
     rng = np.random.default_rng(7)
     along = tuple(rng.standard_normal(np.shape(x)) if np.ndim(x) else 0.3 for x in point)
     tangent = pushforward(lambda x: move(*x), point, along)[1]
-    forward, backward = np.sum(g * tangent), sum(np.sum(a * b) for a, b in zip(back, along))
+    forward = np.sum(g * tangent)
+    backward = sum(np.sum(a * b) for a, b in zip(back, along))
     assert abs(forward - backward) <= 1e-12 * (1 + abs(forward))

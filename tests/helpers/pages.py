@@ -38,12 +38,15 @@ class Block:
 
 
 def blocks(page):
-    found, before, inside = [], [], None
+    found = []
+    before = []
+    inside = None
     for number, line in enumerate(page.splitlines(), 1):
         fence = re.match(r"\s*```\s*(\w*)", line)
         if inside is not None and fence:
             found.append(Block(inside[0], "\n".join(inside[2]), inside[1], "\n".join(before)))
-            inside, before = None, []
+            inside = None
+            before = []
         elif inside is not None:
             inside[2].append(line)
         elif fence:
@@ -63,8 +66,10 @@ def tolerances(text):
 
 def same(wanted, got, **tolerance):
     """Whether a printed text is the wanted one, numbers within the tolerance and ``...`` for anything."""
-    wanted, got = " ".join(wanted.split()), " ".join(got.split())
-    numbers, rule = [], ""
+    wanted = " ".join(wanted.split())
+    got = " ".join(got.split())
+    numbers = []
+    rule = ""
     for part in re.split(rf"({NUMBER}|\.\.\.)", wanted):
         if part == "...":
             rule += ".*?"
@@ -79,7 +84,8 @@ def same(wanted, got, **tolerance):
 
 def run_blocks(path):
     """Execute the python blocks of a page in order; what one prints must be what the page says."""
-    all_blocks, space = blocks(path.read_text(encoding="utf-8")), {"__name__": "__page__"}
+    all_blocks = blocks(path.read_text(encoding="utf-8"))
+    space = {"__name__": "__page__"}
     assert any(block.language == "python" for block in all_blocks), f"{path.name} has no python block"
     for block, following in zip(all_blocks, [*all_blocks[1:], Block("", "", 0, "")]):
         if block.language != "python" or ("import skfem" in block.text and not MESHES):

@@ -19,7 +19,8 @@ def chosen(rows, ways=2, name=""):
     order = random.Random(f"{SEED} {name}").sample(range(len(rows)), len(rows))
     columns = [list(enumerate(row)) for row in rows]
     pairs = [set(combinations(values, min(ways, len(values)))) for values in columns]
-    missing, found = set().union(*pairs), []
+    missing = set().union(*pairs)
+    found = []
     while missing:
         found.append(max(order, key=lambda n: len(pairs[n] & missing)))
         missing -= pairs[found[-1]]

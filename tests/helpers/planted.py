@@ -47,7 +47,8 @@ def call(kind, name, grid, rng, error, jvp):
     if kind == "inverse":
         return dp.inverse(op, "krylov", rtol=1e-12), f"inverse({name})"
     if kind == "elliptic":
-        D, G = scaled(f"{name} D", dp.divergence(grid), error), dp.gradient(grid, dp.dirichlet)
+        D = scaled(f"{name} D", dp.divergence(grid), error)
+        G = dp.gradient(grid, dp.dirichlet)
         solve = dp.elliptic_solver(D, G, "direct")
         faces = 1.0 + 0.2 * np.cos(np.arange(grid.faces.size))
         to_faces = dp.average(grid)

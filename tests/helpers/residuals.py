@@ -40,7 +40,9 @@ def field(shape, shift=0.0):
 def diffusion(shape):
     """-div((1 + c u^2) grad u) + r u^3 = f, u = 0 on the walls."""
     grid = dp.Grid(shape, size=1.0)
-    G, D, A = dp.gradient(grid, dp.dirichlet), dp.divergence(grid), dp.average(grid, dp.dirichlet)
+    G = dp.gradient(grid, dp.dirichlet)
+    D = dp.divergence(grid)
+    A = dp.average(grid, dp.dirichlet)
 
     def residual(u, p):
         return -D((1 + p["c"] * A(u) ** 2) * G(u)) + p["reaction"][0] * u**3 - p["f"]
@@ -52,7 +54,8 @@ def diffusion(shape):
 def advection():
     """u u' - nu u'' = f, one-sided first differences: a Jacobian that is not symmetric."""
     grid = dp.Grid(25, size=1.0)
-    first, second = dp.upwind(grid, boundary=dp.dirichlet), dp.laplacian(grid, dp.dirichlet)
+    first = dp.upwind(grid, boundary=dp.dirichlet)
+    second = dp.laplacian(grid, dp.dirichlet)
 
     def residual(u, p):
         return (1.0 + u) * first(u) - p["nu"] * second(u) - p["f"]
@@ -76,7 +79,8 @@ def two_fields():
     second = dp.laplacian(dp.Grid(20, size=1.0), dp.dirichlet)
 
     def residual(x, p):
-        u, level = x["u"], x["level"]
+        u = x["u"]
+        level = x["level"]
         return p["f"] - 0.1 * second(u) + anp.exp(0.1 * u) * level, level**3 + level - p["a"] * anp.sum(u)
 
     return Problem(residual, {"u": np.zeros(20), "level": 0.5}, {"a": 0.05, "f": 3 * field(20)}, 40.0)
@@ -87,7 +91,8 @@ def stacked_fields():
     second = dp.laplacian(dp.Grid(15, size=1.0))
 
     def residual(x, p):
-        u, v = x[0], x[1]
+        u = x[0]
+        v = x[1]
         return anp.stack([
             u * (1 + v**2) - p["k"] * second(u) - p["f"],
             v - u**2 / (1 + u**2) - 0.1 * second(v) * p["k"],

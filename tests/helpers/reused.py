@@ -23,7 +23,8 @@ PLACES = sp.diags_array([np.ones(5), np.ones(6), np.ones(5)], offsets=[-1, 0, 1]
 
 def entries(seed):
     """Of a diagonally dominant matrix on PLACES, row by row."""
-    rows, columns = np.repeat(np.arange(6), np.diff(PLACES.indptr)), PLACES.indices
+    rows = np.repeat(np.arange(6), np.diff(PLACES.indptr))
+    columns = PLACES.indices
     return field(16, seed, -1, 1) + 4.0 * (rows == columns)
 
 
@@ -73,7 +74,8 @@ def steady():
 
 @case("sponge")
 def leapfrog():
-    D, G = dp.divergence(LINE), dp.gradient(LINE)
+    D = dp.divergence(LINE)
+    G = dp.gradient(LINE)
     rates = (lambda v, c: -c * D(v)), (lambda p, c: -G(p))
     step = dp.stepper("leapfrog", rates, 0.01, damping=dp.sponge(LINE, 2, 1.0))
     start = lambda s: (field(LINE.shape, s), field(LINE.faces.shape, s))

@@ -81,7 +81,8 @@ def imports(module):
     ``from a import b`` counts as ``a.b``, except that a name of our own package that is no module
     counts as the module it is taken from.
     """
-    ours, found = names(), []
+    ours = names()
+    found = []
     for node in walked(module.tree):
         if isinstance(node, ast.Import):
             found += [(alias.name, node.lineno) for alias in node.names]

@@ -25,13 +25,16 @@ def of_van_der_pol(u, p):
 
 def robertson(u, p):
     """A -> B, B + C -> A + C, 2 B -> B + C (Robertson 1966)."""
-    slow, back, fast = p[0] * u[0], p[1] * u[1] * u[2], p[2] * u[1] ** 2
+    slow = p[0] * u[0]
+    back = p[1] * u[1] * u[2]
+    fast = p[2] * u[1] ** 2
     return anp.array([back - slow, slow - back - fast, fast])
 
 
 def of_robertson(u, p):
     """The derivatives of the rate in u and p."""
-    slow, back = np.array([p[0], 0, 0]), np.array([0, p[1] * u[2], p[1] * u[1]])
+    slow = np.array([p[0], 0, 0])
+    back = np.array([0, p[1] * u[2], p[1] * u[1]])
     fast = np.array([0, 2 * p[2] * u[1], 0])
     of_p = np.array([[-u[0], u[1] * u[2], 0], [u[0], -u[1] * u[2], -(u[1] ** 2)], [0, 0, u[1] ** 2]])
     return np.array([back - slow, slow - back - fast, fast]), of_p
@@ -75,10 +78,13 @@ SCENES = {  # name: rate, its derivatives, start, params, end, number of the sta
 
 def by_scipy(rate, derivatives, start, params, end, number, rtol=1e-10):
     """(state, derivative of the number looked at in the logarithm of each parameter) at the end."""
-    p, n, m = np.array(params), len(start), len(params)
+    p = np.array(params)
+    n = len(start)
+    m = len(params)
 
     def both(t, z):
-        u, S = z[:n], z[n:].reshape(n, m)
+        u = z[:n]
+        S = z[n:].reshape(n, m)
         of_u, of_p = derivatives(u, p)
         return np.concatenate([rate(u, p), (of_u @ S + of_p * p).ravel()])
 

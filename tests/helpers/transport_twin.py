@@ -19,7 +19,10 @@ def to_nodes(x, grid, axis, shared):
     h = line(grid.widths[axis], axis, grid.dim)
     if grid.periodic[axis]:
         x, h = (anp.concatenate([cut(y, axis, -1, None), y], axis) for y in (x, h))
-    low, high, hl, hh = cut(x, axis, 0, -1), cut(x, axis, 1, None), cut(h, axis, 0, -1), cut(h, axis, 1, None)
+    low = cut(x, axis, 0, -1)
+    high = cut(x, axis, 1, None)
+    hl = cut(h, axis, 0, -1)
+    hh = cut(h, axis, 1, None)
     inner = (low * hl + high * hh) / (hl + hh) if shared else (low * hh + high * hl) / (hl + hh)
     return inner if grid.periodic[axis] else anp.concatenate([cut(x, axis, 0, 1), inner, cut(x, axis, -1, None)], axis)
 
@@ -55,8 +58,12 @@ class Line:
     """One axis of a component: its widths and distances, and what stands outside."""
 
     def __init__(self, grid, axis, own, sides, walls):
-        self.axis, self.periodic, self.sides, self.walls = axis, grid.periodic[axis], sides, walls
-        cells, between = grid.widths[axis], grid.spacings(axis)
+        self.axis = axis
+        self.periodic = grid.periodic[axis]
+        self.sides = sides
+        self.walls = walls
+        cells = grid.widths[axis]
+        between = grid.spacings(axis)
         h = between if own == axis else cells
         if self.periodic:
             gaps = anp.roll(cells, 1) if own == axis else between
@@ -68,9 +75,12 @@ class Line:
 
     def around(self, u, low=None, high=None):
         """The values below and above each interface, walls and both ends of a periodic axis included."""
-        low, high = u if low is None else low, u if high is None else high
-        first, last = cut(u, self.axis, 0, 1), cut(u, self.axis, -1, None)
-        before, after = cut(low, self.axis, -1, None), cut(high, self.axis, 0, 1)
+        low = u if low is None else low
+        high = u if high is None else high
+        first = cut(u, self.axis, 0, 1)
+        last = cut(u, self.axis, -1, None)
+        before = cut(low, self.axis, -1, None)
+        after = cut(high, self.axis, 0, 1)
         if not self.periodic:
             before, after = (
                 edge if side == dp.neumann else wall for edge, side, wall in zip((first, last), self.sides, self.walls)
@@ -80,19 +90,23 @@ class Line:
     def slope(self, u):
         """Van Leer's limited difference from the point to its face."""
         below, above = self.around(u)
-        a, b = u - cut(below, self.axis, 0, -1), cut(above, self.axis, 1, None) - u
+        a = u - cut(below, self.axis, 0, -1)
+        b = cut(above, self.axis, 1, None) - u
         c, e = (2 * cut(self.half, self.axis, i, j) / self.h for i, j in ((0, -1), (1, None)))
         same = a * b > 0
-        a, b = anp.where(same, a, 1.0), anp.where(same, b, 1.0)
+        a = anp.where(same, a, 1.0)
+        b = anp.where(same, b, 1.0)
         top = a * b * (a * e**2 + b * c**2)
         return anp.where(same, top / (a**2 * e**2 + (c + e - 2) * c * e * a * b + b**2 * c**2), 0.0)
 
     def rate(self, u, w, form, points, limited):
         slope = self.slope(u) if limited else 0.0
         below, above = self.around(u, u + slope, u - slope)
-        lower, upper = (lambda x: cut(x, self.axis, 0, -1)), (lambda x: cut(x, self.axis, 1, None))
+        lower = lambda x: cut(x, self.axis, 0, -1)
+        upper = lambda x: cut(x, self.axis, 1, None)
         if points:
-            p, m = anp.maximum(w, 0.0), anp.minimum(w, 0.0)
+            p = anp.maximum(w, 0.0)
+            m = anp.minimum(w, 0.0)
             back, ahead = (self.h, self.h) if limited else (lower(self.gaps), upper(self.gaps))
             return -p * (upper(below) - lower(below)) / back - m * (upper(above) - lower(above)) / ahead
         w = anp.concatenate([w, cut(w, self.axis, 0, 1)], self.axis) if self.periodic else w
@@ -114,7 +128,8 @@ def component(grid, own, u, w, dt, walls, sides, form, points, scheme):
 def twin(grid, scheme, boundary, velocity, of, form):
     """The function that ``dp.transport(...)`` with the same arguments is."""
     sides = resolve(grid, boundary)
-    space, points = grid.cells if of == "cells" else grid.faces, velocity == "cells" and form == "advective"
+    space = grid.cells if of == "cells" else grid.faces
+    points = velocity == "cells" and form == "advective"
     walls = dp.transport(grid, scheme, boundary, velocity, of, form=form).walls
 
     def move(u, v, dt, inflow):

@@ -153,7 +153,8 @@ def of_flow(step):
 
 def of_certified(tolerance):
     solve = dp.inverse(-dp.laplacian(BOX, dp.dirichlet), "krylov")
-    start, twin = np.zeros(BOX.shape), deepcopy(tolerance)  # it serves one run
+    start = np.zeros(BOX.shape)  # it serves one run
+    twin = deepcopy(tolerance)
     best = dp.minimize(lambda b: anp.sum((solve(b) - 1.0) ** 2), start, maxiter=5, tolerance=twin)
     return [best.x.tobytes()]
 
@@ -243,7 +244,8 @@ def travellers():
     leapfrog = dp.stepper("leapfrog", (push, push), 0.1, damping=(1.0, numbers(12) ** 2))
     yield "stepper", "leapfrog", leapfrog, partial(of_step, state=(numbers(12), numbers(12, 1)), params=0.4)
     solve = dp.elliptic_solver(dp.divergence(GRID), dp.gradient(GRID, dp.dirichlet))
-    k, b = np.exp(numbers(GRID.faces.size)), numbers(GRID.shape)
+    k = np.exp(numbers(GRID.faces.size))
+    b = numbers(GRID.shape)
     yield "elliptic_solver", "", solve, lambda solve: bits(solve, k, b, 0.5)
     K = np.eye(GRID.dim).reshape(GRID.dim, GRID.dim, *[1] * GRID.dim) + 0.1 * np.ones(GRID.shape)
     yield "elliptic_solver", "tensors", solve, lambda solve: bits(solve, K, b, 0.5)
@@ -261,7 +263,8 @@ def travellers():
     yield "implicit", "large", dp.implicit(coupled), lambda s: bits(s, np.zeros(90), numbers(90))
     for scheme in ("upwind", "van_leer", "semi_lagrangian", "maccormack"):
         move = dp.transport(GRID, scheme, solid=SOLID)
-        u, v = numbers(GRID.shape), 0.3 * numbers(GRID.faces.size)
+        u = numbers(GRID.shape)
+        v = 0.3 * numbers(GRID.faces.size)
         yield "transport", scheme, move, lambda move, u=u, v=v: bits(move, u, v, 0.1)
     yield "total_variation", "", dp.total_variation(GRID, 0.1, SOLID), lambda tv: bits(tv, numbers(GRID.shape))
     yield "smoothness", "", dp.smoothness(GRID, SOLID), lambda h1: bits(h1, numbers(GRID.shape))
@@ -295,7 +298,8 @@ def travellers():
     yield "ensemble", "", dp.ensemble(misfit_of, [1.0, 2.0], weights=[1, 3], chunk=2), of_total
     yield "certified", "", dp.certified(0.2), of_certified
     net = dp.network
-    x, p = numbers((2, 2, 9)), net.residual_weights(np.random.default_rng(0), 2, 3)
+    x = numbers((2, 2, 9))
+    p = net.residual_weights(np.random.default_rng(0), 2, 3)
     yield "network", "residual_block", net.residual_block, lambda f: [f(p, x).tobytes()]
     for layer in (net.tanh, net.relu, net.softplus):
         yield "network", layer.__name__, layer, lambda f: bits(f, x)

@@ -7,8 +7,11 @@ import pytest
 
 import sparsedp as dp
 
-SHAPE, TYPE, VALUE = dp.errors.ShapeError, TypeError, ValueError
-FINITE, UNSTABLE = dp.errors.NonFiniteError, dp.errors.UnstableStepError
+SHAPE = dp.errors.ShapeError
+TYPE = TypeError
+VALUE = ValueError
+FINITE = dp.errors.NonFiniteError
+UNSTABLE = dp.errors.UnstableStepError
 L = dp.laplacian(dp.Grid(4), dp.dirichlet)
 U = np.ones(4)
 
@@ -306,7 +309,8 @@ def fastest(op):
 )
 def test_an_operator_of_the_wrong_sign_is_refused(method, grid):
     """Where steps with it would turn signs and grow; with L itself, and in steps that can follow, all is well."""
-    L, rate = dp.laplacian(grid), lambda u, p: 0.0 * u
+    L = dp.laplacian(grid)
+    rate = lambda u, p: 0.0 * u
 
     def stepped(operator, h):
         with_rate = dict(linear=operator) if method == "imex" else {}
@@ -327,7 +331,8 @@ def test_an_operator_of_the_wrong_sign_is_refused(method, grid):
 def test_growth_that_is_meant_is_taken():
     """Swift and Hohenberg's operator, with waves that grow; a growth of its own; one that is not symmetric."""
     grid = dp.Grid(32, size=20.0, periodic=True)
-    one, L = dp.identity(grid.cells), dp.laplacian(grid)
+    one = dp.identity(grid.cells)
+    L = dp.laplacian(grid)
     pattern = 0.3 * one - (one + L) @ (one + L)
     turned = dp.from_matrix(np.array([[1.0, -10.0], [10.0, -3.0]]))
     for op, h, u in ((pattern, 1.0, np.ones(32)), (0.5 * one, 1.0, np.ones(32)), (turned, 2.0, np.ones(2))):

@@ -69,7 +69,9 @@ def random_like(tree, seed):
 @pytest.mark.parametrize("method", ORDERS)
 def test_order_of_solution_and_gradient(method):
     """Nonlinear, with time: both errors fall with the order of the method."""
-    u, r, span = 0.3, 1.5, 1.0
+    u = 0.3
+    r = 1.5
+    span = 1.0
     wanted, of_wanted = value_and_grad(lambda p: exact_logistic(p[0], p[1], span))((u, r))
     errors = []
     for n in (16, 32, 64):
@@ -97,7 +99,8 @@ LAMBDA = 4 * 64**2 * np.sin(np.pi / 128) ** 2
 @pytest.mark.parametrize("as_rate", [False, True])
 def test_factor_of_a_sine_mode(method, dt, factor, as_rate):
     """As an Operator, and as a rate found nonlinear."""
-    mode, op = np.sin(np.pi * FINE.centres()[0]), dp.laplacian(FINE, dp.dirichlet)
+    mode = np.sin(np.pi * FINE.centres()[0])
+    op = dp.laplacian(FINE, dp.dirichlet)
     step = dp.stepper(method, (lambda u, nu: nu * op(u)) if as_rate else op, dt)
     assert step(mode, 1.0) / mode == pytest.approx(np.full(64, factor), rel=1e-9)
     value, g = value_and_grad(lambda nu: anp.sum(step(mode, nu) * mode))(1.0)
@@ -178,7 +181,8 @@ def test_gradient_jvp_and_second_order(name):
     x = (state, params)
     if name != "tr_bdf2 reaction":  # slow; test_integrators_twins.py has it beside a difference
         assert dp.check.gradient(loss, x, quick=True).verdict == "agrees"
-    d, e = random_like(x, 2), random_like(x, 3)
+    d = random_like(x, 2)
+    e = random_like(x, 3)
     g = value_and_grad(loss)(x)[1]
     along = pushforward(loss, x, d)[1]
     assert dot(g, d) == pytest.approx(along, rel=1e-9)
@@ -201,7 +205,8 @@ def test_dt_traced_outside():
     ("method", "stages"), [("backward_euler", 1), ("crank_nicolson", 1), ("tr_bdf2", 2), ("imex", 2)]
 )
 def test_one_setup_and_two_solves_a_stage(method, stages):
-    step, n = dp.stepper(method, L, 0.1), 5
+    step = dp.stepper(method, L, 0.1)
+    n = 5
     name = f"stepper({method})"
     with recording() as calls:
         value_and_grad(lambda p: anp.sum(run(step, p[0], p[1], n) ** 2))((X, 0.5))

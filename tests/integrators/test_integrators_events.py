@@ -14,7 +14,8 @@ from sparsedp.autodiff.derivative import pushforward, value_and_grad
 
 
 def event(function, terminal=False, direction=0):
-    function.terminal, function.direction = terminal, direction
+    function.terminal = terminal
+    function.direction = direction
     return function
 
 
@@ -33,12 +34,18 @@ def bounce(u, g):
 def height(g, end=2.0):
     """Of a ball that falls from 1 and keeps 0.8 of its speed in each bounce, and its two derivatives in g."""
     g = float(g)
-    t, v, count = np.sqrt(2 / g), 0.8 * np.sqrt(2 * g), 1
+    t = np.sqrt(2 / g)
+    v = 0.8 * np.sqrt(2 * g)
+    count = 1
     while t + 2 * v / g < end:
-        t, v, count = t + 2 * v / g, 0.8 * v, count + 1
+        t = t + 2 * v / g
+        v = 0.8 * v
+        count = count + 1
     share = t * np.sqrt(g)  # t is share / sqrt(g), v is speed * sqrt(g)
     speed = v / np.sqrt(g)
-    rest, slope, bend = end - share * g**-0.5, 0.5 * share * g**-1.5, -0.75 * share * g**-2.5
+    rest = end - share * g**-0.5
+    slope = 0.5 * share * g**-1.5
+    bend = -0.75 * share * g**-2.5
     value = speed * g**0.5 * rest - 0.5 * g * rest**2
     first = 0.5 * speed * g**-0.5 * rest + speed * g**0.5 * slope - 0.5 * rest**2 - g * rest * slope
     second = (
@@ -213,9 +220,11 @@ def test_events_at_the_same_time_are_all_recorded(events, factor):
     """Their jumps act in the order of `events`; the first one moved the state off the surface of the second."""
     step = dp.stepper("rk4", falling, 0.5, tolerance=1e-6, events=events)
     loss = lambda g: step((np.array([1.0, 0.0]), 0.0), g)[0][1]
-    time, root = np.sqrt(2 / 9.81), np.sqrt(2 * 9.81)
+    time = np.sqrt(2 / 9.81)
+    root = np.sqrt(2 * 9.81)
     if factor is None:  # the speed after the bounce, at which the step ends
-        value, slope = 0.8 * root, 0.8 / root
+        value = 0.8 * root
+        slope = 0.8 / root
     else:
         value = factor * root - 9.81 * (0.5 - time)
         slope = factor / root - 0.5 + 0.5 * time
@@ -249,7 +258,8 @@ def test_events_at_the_ends_of_intervals(method):
         value, slope = value_and_grad(loss)(10.0)
         assert value == pytest.approx(0.8 * 10 * time * 0.25 - 5.0 * 0.25**2, rel=1e-9)
         # With landing time s = c / sqrt(g) and its slope -s / (2 g): b = 0.8 g s (end - s) - g (end - s)^2 / 2.
-        rest, by_g = 0.25, -time / 20
+        rest = 0.25
+        by_g = -time / 20
         exact = 0.8 * time * rest + 8 * by_g * (rest - time) - 0.5 * rest**2 + 10 * rest * by_g
         assert slope == pytest.approx(exact, rel=1e-9, abs=1e-11)
 
@@ -290,13 +300,15 @@ def test_radau_locates_an_event_in_a_step_with_a_large_error():
     )
     step((np.array([0.9, 0.3]), 0.0), 1.25)
     f = np.sqrt(1.25)
-    size, phase = np.hypot(0.9, 0.3 / f), np.arctan2(0.3 / f, 0.9)
+    size = np.hypot(0.9, 0.3 / f)
+    phase = np.arctan2(0.3 / f, 0.9)
     assert step.t_events[0] == pytest.approx([(phase + np.arccos(0.5 / size)) / f], rel=1e-3)
 
 
 def test_a_stepper_with_events_is_pickled():
     step = dp.stepper("rk4", falling, 0.6, tolerance=1e-6, events=(level, bounce), breaks=[0.3])
-    again, start = pickle.loads(pickle.dumps(step)), (np.array([1.0, 0.0]), 0.0)
+    again = pickle.loads(pickle.dumps(step))
+    start = (np.array([1.0, 0.0]), 0.0)
     assert np.array_equal(again(start, 9.81)[0], step(start, 9.81)[0]) and len(again.t_events[0]) == 1
 
 

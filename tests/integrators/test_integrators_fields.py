@@ -14,16 +14,20 @@ from sparsedp._utils.pytree import leaves
 from sparsedp.autodiff.derivative import pushforward, value_and_grad
 
 GRID = dp.Grid((4, 3), size=1.0)
-L, M = dp.laplacian(GRID), dp.laplacian(GRID, dp.dirichlet)
+L = dp.laplacian(GRID)
+M = dp.laplacian(GRID, dp.dirichlet)
 U, V, W = np.random.default_rng(3).standard_normal((3, 4, 3))
-STATE, PARAMS = {"u": U, "v": V, "w": W}, {"D": 0.3, "F": 0.7, "dt": 0.02}
+STATE = {"u": U, "v": V, "w": W}
+PARAMS = {"D": 0.3, "F": 0.7, "dt": 0.02}
 LINEAR = {"w": None, "v": (-1e-3 * M @ M, lambda p: 0.5 * p["D"]), "u": (L, lambda p: p["D"])}  # in another order
 METHODS = ["euler", "heun", "ssprk3", "rk4", "backward_euler", "crank_nicolson", "tr_bdf2", "radau", "imex", "etdrk4"]
 
 
 def react(x, p):
     """Three species; the third does not spread. The entries are not in the order of the state."""
-    u, v, w = x["u"], x["v"], x["w"]
+    u = x["u"]
+    v = x["v"]
+    w = x["w"]
     return {"w": u - w, "u": p["F"] * (1 - u) - u * v**2, "v": u * v**2 - p["F"] * v}
 
 
@@ -34,7 +38,8 @@ def dense(op):
     return np.array([op @ unit for unit in np.eye(12)]).T
 
 
-DENSE_U, DENSE_V = dense(L), dense(-1e-3 * M @ M)
+DENSE_U = dense(L)
+DENSE_V = dense(-1e-3 * M @ M)
 
 
 def matrix(p):
@@ -52,15 +57,19 @@ def flat_rate(x, p):
 
 
 def imex(x, p):
-    d, h, A = 1 - np.sqrt(0.5), p["dt"], matrix(p)
-    e, solve = 1 - 1 / (2 * d), lambda b: anp.linalg.solve(np.eye(36) - d * h * A, b)
+    d = 1 - np.sqrt(0.5)
+    h = p["dt"]
+    A = matrix(p)
+    e = 1 - 1 / (2 * d)
+    solve = lambda b: anp.linalg.solve(np.eye(36) - d * h * A, b)
     n0 = flat_rate(x, p)
     y = solve(x + h * d * n0)
     return solve(x + h * (e * n0 + (1 - e) * flat_rate(y, p)) + (1 - d) * h * anp.dot(A, y))
 
 
 def phi(k, Z):
-    total, term = np.eye(36) / factorial(k), np.eye(36)
+    total = np.eye(36) / factorial(k)
+    term = np.eye(36)
     for n in range(1, 40):
         term = anp.dot(term, Z)
         total = total + term / factorial(n + k)
@@ -69,10 +78,14 @@ def phi(k, Z):
 
 def etdrk4(x, p):
     """Cox and Matthews, in phi functions, which are sums of powers."""
-    h, A = p["dt"], matrix(p)
-    Z, n = h * A, lambda x: h * flat_rate(x, p)
-    half, q = phi(0, 0.5 * Z), 0.5 * phi(1, 0.5 * Z)
-    n0, a = n(x), half @ x + q @ n(x)
+    h = p["dt"]
+    A = matrix(p)
+    Z = h * A
+    n = lambda x: h * flat_rate(x, p)
+    half = phi(0, 0.5 * Z)
+    q = 0.5 * phi(1, 0.5 * Z)
+    n0 = n(x)
+    a = half @ x + q @ n(x)
     b = half @ x + q @ n(a)
     c = half @ a + q @ (2 * n(b) - n0)
     one, two, three = (phi(k, Z) for k in (1, 2, 3))
@@ -177,13 +190,16 @@ OPERATORS = [
 
 @pytest.mark.parametrize("op", OPERATORS, ids=[op.name for op in OPERATORS])
 def test_functions_of_an_operator(op):
-    A, h, nu = dense(op), 0.05, 0.6
+    A = dense(op)
+    h = 0.05
+    nu = 0.6
     assert dp.stepper("etdrk4", op, h)(U, nu).ravel() == pytest.approx(
         scipy.linalg.expm(h * nu * A) @ U.ravel(), rel=1e-9
     )
     found = dp.stepper("backward_euler", op, h)(U, nu)
     assert found.ravel() == pytest.approx(np.linalg.solve(np.eye(12) - h * nu * A, U.ravel()), rel=1e-9)
-    fine, exact = dp.stepper("rk4", lambda u, p: p * u**2 + p * op(u), h / 20), None
+    fine = dp.stepper("rk4", lambda u, p: p * u**2 + p * op(u), h / 20)
+    exact = None
     if op.name.startswith("diagonal"):  # the others are too stiff for these figures
         exact = value_and_grad(lambda p: anp.sum((1 + V) * dp.rollout(fine, p * U, p, 40) ** 2))(nu)
     for method in ("imex", "etdrk4"):
@@ -274,7 +290,8 @@ def test_trees_travel():
 @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (2, 2), (0, 3)])
 @pytest.mark.parametrize("method", ["imex", "etdrk4"])
 def test_thin_and_empty_grids(method, shape):
-    lap, u = dp.laplacian(dp.Grid(shape)), np.cos(np.arange(shape[0] * shape[1])).reshape(shape)
+    lap = dp.laplacian(dp.Grid(shape))
+    u = np.cos(np.arange(shape[0] * shape[1])).reshape(shape)
     for op in (-1.0 * lap @ lap, dp.matrix_function(lap, lambda e: -(e**2))):
         step = dp.stepper(method, lambda x, p: {"b": -p * x["b"], "a": p * x["b"]}, 0.1, linear={"a": op, "b": None})
         end = step({"a": u, "b": u}, 0.5)
@@ -296,7 +313,8 @@ def test_a_field_without_a_term_is_handed_out_afresh(method):
 
 
 def test_the_way_back_of_a_linear_step_has_a_name_of_its_own():
-    step, u = dp.stepper("heun", dp.laplacian(dp.Grid(5)), 0.1), np.arange(5.0)
+    step = dp.stepper("heun", dp.laplacian(dp.Grid(5)), 0.1)
+    u = np.arange(5.0)
     with recording() as calls:
         dp.grad(lambda u: anp.sum(step(u) ** 2))(u)
     assert calls["stepper(heun)", "forward"] == calls["stepper(heun)", "vjp"] == 1

@@ -21,7 +21,9 @@ RATES = np.array([0.04, 1e4, 3e7])
 
 
 def robertson(u, p):
-    slow, back, fast = p[0] * u[0], p[1] * u[1] * u[2], p[2] * u[1] ** 2
+    slow = p[0] * u[0]
+    back = p[1] * u[1] * u[2]
+    fast = p[2] * u[1] ** 2
     return anp.array([back - slow, slow - back - fast, fast])
 
 
@@ -48,7 +50,8 @@ def test_stages_share_a_jacobian(method, most):
 
 def test_a_jacobian_that_does_not_contract_is_made_again(monkeypatch):
     """A step of 50 time units of stiff kinetics: the first Jacobian is of no use at the root."""
-    u, step = np.array([1.0, 0.0, 0.0]), dp.stepper("backward_euler", robertson, 50.0)
+    u = np.array([1.0, 0.0, 0.0])
+    step = dp.stepper("backward_euler", robertson, 50.0)
     count = {"made": 0, "steps": 0}
     made = Jacobians.fresh
     monkeypatch.setattr(Jacobians, "fresh", lambda *args: (count.update(made=count["made"] + 1), made(*args))[1])
@@ -121,7 +124,8 @@ def test_loops_of_trees_and_single_precision():
 
 
 def test_a_pullback_gives_the_same_bits_twice():
-    step, u = dp.stepper("tr_bdf2", robertson, 0.3), np.array([0.9, 2e-5, 0.1])
+    step = dp.stepper("tr_bdf2", robertson, 0.3)
+    u = np.array([0.9, 2e-5, 0.1])
     pull = pullback(lambda p: step(u, p), RATES)[1]
     first = pull(np.ones(3))
     step(u, 2 * RATES)
@@ -131,7 +135,8 @@ def test_a_pullback_gives_the_same_bits_twice():
 @pytest.mark.parametrize("method", ["backward_euler", "crank_nicolson", "tr_bdf2"])
 def test_small_steps_add_up(method):
     """Each changes the state by less than the tolerance of Newton's method."""
-    step, u = dp.stepper(method, lambda u, p: p * anp.array([u[1], -u[0]]), 1e-12), np.array([1.0, 0.0])
+    step = dp.stepper(method, lambda u, p: p * anp.array([u[1], -u[0]]), 1e-12)
+    u = np.array([1.0, 0.0])
     for _ in range(50):
         u = step(u, 1.0)
     assert u[1] == pytest.approx(-5e-11, rel=1e-9)
@@ -141,8 +146,10 @@ def test_small_steps_add_up(method):
 def test_no_diffusion_and_hardly_any(method):
     """As a rate: nu = 0 is the identity; at 1e-300 and at diffusion number 1e8 the gradient is that of the formula."""
     grid = dp.Grid(8, size=1.0)
-    op, mode = dp.laplacian(grid, dp.dirichlet), np.sin(np.pi * grid.centres()[0])
-    nonlinear, linear = dp.stepper(method, lambda u, nu: nu * op(u), 1.0), dp.stepper(method, op, 1.0)
+    op = dp.laplacian(grid, dp.dirichlet)
+    mode = np.sin(np.pi * grid.centres()[0])
+    nonlinear = dp.stepper(method, lambda u, nu: nu * op(u), 1.0)
+    linear = dp.stepper(method, op, 1.0)
     np.testing.assert_array_equal(nonlinear(mode, 0.0), mode)
     for nu in (0.0, 1e-300, 1e8 / 64):
         slopes = [value_and_grad(lambda nu, s=s: anp.sum(s(mode, nu) * mode))(nu)[1] for s in (nonlinear, linear)]
@@ -153,7 +160,8 @@ def test_no_diffusion_and_hardly_any(method):
 
 
 def test_small_systems_take_the_same_path_while_calls_are_counted():
-    step, u = dp.stepper("tr_bdf2", robertson, 0.3), np.array([0.9, 2e-5, 0.1])
+    step = dp.stepper("tr_bdf2", robertson, 0.3)
+    u = np.array([0.9, 2e-5, 0.1])
     loss = lambda p: anp.sum(step(u, p) * np.array([1.0, 1e4, -2.0]))
     value, g = value_and_grad(loss)(RATES)
     assert step.info.hierarchy == "dense LU, 3 rows" and step.info.adjoint.residual <= 1e-10
@@ -169,7 +177,8 @@ def dense(A):
 
 def test_dense_factors_solve_and_know_when_they_cannot():
     rng = np.random.default_rng(0)
-    A, b = rng.standard_normal((7, 7)), rng.standard_normal(7)
+    A = rng.standard_normal((7, 7))
+    b = rng.standard_normal(7)
     for scale in (1.0, 2.0**150, 2.0**-150):
         solver = dense(scale * A)
         np.testing.assert_allclose(scale * A @ solver.solve(b), b, rtol=1e-10)
@@ -203,7 +212,8 @@ def test_a_jacobian_stands_on_the_grid_of_its_operators():
 
 def test_a_jacobian_that_is_not_symmetric_does_not():
     grid = dp.Grid((6, 5), size=1.0, periodic=True)
-    average, out = dp.average(grid), dp.divergence(grid)
+    average = dp.average(grid)
+    out = dp.divergence(grid)
     step = dp.stepper("backward_euler", lambda u, p: -out(0.5 * p * average(u) ** 2), 0.01)
     step(np.sin(grid.centres()[0]), 1.0)
     assert "space(30) -> space(30)" in str(step.scheme.root)
@@ -225,7 +235,8 @@ def test_gradient_on_other_grids(case):
     grid = dp.Grid((8, 9), spacing=(widths, 1.0)) if case == "stretched" else dp.Grid((4, 5))
     op = dp.laplacian(grid, dp.dirichlet)
     if case == "stretched":
-        rate, u = (lambda u, p: p * op(u) - u**3), np.cos(grid.centres()[1])
+        rate = lambda u, p: p * op(u) - u**3
+        u = np.cos(grid.centres()[1])
     else:
         rate = lambda u, p: anp.stack([p * op(u[0]) - u[0] * u[1] ** 2, u[0] * u[1] ** 2 - u[1]])
         u = np.stack([np.cos(grid.centres()[0]), np.sin(grid.centres()[1])])
@@ -250,7 +261,8 @@ def test_functions_are_evaluated_once_for_all_steps_and_the_adjoint(monkeypatch)
     """One set for each c dt, for plain and traced coefficients alike."""
     grid = dp.Grid(16, size=1.0)
     step = dp.stepper("etdrk4", lambda u, p: u - u**3, 0.01, linear=(dp.laplacian(grid), lambda p: p))
-    evaluated, values = [], Function.values
+    evaluated = []
+    values = Function.values
     monkeypatch.setattr(Function, "values", lambda self, *args: (evaluated.append(self), values(self, *args))[1])
     loss = lambda nu: anp.sum(dp.rollout(step, np.cos(grid.centres()[0]), nu, 6) ** 2)
     value_and_grad(loss)(0.1)

@@ -44,7 +44,8 @@ split = dp.differentiable(
     lambda nums, ans, u: lambda g: (2 * anp.concatenate([g[0], np.zeros(2)]) + 2 * u * g[1],),
 )
 X = np.array([1.0, 2.0, 1.5, 0.3])
-MATRIX, LINE = np.random.default_rng(1).standard_normal((3, 3)), dp.laplacian(dp.Grid(3), dp.dirichlet)
+MATRIX = np.random.default_rng(1).standard_normal((3, 3))
+LINE = dp.laplacian(dp.Grid(3), dp.dirichlet)
 
 
 def test_order_five():
@@ -63,7 +64,8 @@ def test_prothero_robinson(stiffness, monkeypatch):
         calls.append(t)
         return -k * (u - anp.cos(t)) - anp.sin(t)
 
-    errors, tolerances = [], (1e-3, 1e-5, 1e-8)
+    errors = []
+    tolerances = (1e-3, 1e-5, 1e-8)
     for tolerance in tolerances:
         calls.clear()
         step = dp.stepper("radau", rate, 5.0, tolerance=tolerance)
@@ -106,7 +108,9 @@ def test_stiff_problems_with_their_gradients(name):
     """Values and gradients within the tolerance that the page names; both fall with it."""
     rate, _, start, params, end, number = SCENES[name]
     state, slopes = map(np.array, KNOWN[name])
-    start, params, found = np.array(start), np.array(params), []
+    start = np.array(start)
+    params = np.array(params)
+    found = []
     for tolerance in (1e-3, 1e-5, 1e-7):
         step = dp.stepper("radau", rate, end, tolerance=tolerance, floor=SMALL.get(name))
         new = step(start, params)
@@ -131,7 +135,8 @@ def test_moved_rates_with_the_default_floor(tolerance):
 
 def test_one_step_against_a_root():
     """The value and gradient of a fixed step are those of the stage equations by `implicit`."""
-    p, u = np.array([2.0, 0.5]), np.array([1.0, -0.5, 0.3])
+    p = np.array([2.0, 0.5])
+    u = np.array([1.0, -0.5, 0.3])
 
     def rate(u, p, t):
         return anp.array([u[1] * u[2], -p[0] * u[0] + anp.sin(t), p[1] * u[0] ** 2 - u[2]])
@@ -195,7 +200,8 @@ def test_every_mode(count, options, near):
 )
 def test_all_rows_at_once(rate):
     """The derivatives of a rate at many points are those of one pass back for each row and point, to rounding."""
-    points, p = np.random.default_rng(0).uniform(0.3, 2.5, (9, 3)), np.array([0.7, 1.6])
+    points = np.random.default_rng(0).uniform(0.3, 2.5, (9, 3))
+    p = np.array([0.7, 1.6])
     problem = dp.stepper("radau", rate, 1.0).problem
     rates, rows = Flat(problem, points[0], "radau").rows([(u, 0.0) for u in points], p, [True])
     for u, f, found in zip(points, rates, rows, strict=True):
@@ -206,7 +212,8 @@ def test_all_rows_at_once(rate):
 
 def test_points_go_back_together(monkeypatch):
     """Tapes of the same calls do, each branch by itself; what is not known goes back alone."""
-    groups, one_by_one = [], jacobians._rows
+    groups = []
+    one_by_one = jacobians._rows
     monkeypatch.setattr(jacobians, "_rows", lambda tapes, *rest: groups.append(len(tapes)) or one_by_one(tapes, *rest))
     cube = dp.differentiable("cube", lambda x: x**3, lambda nums, ans, x: lambda g: (3 * x**2 * g,))
     points = [np.array([x, 1.0]) for x in (0.5, 1.5, 2.5, 0.1)]
@@ -256,7 +263,8 @@ def test_an_audit_of_a_wrong_loss_blames_no_step(at_fault):
 
 def test_long_oscillation():
     """The phase of the derivative in a frequency grows with time; right, or refused."""
-    rate, end = lambda u, p: anp.array([p * u[1], -p * u[0]]), 80.0
+    rate = lambda u, p: anp.array([p * u[1], -p * u[0]])
+    end = 80.0
     for tolerance in (1e-3, 1e-5):
         step = dp.stepper("radau", rate, end, tolerance=tolerance)
         exact = -end * np.sin(end * 1.01)
@@ -283,7 +291,8 @@ def test_what_matters_early_only():
 def test_a_jacobian_that_is_given(given):
     """It serves Newton's method; a poor one costs steps, and never the derivative."""
     rate, _, start, params, end, number = SCENES["HIRES"]
-    start, params = np.array(start), np.array(params)
+    start = np.array(start)
+    params = np.array(params)
     step = dp.stepper("radau", rate, end, tolerance=1e-6, jacobian=given)
     value, g = value_and_grad(lambda p: step(start, p)[number])(params)
     assert value == pytest.approx(KNOWN["HIRES"][0][number], rel=1e-5)
@@ -292,7 +301,8 @@ def test_a_jacobian_that_is_given(given):
 
 def test_kinds_of_states():
     """Batches, single precision, one number, whole numbers, nothing, nothing that moves; inputs stay as they are."""
-    rate, p = lambda u, p: -p * u**2, 0.5
+    rate = lambda u, p: -p * u**2
+    p = 0.5
     step = dp.stepper("radau", rate, 2.0, tolerance=1e-6)
     u = np.array([[1.0, 2.0], [0.5, 0.1]])
     u.flags.writeable = False

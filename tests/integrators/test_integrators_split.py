@@ -29,7 +29,8 @@ def run(step, state, params, n):
 @pytest.mark.parametrize(("method", "order"), [("imex", 2), ("etdrk4", 4)])
 def test_order_of_solution_and_gradient(method, order):
     """Bistable reaction and diffusion, stiff for every dt used; against steps eight times as fine."""
-    start, params = np.sin(np.pi * X) + 0.3 * np.sin(3 * np.pi * X), {"nu": 0.05, "r": 4.0}
+    start = np.sin(np.pi * X) + 0.3 * np.sin(3 * np.pi * X)
+    params = {"nu": 0.05, "r": 4.0}
 
     def found(n):
         step = dp.stepper(method, reaction, 0.5 / n, linear=(L, lambda p: p["nu"]))
@@ -48,7 +49,9 @@ def test_a_linear_problem_is_exact(dt):
     """exp(dt nu L) and its derivative, with a constant source too, against dense matrices."""
     dense = L.matrix.toarray()
     forced = dp.stepper("etdrk4", dt=dt, linear=(L, lambda p: p[0]), source=lambda p: p[1])
-    u, f, nu = np.cos(3 * X), 1 + X, 0.3
+    u = np.cos(3 * X)
+    f = 1 + X
+    nu = 0.3
     grown = scipy.linalg.expm(dt * nu * dense)
     wanted = grown @ u + np.linalg.solve(nu * dense, grown @ f - f)
     assert forced(u, (nu, f)) == pytest.approx(wanted, rel=1e-9, abs=1e-12)
@@ -60,7 +63,8 @@ def test_a_linear_problem_is_exact(dt):
 
 def test_factor_of_a_sine_mode_is_the_exponential():
     """A4: exact to round-off at any dt."""
-    mode, eigenvalue = np.sin(np.pi * X), 4 * 16**2 * np.sin(np.pi / 32) ** 2
+    mode = np.sin(np.pi * X)
+    eigenvalue = 4 * 16**2 * np.sin(np.pi / 32) ** 2
     for dt in (1e-12, 1e-3, 1.0, 1e4):
         factor = dp.stepper("etdrk4", L, dt)(mode, 1.0) / mode
         assert factor == pytest.approx(np.full(16, np.exp(-dt * eigenvalue)), rel=1e-12, abs=1e-15)
@@ -70,7 +74,8 @@ def test_factor_of_a_sine_mode_is_the_exponential():
 def test_phi_against_the_integral(x):
     """phi_k(x) = the integral of exp((1 - s) x) s^(k-1) / (k-1)! over 0 < s < 1."""
     nodes, weights = np.polynomial.legendre.leggauss(200)
-    s, weights = (nodes + 1) / 2, weights / 2
+    s = (nodes + 1) / 2
+    weights = weights / 2
     found = phi(5, np.array(x))
     assert found[0] == pytest.approx(np.exp(x), rel=1e-14)
     if x == -1e5:
@@ -89,7 +94,8 @@ def test_functions_against_the_dense_matrix(power):
     op = dp.matrix_power(op, 2) if power else op
     dense = np.array([op(unit.reshape(4, 5)).ravel() for unit in np.eye(20)]).T
     f = PhiFunctions(op, "f")
-    z, u = (-1e-4 if power else 0.01), np.random.default_rng(0).standard_normal((4, 5))
+    z = -1e-4 if power else 0.01
+    u = np.random.default_rng(0).standard_normal((4, 5))
     whole = (f(Function((1.0,)), z, u) + f(Function((0.0, 2.0), 0.5), z, 2 * u)).ravel()
     grown = scipy.linalg.expm(z * dense)
     half = np.linalg.solve(z / 2 * dense, scipy.linalg.expm(z / 2 * dense) - np.eye(20))
@@ -97,7 +103,8 @@ def test_functions_against_the_dense_matrix(power):
 
 
 def test_derivatives_of_functions():
-    f, table = PhiFunctions(L, "f"), (Function((1.0, 0.0, 2.0), 0.5), Function((0.0, 1.0)))
+    f = PhiFunctions(L, "f")
+    table = (Function((1.0, 0.0, 2.0), 0.5), Function((0.0, 1.0)))
     loss = lambda x: anp.sum((f(table[0], x[0], x[1]) + f(table[1], x[0], x[2])) ** 2)
     for z in (0.0, 0.01, 1.0):
         slope = lambda x: anp.sum(anp.sin(value_and_grad(loss)(x)[1][1]) * X) + value_and_grad(loss)(x)[1][0] ** 2
@@ -169,7 +176,8 @@ def test_chaos_keeps_its_mean_and_its_size():
 def test_growth_of_the_gradient_is_the_lyapunov_exponent():
     """0.043 to 0.05 in the literature, within 25 %; and the loop says that the gradient is of little use."""
     step, u = chaos(128, 0.1)
-    start, runs = dp.rollout(step, u, None, 2000), []
+    start = dp.rollout(step, u, None, 2000)
+    runs = []
     weights = np.random.default_rng(0).standard_normal(128)
     with pytest.warns(UserWarning, match="the cotangent grew by"):
         value_and_grad(lambda u: anp.sum(weights * dp.rollout(step, u, None, 15000, record=runs.append)))(start)

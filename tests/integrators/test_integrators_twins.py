@@ -54,7 +54,8 @@ def imex(u, z, h, n):
 
 def exp(z):
     """Enough terms for |z A| < 2."""
-    total, term = EYE, EYE
+    total = EYE
+    term = EYE
     for k in range(1, 30):
         term = anp.dot(term, z * A) / k
         total = total + term
@@ -63,7 +64,9 @@ def exp(z):
 
 def etdrk4(u, z, h, n):
     """Formulas 26 to 29 of Cox and Matthews, with inverses of matrices."""
-    half, whole, Z = exp(z / 2), exp(z), z * A
+    half = exp(z / 2)
+    whole = exp(z)
+    Z = z * A
     q = h * anp.linalg.solve(Z, half - EYE)
     a = half @ u + q @ n(u)
     b = half @ u + q @ n(a)
@@ -92,7 +95,8 @@ TWINS = {
 def test_twin(method):
     """Value and gradient of three steps in state, coefficient, rate and dt."""
     by_hand, kind = TWINS[method]
-    start, params = np.cos(2 * X), {"nu": 0.4, "r": 3.0, "dt": 0.01 if kind == "linear" else 0.004}
+    start = np.cos(2 * X)
+    params = {"nu": 0.4, "r": 3.0, "dt": 0.01 if kind == "linear" else 0.004}
     rate = None if kind == "linear" else cubic
     step = dp.stepper(method, rate, lambda p: p["dt"], linear=(L, lambda p: p["nu"]))
 
@@ -121,7 +125,8 @@ def test_a_jacobian_that_is_given(form):
         J = p["nu"] * L.matrix.toarray() + np.diag(p["r"] - 3 * u**2)
         return {"dense": J, "sparse": dp.from_matrix(J).matrix, "operator": dp.from_matrix(J)}[form]
 
-    rate, params = lambda u, p: p["nu"] * L(u) + cubic(u, p), {"nu": 0.4, "r": 3.0}
+    rate = lambda u, p: p["nu"] * L(u) + cubic(u, p)
+    params = {"nu": 0.4, "r": 3.0}
     found = []
     for given in (None, jacobian):
         step = dp.stepper("tr_bdf2", rate, 0.1, jacobian=given, rtol=1e-12)
@@ -133,7 +138,8 @@ def test_a_jacobian_that_is_given(form):
 @pytest.mark.parametrize("solver", ["direct", "separable", "multigrid", "krylov"])
 def test_solver_of_a_linear_step(solver):
     grid = dp.Grid((8, 6), size=1.0)
-    op, u = dp.laplacian(grid), np.random.default_rng(0).standard_normal((8, 6))
+    op = dp.laplacian(grid)
+    u = np.random.default_rng(0).standard_normal((8, 6))
     new = dp.stepper("tr_bdf2", op, 0.3, solver=solver, rtol=1e-12)(u, 0.5)
     assert new == pytest.approx(dp.stepper("tr_bdf2", op, 0.3)(u, 0.5), rel=1e-8, abs=1e-10)
     assert np.mean(new) == pytest.approx(np.mean(u), rel=1e-9)
@@ -179,7 +185,9 @@ def test_any_layout_and_no_writing(method):
 @pytest.mark.parametrize("nu", [0.0, 0.5])
 def test_complex_and_whole_numbers(method, nu):
     """A complex state is two real ones; whole numbers become floating ones."""
-    step, u, v = dp.stepper(method, L, 1e-3), np.cos(X), np.sin(3 * X)
+    step = dp.stepper(method, L, 1e-3)
+    u = np.cos(X)
+    v = np.sin(3 * X)
     both = step(u + 1j * v, nu)
     assert both == pytest.approx(step(u, nu) + 1j * step(v, nu), rel=1e-12)
     value, g = value_and_grad(lambda nu: anp.sum(anp.abs(step(u + 1j * v, nu)) ** 2))(nu)

@@ -52,7 +52,8 @@ def solved(name, tolerance, floor=None):
     """(errors of the state relative to its largest entry, of the gradient relative to its norm), or what refused it."""
     rate, _, start, params, end, number = SCENES[name]
     state, slopes = map(np.array, KNOWN[name])
-    start, params = np.array(start), np.array(params)
+    start = np.array(start)
+    params = np.array(params)
     step = dp.stepper("tr_bdf2", rate, end, tolerance=tolerance, floor=floor)
     end_state = step(start, params)
     error = np.max(np.abs(end_state - state)) / np.max(np.abs(state))
@@ -87,7 +88,8 @@ def test_a_jump_that_moves():
 def test_values_fall_with_the_tolerance(name, most):
     """Newton's method took errors of 1e-5 in species of 5e-5 for rounding, and they added up."""
     rate, _, start, params, end, _ = SCENES[name]
-    state, errors = np.array(KNOWN[name][0]), []
+    state = np.array(KNOWN[name][0])
+    errors = []
     for tolerance in (1e-3, 1e-4):
         new = dp.stepper("tr_bdf2", rate, end, tolerance=tolerance)(np.array(start), np.array(params))
         errors.append(np.max(np.abs(new - state)) / np.max(np.abs(state)))

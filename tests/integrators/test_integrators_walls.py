@@ -11,8 +11,12 @@ from sparsedp.autodiff.derivative import value_and_grad
 
 ORDERS = {"backward_euler": 1, "crank_nicolson": 2, "tr_bdf2": 2, "imex": 2, "etdrk4": 4}
 GRID = dp.Grid(48, size=1.0)
-X, ENDS, WEIGHTS = GRID.centres()[0], np.array([0.0, 1.0]), 1 + np.exp(GRID.centres()[0])
-G, D, B = dp.gradient(GRID, dp.dirichlet), dp.divergence(GRID), dp.lift(GRID, dp.dirichlet)
+X = GRID.centres()[0]
+ENDS = np.array([0.0, 1.0])
+WEIGHTS = 1 + np.exp(GRID.centres()[0])
+G = dp.gradient(GRID, dp.dirichlet)
+D = dp.divergence(GRID)
+B = dp.lift(GRID, dp.dirichlet)
 L = dp.laplacian(GRID, dp.dirichlet)
 
 
@@ -26,7 +30,8 @@ def problem(reaction):
 
     def source(params, t):
         nu, w = params
-        u, walls = exact(X, t, w), B(exact(ENDS, t, w))
+        u = exact(X, t, w)
+        walls = B(exact(ENDS, t, w))
         f = -w * anp.sin(3 * X + w * t) + 5 * X * anp.cos(5 * t) - nu * D(G(u) + walls) + reaction * u**3
         return nu * D(walls) + f
 
@@ -57,7 +62,8 @@ WALLS = list(product(ORDERS, (0.0, 1.0)))  # with a reaction, steps of many meth
 def test_moving_walls(method, reaction):
     """The errors of value and gradient fall with the order of the method."""
     found = np.array([errors(method, reaction, n) for n in (16, 128)])
-    order, slopes = ORDERS[method], np.log2(found[0] / found[-1]) / 3
+    order = ORDERS[method]
+    slopes = np.log2(found[0] / found[-1]) / 3
     assert np.all(slopes >= order - 0.2) and np.all(slopes <= order + 0.6), found
     assert np.all(found[-1] <= {1: 2e-2, 2: 3e-4, 4: 1e-7}[order]), found
 
@@ -67,7 +73,8 @@ def test_prothero_robinson(method):
     """u' = -a (u - g(t)) + g'(t), u = g: the error at the end, the largest over all stiffnesses a."""
     one = dp.Grid(1, size=1.0)
     op = dp.laplacian(one, dp.dirichlet) * 0.25  # the number -1
-    g, slope = lambda t: anp.sin(3 * t) + anp.cos(t), lambda t: 3 * anp.cos(3 * t) - anp.sin(t)
+    g = lambda t: anp.sin(3 * t) + anp.cos(t)
+    slope = lambda t: 3 * anp.cos(3 * t) - anp.sin(t)
     worst = []
     for n in (32, 128):
         found = []
@@ -82,13 +89,19 @@ def test_prothero_robinson(method):
 def test_stages_of_imex_by_hand():
     """ARS(2,2,2) with dense matrices, the source at the times of its implicit stages."""
     d = 1 - np.sqrt(0.5)
-    e, h, nu, t = 1 - 1 / (2 * d), 0.3, 0.7, 0.2
-    A, eye = nu * L.matrix.toarray(), np.eye(X.size)
-    s, rate = (lambda t: np.cos(X + 4 * t)), (lambda u, t: np.sin(u) * t)
+    e = 1 - 1 / (2 * d)
+    h = 0.3
+    nu = 0.7
+    t = 0.2
+    A = nu * L.matrix.toarray()
+    eye = np.eye(X.size)
+    s = lambda t: np.cos(X + 4 * t)
+    rate = lambda u, t: np.sin(u) * t
     u = np.exp(X)
     n0 = rate(u, t)
     x1 = np.linalg.solve(eye - d * h * A, u + h * d * n0 + d * h * s(t + d * h))
-    f1, n1 = A @ x1 + s(t + d * h), rate(x1, t + d * h)
+    f1 = A @ x1 + s(t + d * h)
+    n1 = rate(x1, t + d * h)
     right = u + h * (e * n0 + (1 - e) * n1) + (1 - d) * h * f1 + d * h * s(t + h)
     step = dp.stepper("imex", lambda u, p, t: rate(u, t), h, linear=(L, nu), source=lambda p, t: s(t))
     found, at = step((u, t))

@@ -12,7 +12,9 @@ import sparsedp as dp
 def strings(n, dt, damping=None, periodic=True, **options):
     """Waves p' = -c^2 div v, v' = -grad p on a line; params: c."""
     grid = dp.Grid(n, size=1.0, periodic=periodic)
-    D, G, inside = dp.divergence(grid), dp.gradient(grid), dp.interior(grid)
+    D = dp.divergence(grid)
+    G = dp.gradient(grid)
+    inside = dp.interior(grid)
     rates = (lambda v, c: -(c**2) * D(v)), (lambda p, c: -inside(G(p)))
     return grid, dp.stepper("leapfrog", rates, dt, damping=damping, **options)
 
@@ -74,7 +76,9 @@ def test_steps_beyond_the_limit_are_refused(damping):
 def test_the_limit_of_a_box(shape):
     """Against the eigenvalues, where the waves have different speeds."""
     grid = dp.Grid(shape)
-    D, G, inside = dp.divergence(grid), dp.gradient(grid), dp.interior(grid)
+    D = dp.divergence(grid)
+    G = dp.gradient(grid)
+    inside = dp.interior(grid)
     c = np.where(np.arange(grid.cells.size).reshape(shape) % 2, 1.0, 3.0)
     w = np.max(np.linalg.eigvals(c.reshape(-1, 1) ** 2 * (-D @ inside @ G).matrix.toarray()).real) ** 0.5
     state = np.zeros(shape), np.zeros(grid.faces.size)
@@ -147,11 +151,13 @@ def test_trees_and_inputs():
 @pytest.mark.parametrize("damped", [False, True])
 def test_derivatives(damped):
     """Against a loop in autograd.numpy, in state and params, to second order."""
-    n, dt = 8, 0.05
+    n = 8
+    dt = 0.05
     rng = np.random.default_rng(1)
     sigma = 3 * rng.random(n) * damped, 3 * rng.random(n) * damped
     grid, step = strings(n, dt, sigma if damped else None)
-    state, weights = (rng.standard_normal(n), rng.standard_normal(n)), rng.standard_normal(n)
+    state = (rng.standard_normal(n), rng.standard_normal(n))
+    weights = rng.standard_normal(n)
 
     def twin(p, v, c):
         for _ in range(5):
@@ -163,7 +169,8 @@ def test_derivatives(damped):
 
     ours = lambda x: anp.sum(weights * dp.rollout(step, x[:2], x[2], 5)[0] ** 2)
     other = lambda x: twin(*x)
-    x, t = (*state, np.array(1.3)), (weights, weights[::-1].copy(), np.array(0.3))
+    x = (*state, np.array(1.3))
+    t = (weights, weights[::-1].copy(), np.array(0.3))
     assert ours(x) == pytest.approx(other(x), rel=1e-13)
     for one, two in ((dp.grad(ours)(x), dp.grad(other)(x)), (dp.hvp(ours, x, t), dp.hvp(other, x, t))):
         for a, b in zip(one, two, strict=True):
@@ -174,7 +181,9 @@ def pulse(cells, deep, steps):
     """A round pulse in a box of `cells` and a sponge around; the pressure in the box at the end."""
     n = cells + 2 * deep
     grid = dp.Grid((n, n))
-    D, G, inside = dp.divergence(grid), dp.gradient(grid), dp.interior(grid)
+    D = dp.divergence(grid)
+    G = dp.gradient(grid)
+    inside = dp.interior(grid)
     rates = (lambda v, _: -D(v)), (lambda p, _: -inside(G(p)))
     x, y = (c - n / 2 for c in grid.centres())
     square = (x**2 + y**2) / 18
@@ -240,9 +249,11 @@ def test_reversed_steps_give_the_gradient(keep):
     """To 1e-10 of that with all states kept, in state, params and inputs; second order too."""
     rng = np.random.default_rng(2)
     grid = dp.Grid(24, size=1.0, periodic=True)
-    D, G = dp.divergence(grid), dp.gradient(grid)
+    D = dp.divergence(grid)
+    G = dp.gradient(grid)
     rates = (lambda v, given: -(given[0] ** 2) * D(v) + given[1]), (lambda p, given: -G(p))
-    step, weights = dp.stepper("leapfrog", rates, 0.01), rng.standard_normal(24)
+    step = dp.stepper("leapfrog", rates, 0.01)
+    weights = rng.standard_normal(24)
 
     def loss(x, memory):
         given = dict(inputs=x["beat"], memory=memory)
@@ -301,7 +312,8 @@ def test_a_way_back_that_loses_the_start_is_refused():
 def test_reversed_steps_in_single_precision(error):
     """Rounding of float32 is allowed for, and the gradient has its digits; a wrong way back is refused."""
     grid = dp.Grid(24, size=1.0)
-    D, G = dp.divergence(grid), dp.gradient(grid, dp.dirichlet)
+    D = dp.divergence(grid)
+    G = dp.gradient(grid, dp.dirichlet)
     leapfrog = dp.stepper("leapfrog", (lambda v, c: -c * D(v), lambda p, c: -G(anp.sin(p))), 0.01)
 
     class Step:
@@ -322,7 +334,8 @@ def test_reversed_steps_in_single_precision(error):
         with pytest.raises(dp.errors.DerivativeError, match="away from the first state, beside states of size"):
             dp.grad(single)(u.astype(np.float32))
         return
-    found, right = dp.grad(single)(u.astype(np.float32)), dp.grad(lambda u: loss(u, None, np.float64))(u)
+    found = dp.grad(single)(u.astype(np.float32))
+    right = dp.grad(lambda u: loss(u, None, np.float64))(u)
     assert found.dtype == np.float32
     np.testing.assert_allclose(found, right, rtol=0, atol=1e-4 * np.max(np.abs(right)))
 
@@ -374,7 +387,8 @@ def test_damping_of_other_names_is_refused():
 @pytest.mark.parametrize("n", [0, 1, 20, 40])
 def test_frequencies_of_every_kind(n):
     """None at all, one alone, many, growth without a wave, and no finite slope at the state."""
-    c, ones = np.linspace(1.0, 30.0, n), (np.ones(n), np.ones(n))
+    c = np.linspace(1.0, 30.0, n)
+    ones = (np.ones(n), np.ones(n))
     rates = [
         (lambda q, p: 0.0 * q, lambda p, c: 0.0 * p),
         (lambda q, p: -30.0 * q, lambda p, c: 30.0 * p),

@@ -26,7 +26,8 @@ def real_only(x):
 
 def traced(x):
     """The same in autograd.numpy."""
-    u, v = x[0], x[1]
+    u = x[0]
+    v = x[1]
     spread = lambda a: sum(anp.roll(a, s, axis) for axis in (0, 1) for s in (-1, 1)) - 4 * a
     eaten = u * v * v
     return anp.stack([u + 0.16 * spread(u) - eaten + 0.04 * (1 - u), v + 0.08 * spread(v) + eaten - 0.1 * v])
@@ -36,7 +37,8 @@ def traced(x):
     "f, way, runs, digits", [(reaction, "complex step", 10, 1e-13), (real_only, "central", 20, 1e-8)]
 )
 def test_a_step_of_foreign_code(rng, f, way, runs, digits):
-    x, g = rng.random((2, 64, 64)), rng.standard_normal((2, 64, 64))
+    x = rng.random((2, 64, 64))
+    g = rng.standard_normal((2, 64, 64))
     step = dp.from_blackbox(f)
     slope = dp.value_and_grad(lambda x: anp.sum(g * step(x)))(x)[1]
     known = dp.value_and_grad(lambda x: anp.sum(g * traced(x)))(x)[1]
@@ -122,7 +124,8 @@ def far(x):
 )
 def test_a_stencil_is_found_from_a_few_cells(rng, f, shape, most):
     """And where the field is not the same everywhere the whole pattern is searched for."""
-    x, step = rng.standard_normal(shape), dp.from_blackbox(f)
+    x = rng.standard_normal(shape)
+    step = dp.from_blackbox(f)
     jacobian = step.jacobian(x)
     assert step.runs <= most
     v = 1e-6 * rng.standard_normal(shape)
@@ -138,7 +141,8 @@ def test_a_stencil_is_found_from_a_few_cells(rng, f, shape, most):
 @pytest.mark.parametrize("size", [1e-6, 1e-10, 1e-30, 1e-100])
 def test_small_rows_keep_what_no_stencil_has(rng, size):
     """A row of other units is not lost in the rounding of the largest, where differences are taken."""
-    sizes, x = np.ones(300), rng.standard_normal(300)
+    sizes = np.ones(300)
+    x = rng.standard_normal(300)
     sizes[[37, 101]] = size
 
     def f(x):

@@ -20,14 +20,18 @@ def relu_of_real(x):
 
 def upwind(x):
     """Values and the wind that carries them: differences from the side that the wind comes from."""
-    u, w = x[:N], x[N:]
+    u = x[:N]
+    w = x[N:]
     gain = np.where(w.real > 0, w * (u - np.roll(u, 1)), w * (np.roll(u, -1) - u))
     return np.concatenate([u - 0.3 * gain, 0.9 * w + 0.1 * np.roll(w, 1)])
 
 
 def upwind_matrix(x):
-    u, w = x[:N], x[N:]
-    one, before, after = np.eye(N), np.roll(np.eye(N), -1, 1), np.roll(np.eye(N), 1, 1)
+    u = x[:N]
+    w = x[N:]
+    one = np.eye(N)
+    before = np.roll(np.eye(N), -1, 1)
+    after = np.roll(np.eye(N), 1, 1)
     up = w > 0
     difference = np.where(up[:, None], one - before, after - one)
     of_u = one - 0.3 * w[:, None] * difference
@@ -72,7 +76,8 @@ def mixed(x):
 
 
 def mixed_matrix(x):
-    low, before = x <= 0, np.roll(np.eye(x.size), -1, 1)
+    low = x <= 0
+    before = np.roll(np.eye(x.size), -1, 1)
     return np.diag(np.where(low, -np.roll(x, 1), 2 * x)) + np.where(low, np.abs(x), 0.0)[:, None] * before
 
 
@@ -139,7 +144,8 @@ def test_the_other_side_is_met_later(f, seed):
     """The first point sees one side of every branch; the ones that follow turn a few, and then all."""
     rng = np.random.default_rng(seed)
     for code in (f, real(f)) if f in REAL else (f,):
-        adopted, x = dp.from_blackbox(code), 2 + rng.random(2 * N)
+        adopted = dp.from_blackbox(code)
+        x = 2 + rng.random(2 * N)
         for turned in (0, 3, 10, 2 * N):
             x = np.where(np.isin(np.arange(2 * N), rng.choice(2 * N, turned, replace=False)), -x, x)
             g, v = rng.standard_normal((2, 2 * N))
@@ -153,7 +159,8 @@ def test_the_other_side_is_met_later(f, seed):
 @pytest.mark.parametrize("f", [relu, relu_of_real, real(relu)], ids=lambda f: f.__name__)
 def test_at_a_kink_and_near_it(f):
     """Exactly at a kink the derivative is the mean of both sides; next to it that of its side."""
-    adopted, x = dp.from_blackbox(f), np.linspace(1.0, 2.0, 300)
+    adopted = dp.from_blackbox(f)
+    x = np.linspace(1.0, 2.0, 300)
     adopted.jacobian(x)
     x[::3], x[1::30], x[2::30] = 0.0, 1e-6, -1e-6
     known = np.where(x > 0, 1.0, np.where(x < 0, 0.0, 0.5))
@@ -199,7 +206,8 @@ def test_code_that_refuses_every_probe():
 @pytest.mark.parametrize("place", [2, 4, 9])
 def test_no_memory_is_no_branch_of_the_code(place):
     """It is handed on from wherever the code runs into it, and so is Ctrl-C; the next call is as the first."""
-    x, calls = np.array([1.0, -2.0, 3.0]), []
+    x = np.array([1.0, -2.0, 3.0])
+    calls = []
 
     def full(z):
         calls.append(z)

@@ -13,7 +13,8 @@ from sparsedp._utils.pytree import leaves
 
 jax = pytest.importorskip("jax", reason="jax is not installed: the extra `jax`")
 jnp = jax.numpy
-to_jax, from_jax = dp.interop.to_jax, dp.interop.from_jax
+to_jax = dp.interop.to_jax
+from_jax = dp.interop.from_jax
 
 
 @pytest.fixture
@@ -206,7 +207,8 @@ def loss_with(g):
 
 def test_every_order_of_a_jax_function():
     """Value, gradient, tangent and Hessian products are those of the twin in autograd.numpy."""
-    mine, theirs = loss_with(from_jax(of_jax)), loss_with(twin)
+    mine = loss_with(from_jax(of_jax))
+    theirs = loss_with(twin)
     assert dp.check.gradient(mine, PAIR).verdict == "agrees"
     squared = lambda f: lambda x: sum(anp.sum(g**2) for g in leaves(dp.grad(f)(x)))
     for act in (dp.grad, lambda f: dp.grad(squared(f))):
@@ -232,7 +234,8 @@ def test_float64_in_float64_out():
 
 
 def test_constants_may_be_reused_and_results_written_to():
-    work, f = np.array([2.0, 3.0]), from_jax(lambda a, w: a**2 * w)
+    work = np.array([2.0, 3.0])
+    f = from_jax(lambda a, w: a**2 * w)
 
     def loss(a):
         total = 0.0

@@ -12,7 +12,8 @@ import sparsedp as dp
 from sparsedp._utils.pytree import flatten, leaves, mapped
 
 torch = pytest.importorskip("torch", reason="torch is not installed: the extra `torch`")
-to_torch, from_torch = dp.interop.to_torch, dp.interop.from_torch
+to_torch = dp.interop.to_torch
+from_torch = dp.interop.from_torch
 
 
 def tensor(x, moves=True):
@@ -52,14 +53,16 @@ def test_float32_stays_float32():
 
 def test_nothing_is_done_for_arguments_without_a_gradient():
     """No pull for what does not ask, no record where nothing does, or torch does not look."""
-    asked, made = [], []
+    asked = []
+    made = []
 
     def vjp(nums, ans, a, b):
         made.append(nums)
         return lambda g: asked.append(nums) or tuple(g * (b, a)[num] for num in nums)
 
     product = to_torch(dp.differentiable("product", lambda a, b: a * b, vjp))
-    a, b = tensor(numbers(3)), tensor(numbers(3, seed=1), False)
+    a = tensor(numbers(3))
+    b = tensor(numbers(3, seed=1), False)
     product(a, b).sum().backward()
     assert made == asked == [(0,)] and b.grad is None
     assert np.array_equal(a.grad, b)
@@ -71,7 +74,8 @@ def test_nothing_is_done_for_arguments_without_a_gradient():
 
 def test_a_result_that_is_not_used_has_no_cotangent():
     f = to_torch(lambda a, b: (a * b, a**2, L(b)))
-    a, b = tensor(FIELD), tensor(FIELD + 1)
+    a = tensor(FIELD)
+    b = tensor(FIELD + 1)
     f(a, b)[1].sum().backward()
     assert np.allclose(a.grad, 2 * FIELD) and not b.grad.any()
 
@@ -99,7 +103,8 @@ def test_memory_is_shared_where_nobody_else_has_it():
 
 
 def test_gradients_share_no_memory():
-    a, b = tensor(FIELD), tensor(FIELD)
+    a = tensor(FIELD)
+    b = tensor(FIELD)
     to_torch(lambda a, b: a + b)(a, b).sum().backward()
     a.grad.zero_()
     assert np.array_equal(b.grad, np.ones(GRID.shape))
@@ -107,7 +112,8 @@ def test_gradients_share_no_memory():
 
 @pytest.mark.parametrize("changed", ["argument", "beside", "result"])
 def test_a_change_before_the_way_back_is_refused(changed):
-    a, b = tensor(FIELD), tensor(FIELD + 2, False)
+    a = tensor(FIELD)
+    b = tensor(FIELD + 2, False)
     y = to_torch(lambda a, b: anp.exp(a * b))(a, b)
     with torch.no_grad():
         {"argument": a, "beside": b, "result": y}[changed].mul_(2.0)
@@ -116,7 +122,8 @@ def test_a_change_before_the_way_back_is_refused(changed):
 
 
 def test_arrays_beside_tensors_may_be_reused():
-    work, a = np.array([1.0, 2.0]), tensor(np.array([3.0, 4.0]))
+    work = np.array([1.0, 2.0])
+    a = tensor(np.array([3.0, 4.0]))
     y = to_torch(lambda a, w: a**2 * w)(a, work)
     work[:] = np.nan
     slope = torch.autograd.grad(y.sum(), a, create_graph=True)[0]
@@ -196,7 +203,8 @@ def test_a_bridge_travels():
 
 def test_a_network_learns_through_a_solve():
     torch.manual_seed(0)
-    net, apply = torch.nn.Linear(1, 1).double(), to_torch(INVERSE)
+    net = torch.nn.Linear(1, 1).double()
+    apply = to_torch(INVERSE)
     x = torch.tensor(FIELD)[..., None]
     wanted = apply(3.0 * x[..., 0] - 1.0)
     optimizer = torch.optim.LBFGS(net.parameters(), line_search_fn="strong_wolfe")
@@ -231,7 +239,8 @@ def loss_with(g):
 
 def test_every_order_of_a_torch_function():
     """Value, gradient, tangent and Hessian product are those of the twin in autograd.numpy."""
-    mine, theirs = loss_with(from_torch(of_torch)), loss_with(twin)
+    mine = loss_with(from_torch(of_torch))
+    theirs = loss_with(twin)
     assert dp.check.gradient(mine, PAIR).verdict == "agrees"
     for act in (dp.grad, lambda f: dp.grad(lambda x: sum(anp.sum(g**2) for g in dp.grad(f)(x)))):
         for found, wanted in zip(act(mine)(PAIR), act(theirs)(PAIR), strict=True):
@@ -254,7 +263,8 @@ def test_a_module_and_its_parameters():
     torch.manual_seed(0)
     module = torch.nn.Sequential(torch.nn.Linear(2, 3), torch.nn.Tanh(), torch.nn.Linear(3, 1)).double()
     before = [p.detach().numpy().copy() for p in module.parameters()]
-    net, x = from_torch(module), numbers(5, 2)
+    net = from_torch(module)
+    x = numbers(5, 2)
     assert list(net.parameters) == ["0.weight", "0.bias", "2.weight", "2.bias"]
     assert np.array_equal(net(net.parameters, x), module(torch.tensor(x)).detach())
     loss = lambda p: anp.sum((net(p, x) - x[:, :1]) ** 2)
@@ -274,7 +284,8 @@ def test_a_function_with_random_numbers_runs_once():
         runs.append(1)
         return x**3 * torch.rand(3, dtype=torch.float64)
 
-    f, x = from_torch(noisy), np.array([1.0, 2.0, 3.0])
+    f = from_torch(noisy)
+    x = np.array([1.0, 2.0, 3.0])
     slope = dp.grad(lambda x: anp.sum(f(x)))
     torch.manual_seed(1)
     draws = torch.rand(3, dtype=torch.float64).numpy()
@@ -283,7 +294,8 @@ def test_a_function_with_random_numbers_runs_once():
 
 
 def test_constants_may_be_reused_and_results_written_to():
-    work, f = np.array([2.0, 3.0]), from_torch(lambda a, w: a**2 * w)
+    work = np.array([2.0, 3.0])
+    f = from_torch(lambda a, w: a**2 * w)
 
     def loss(a):
         total = 0.0
@@ -300,7 +312,8 @@ def test_constants_may_be_reused_and_results_written_to():
 
 
 def test_arguments_are_not_written_into():
-    u, twice = np.array([-1.0, 2.0]), from_torch(lambda x: x.mul_(2.0))
+    u = np.array([-1.0, 2.0])
+    twice = from_torch(lambda x: x.mul_(2.0))
     assert twice(u).tolist() == [-2.0, 4.0] and u.tolist() == [-1.0, 2.0]
     with pytest.raises(RuntimeError, match="in-place operation"):
         dp.grad(lambda u: anp.sum(twice(u)))(u)

@@ -87,7 +87,8 @@ def test_a_write_that_fails_in_the_middle_leaves_what_was_there(tmp_path):
 
 def test_what_a_new_file_keeps_of_the_old_one(tmp_path):
     """Its mode, and the link that leads to it; a pipe is written into, not replaced."""
-    path, link = tmp_path / "net.npz", tmp_path / "link.npz"
+    path = tmp_path / "net.npz"
+    link = tmp_path / "link.npz"
     path.write_bytes(b"old")
     path.chmod(0o600)
     link.symlink_to(path)
@@ -273,7 +274,8 @@ def test_a_name_that_cannot_be_printed(tmp_path, monkeypatch, capsys):
 
 def test_a_file_that_came_during_the_demo_is_not_overwritten(tmp_path, monkeypatch, capsys):
     class Verdict:
-        verdict, lines = "agrees", ()
+        verdict = "agrees"
+        lines = ()
 
     def slow(*_, **options):
         (tmp_path / "table.csv").write_text("mine")
@@ -292,9 +294,11 @@ def test_a_file_that_came_during_the_demo_is_not_overwritten(tmp_path, monkeypat
 def test_a_run_goes_on_from_the_state_before_the_disk_was_full(tmp_path, monkeypatch):
     """The state that found no room is not there, and the one before it takes the run to the same bits."""
     monkeypatch.setattr("sparsedp.optimize.checkpoint.SHARE", np.inf)
-    loss, start = lambda x: ((x - 1) ** 4).sum(), np.linspace(-1, 1, 9)
+    loss = lambda x: ((x - 1) ** 4).sum()
+    start = np.linspace(-1, 1, 9)
     whole = dp.minimize(loss, start, maxiter=8, tolerance=0)
-    fsync, room = os.fsync, [11]
+    fsync = os.fsync
+    room = [11]
 
     def full(handle):
         room[0] -= 1

@@ -23,7 +23,8 @@ def same(a, b):
 @pytest.mark.parametrize("name", GRIDS)
 @pytest.mark.parametrize("dtype", ["float64", "float32", "complex128", "complex64", "int16", "bool", ">f8"])
 def test_round_trip(name, dtype, tmp_path):
-    grid, rng = GRIDS[name], np.random.default_rng(0)
+    grid = GRIDS[name]
+    rng = np.random.default_rng(0)
     fields = {}
     for kind in ("cells", "faces", "nodes", "edges"):
         fields[kind] = (4 * rng.standard_normal(getattr(grid, kind).shape)).astype(dtype)

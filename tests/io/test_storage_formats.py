@@ -40,7 +40,8 @@ def numbers(grid, kind, dtype, *lead):
 @pytest.mark.parametrize("dtype", ["float64", "float32", "complex128", "complex64", "int64", "uint8", "bool"])
 @pytest.mark.parametrize("times", [None, np.array([0.0, 0.1]), np.arange(3), np.zeros(0, "float32")])
 def test_round_trip(suffix, name, dtype, times, tmp_path):
-    grid, lead = GRIDS[name], () if times is None else times.shape
+    grid = GRIDS[name]
+    lead = () if times is None else times.shape
     fields = {kind: numbers(grid, kind, dtype, *lead) for kind in KINDS}
     fields["batch"] = np.asfortranarray(numbers(grid, "cells", dtype, *lead, 2))
     fields["flows"] = numbers(grid, "faces", dtype, *lead, 1, 2)
@@ -102,7 +103,8 @@ def test_what_was_there_is_replaced_by_the_whole_or_stays(suffix, tmp_path, monk
 @pytest.mark.parametrize("moment", ["before", "after"])
 def test_a_folder_that_cannot_take_its_name_leaves_the_old_one_or_is_whole(kind, moment, tmp_path, monkeypatch):
     """An error or Ctrl-C at each rename: of the old folder out of the way, and of the new one onto its name."""
-    path, rename = tmp_path / "a.zarr", os.replace
+    path = tmp_path / "a.zarr"
+    rename = os.replace
     for failing in (1, 2):
         dp.save(path, GRID, v=np.ones(GRID.shape))
         calls = []
@@ -231,7 +233,8 @@ def test_damaged_netcdf(tmp_path):
 
 
 def test_damaged_zarr(tmp_path):
-    path, copy = tmp_path / "a.zarr", tmp_path / "copy.zarr"
+    path = tmp_path / "a.zarr"
+    copy = tmp_path / "copy.zarr"
     with pytest.raises(FileNotFoundError, match=r"a\.zarr"):
         dp.load(path)
     dp.save(path, GRID, u=numbers(GRID, "cells", float))

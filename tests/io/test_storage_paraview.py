@@ -92,7 +92,8 @@ def test_every_grid(name, tmp_path):
 
 
 def test_a_series(tmp_path):
-    path, u = tmp_path / "a & b.pvd", sample(FLAT, "cells", float, 3)
+    path = tmp_path / "a & b.pvd"
+    u = sample(FLAT, "cells", float, 3)
     dp.save(path, FLAT, times=[0.0, 0.1, 2], u=u, w=sample(FLAT, "faces", float, 3))
     entries = ElementTree.parse(path).getroot().findall("./Collection/DataSet")
     assert [float(entry.get("timestep")) for entry in entries] == [0.0, 0.1, 2.0]
@@ -103,7 +104,8 @@ def test_a_series(tmp_path):
 
 
 def test_a_shorter_series_leaves_no_file_of_the_longer_one(tmp_path):
-    path, u = tmp_path / "a.pvd", sample(FLAT, "cells", float, 3)
+    path = tmp_path / "a.pvd"
+    u = sample(FLAT, "cells", float, 3)
     dp.save(path, FLAT, times=[0.0, 0.1, 0.2], u=u)
     (tmp_path / "a" / "mine.vtr").write_text("mine")
     dp.save(path, FLAT, times=[0.0], u=u[:1])
@@ -124,7 +126,8 @@ def test_vtk_reads_the_same(grid, suffix, tmp_path):
     reader = vtk.vtkXMLImageDataReader() if suffix == ".vti" else vtk.vtkXMLRectilinearGridReader()
     reader.SetFileName(str(tmp_path / f"a{suffix}"))
     reader.Update()
-    cells, points = reader.GetOutput().GetCellData(), reader.GetOutput().GetPointData()
+    cells = reader.GetOutput().GetCellData()
+    points = reader.GetOutput().GetPointData()
     assert reader.GetOutput().GetNumberOfCells() == grid.cells.size
     bounds = reader.GetOutput().GetBounds()
     ends = [line[place] for axis in range(grid.dim) for line in [grid.coordinates(axis, "ends")] for place in (0, -1)]

@@ -38,7 +38,8 @@ def line(rng, n, periodic, stretched):
 def dense(axis, n):
     if axis is None:
         return np.zeros((n, n))
-    matrix, i = np.diag(axis.centre), np.arange(n)
+    matrix = np.diag(axis.centre)
+    i = np.arange(n)
     np.add.at(matrix, (i, i - 1), axis.lower)
     np.add.at(matrix, (i, (i + 1) % n), axis.upper)
     return matrix
@@ -107,9 +108,11 @@ def test_even_rows_have_the_bits_of_any_rows():
         for axis in axes:
             for diagonal in axis:
                 diagonal[:] = np.where(diagonal, diagonal[len(diagonal) // 2], 0.0)
-        u, found = rng.standard_normal(shape), []
+        u = rng.standard_normal(shape)
+        found = []
         for uniform in (True, False):
-            out, bands = np.full_like(u, np.nan), [np.stack(axis) for axis in axes]
+            out = np.full_like(u, np.nan)
+            bands = [np.stack(axis) for axis in axes]
             assert kernels.run("stencil", "kronecker_sum", shape[0] * shape[1], u.size, 1, u, out, *bands, uniform, 0.3)
             found.append(out)
         assert np.array_equal(*found) and np.array_equal(found[0], added(u, axes, 0.3))
@@ -133,7 +136,8 @@ def record(matrix, diagonals):
     m.sum_duplicates()
     row = np.repeat(np.arange(m.shape[0]), np.diff(m.indptr))
     offsets = np.unique(m.indices - row) if diagonals else np.zeros(0, int)
-    values, spans = np.zeros((offsets.size, m.shape[0])), np.zeros((2, offsets.size), int)
+    values = np.zeros((offsets.size, m.shape[0]))
+    spans = np.zeros((2, offsets.size), int)
     for d, offset in enumerate(offsets):
         here = row[m.indices - row == offset]
         values[d, here] = m.data[m.indices - row == offset]
@@ -190,7 +194,8 @@ def test_python_threads_may_call_at_the_same_time(monkeypatch):
     axes = (None, line(rng, 150, False, True), line(rng, 160, True, True))
     fields = [rng.standard_normal((1, 150, 160)) for _ in range(4)]
     expected = [added(u, axes, 0.0) for u in fields]
-    results, start = [[] for _ in fields], Barrier(len(fields))
+    results = [[] for _ in fields]
+    start = Barrier(len(fields))
 
     def work(k):
         start.wait()
@@ -246,7 +251,8 @@ def test_numpy_steps_in_where_nothing_compiles(monkeypatch):
 @NUMBA
 def test_an_error_in_a_slab_comes_out_when_all_have_ended(monkeypatch):
     monkeypatch.setattr(team, "SERIAL", 0)
-    kernel, ended = team.Kernel(double, "write1"), []
+    kernel = team.Kernel(double, "write1")
+    ended = []
 
     def compiled(x, start, stop):
         ended.append(start)

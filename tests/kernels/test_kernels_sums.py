@@ -19,7 +19,8 @@ def test_norms_on_the_way(size, rng):
     rest = fresh.copy()
     assert np.allclose(remainder(b, rest, x), (np.linalg.norm(b - fresh), np.linalg.norm(x)))
     assert np.array_equal(rest, b - fresh)
-    z, rest = x + 1j * b, b + 1j * x
+    z = x + 1j * b
+    rest = b + 1j * x
     assert np.isclose(norm(z), np.linalg.norm(z))
     assert np.allclose(remainder(z, rest, z), (np.linalg.norm(z - (b + 1j * x)), np.linalg.norm(z)))
 

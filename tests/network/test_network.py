@@ -17,7 +17,8 @@ SHAPES = [((3,), (7,)), ((5,), (5,)), ((1,), (4,)), ((3, 5), (6, 7)), ((1, 3), (
 
 def twin(p, x, padding):
     """The sum of shifted fields, one for each entry of the filters."""
-    w, dim = p["weight"], anp.ndim(x) - 2
+    w = p["weight"]
+    dim = anp.ndim(x) - 2
     widths = anp.shape(w)[-dim:]
     total = 0.0
     for place in np.ndindex(*widths):
@@ -60,7 +61,8 @@ def test_convolution_against_its_twin(rng, widths, cells, padding):
 @pytest.mark.parametrize("padding", PADDINGS)
 def test_second_order_of_a_small_network(rng, padding):
     p = {"a": nn.convolution_weights(rng, 1, 3, 3), "b": nn.convolution_weights(rng, 3, 1, 5)}
-    x, v = rng.standard_normal((2, 1, 6)), rng.standard_normal((3, 1, 3))
+    x = rng.standard_normal((2, 1, 6))
+    v = rng.standard_normal((3, 1, 3))
 
     def loss(convolution):
         net = lambda q: convolution(p["b"], nn.tanh(convolution({**p["a"], "weight": q}, x, padding)), padding)

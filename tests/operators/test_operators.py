@@ -20,7 +20,9 @@ def entry(request):
 @pytest.fixture(scope="module")
 def made(entry, drawn):
     """Operators of one entry on all grids and boundaries, by shape: as made, explicit and matrix-free."""
-    rng, scenes, found = np.random.default_rng(1), {}, {}
+    rng = np.random.default_rng(1)
+    scenes = {}
+    found = {}
     for shape in (shape for shape in SHAPES if len(shape) >= entry.least_dim):
         for number, grid in enumerate(grids(shape, rng)):
             for place, boundary in enumerate(entry.conditions(boundaries(grid))):
@@ -45,7 +47,8 @@ def random_field(rng, space, dtype):
 
 def test_transpose_and_twin_in_every_dtype(made, drawn, rng):
     """Dot test and explicit against matrix-free, in the scaling of the gates: both at most 10."""
-    worst, seeds = 0.0, 5 if drawn is list else 1  # in double precision
+    worst = 0.0  # in double precision
+    seeds = 5 if drawn is list else 1
     kinds = [np.float64] * seeds + [np.float32, np.complex128, np.complex64]
     for op, explicit, free in some(made, *SHAPES):
         matrix = explicit.matrix
@@ -53,8 +56,10 @@ def test_transpose_and_twin_in_every_dtype(made, drawn, rng):
         sizes = abs(matrix)
         size = np.sqrt(sizes.sum(0).max(initial=0) * sizes.sum(1).max(initial=0))
         for dtype in kinds:
-            u, v = random_field(rng, op.domain, dtype), random_field(rng, op.codomain, dtype)
-            one, other = explicit(u), free(u)
+            u = random_field(rng, op.domain, dtype)
+            v = random_field(rng, op.codomain, dtype)
+            one = explicit(u)
+            other = free(u)
             assert one.dtype == other.dtype == u.dtype
             assert one.shape == other.shape == op.codomain.shape
             eps = np.finfo(dtype).eps
@@ -62,7 +67,8 @@ def test_transpose_and_twin_in_every_dtype(made, drawn, rng):
             gap = np.max(abs(one - other) / np.where(scale > 0, scale, 1), initial=0) / eps
             assert not np.any(one[scale == 0]) and not np.any(other[scale == 0])
             for form in (explicit, free):
-                left, right = np.sum(form(u) * v, dtype=complex), np.sum(u * form.T(v), dtype=complex)
+                left = np.sum(form(u) * v, dtype=complex)
+                right = np.sum(u * form.T(v), dtype=complex)
                 bound = eps * size * np.linalg.norm(u) * np.linalg.norm(v)
                 assert abs(left - right) <= 10 * bound, (op, dtype)
             worst = max(worst, gap)
@@ -79,7 +85,8 @@ def test_transposed_matrix_entry_by_entry(made):
 def test_derivatives_of_every_order(made, rng):
     """JVP is the operator, VJP the transpose, and a Hessian product is A^T A, in both forms."""
     for op, *forms in some(made, (9,), (6, 4), (4, 3, 5)):
-        u, du = random_field(rng, op.domain, float), random_field(rng, op.domain, float)
+        u = random_field(rng, op.domain, float)
+        du = random_field(rng, op.domain, float)
         g = random_field(rng, op.codomain, float)
         for form in forms:
             np.testing.assert_array_equal(pushforward(form, u, du)[1], form(du))
@@ -92,8 +99,10 @@ def test_derivatives_of_every_order(made, rng):
 def test_linear_and_fresh_and_untouched(made, rng):
     for op, *forms in some(made, (9,), (6, 4)):
         for form in forms:
-            u, v = random_field(rng, op.domain, float), random_field(rng, op.domain, float)
-            kept, result = u.copy(), form(u)
+            u = random_field(rng, op.domain, float)
+            v = random_field(rng, op.domain, float)
+            kept = u.copy()
+            result = form(u)
             np.testing.assert_array_equal(u, kept)
             assert not np.shares_memory(result, u)
             both = form(2.0 * u - v)
@@ -140,7 +149,8 @@ def test_interior_order(entry, periodic, stretched):
 
 
 def interior_error(entry, n, dim, periodic, stretched, boundary):
-    grid, field = grid_of(n, dim, periodic, stretched), Field(periodic)
+    grid = grid_of(n, dim, periodic, stretched)
+    field = Field(periodic)
     op = entry.make(grid, boundary)
     values, wanted = entry.exact(field, grid, boundary)
     error = abs(op(values) - wanted)
@@ -164,7 +174,9 @@ WALLS = {  # least orders of gradient and laplacian over the whole field, L2: th
 def test_order_up_to_the_wall(kind, dim, stretched):
     """Boundary data by lift: the wall truncation is there, and no more."""
     boundary, least_slope, least_laplacian = WALLS[kind]
-    errors, sizes, field = [], (16, 24, 32) if dim == 3 else (32, 64, 128), Field(False)
+    errors = []
+    sizes = (16, 24, 32) if dim == 3 else (32, 64, 128)
+    field = Field(False)
     for n in sizes:
         grid = grid_of(n, dim, False, stretched)
         slopes = dp.gradient(grid, boundary)(field(grid.centres()))
@@ -181,9 +193,12 @@ def test_discrete_identities(shape):
     """V D I = -(W G I)^T, zero row sums, constants and linears, D @ curl = 0."""
     rng = np.random.default_rng(3)
     for grid in grids(shape, rng):
-        volumes, areas = dp.diagonal(grid.cells, grid.volumes), dp.diagonal(grid.faces, grid.faces.volumes)
-        divergence, inner = dp.divergence(grid), dp.interior(grid)
-        left, keep = (volumes @ divergence @ inner).matrix, inner.matrix
+        volumes = dp.diagonal(grid.cells, grid.volumes)
+        areas = dp.diagonal(grid.faces, grid.faces.volumes)
+        divergence = dp.divergence(grid)
+        inner = dp.interior(grid)
+        left = (volumes @ divergence @ inner).matrix
+        keep = inner.matrix
         for boundary in boundaries(grid):
             slope = dp.gradient(grid, boundary)
             right = (areas @ slope).matrix.T @ keep
@@ -204,7 +219,8 @@ def test_linear_fields_are_exact():
     rng = np.random.default_rng(4)
     grid = dp.Grid((6, 5), spacing=[rng.uniform(0.5, 2, 6), rng.uniform(0.5, 2, 5)], origin=(1.0, -2.0))
     x, y = grid.centres()
-    u, inner = 2 * x - 3 * y + 1, dp.interior(grid)
+    u = 2 * x - 3 * y + 1
+    inner = dp.interior(grid)
     slopes = grid.join(np.full(grid.face_shape(0), 2.0), np.full(grid.face_shape(1), -3.0))
     np.testing.assert_allclose(inner(dp.gradient(grid)(u)), inner(slopes), rtol=1e-12)
     on_faces = grid.join(*(2 * a - 3 * b + 1 for a, b in map(grid.face_centres, (0, 1))))
@@ -216,7 +232,9 @@ def test_linear_fields_are_exact():
 def test_the_border_to_scipy_conjugates(rng):
     """rmatvec is the adjoint, .T the plain transpose."""
     matrix = random_field(rng, dp.Grid((4, 3)).cells, complex)
-    op, x, y = dp.from_matrix(matrix), matrix[0].copy(), matrix[:, 1].copy()
+    op = dp.from_matrix(matrix)
+    x = matrix[0].copy()
+    y = matrix[:, 1].copy()
     for border in (op, op.to_scipy()):
         np.testing.assert_allclose(border.matvec(x), matrix @ x, rtol=1e-14)
         np.testing.assert_allclose(border.rmatvec(y), matrix.conj().T @ y, rtol=1e-14)
@@ -236,21 +254,24 @@ def test_products_and_sums_stay_factor_defined(builder):
 
 def test_whole_numbers_of_any_size_scale_an_operator():
     """NumPy holds none beyond 64 bits."""
-    op, u = dp.laplacian(dp.Grid(3)), np.array([1.0, 2.0, 4.0])
+    op = dp.laplacian(dp.Grid(3))
+    u = np.array([1.0, 2.0, 4.0])
     assert np.array_equal((2**70 * op)(u), 2.0**70 * op(u))
 
 
 @pytest.mark.parametrize("number", [3, -0.7, 2**70, 1e308, np.float32(0.3), np.array(7.0), 2 - 3j, np.complex64(1j)])
 def test_divided_by_a_number(number):
     """Of 1 / 1e308 digits are lost, of the quotient none."""
-    op, u = dp.laplacian(dp.Grid(4, spacing=0.3)), 1e300 * np.array([1.0, 2.0, 4.0, -3.0])
+    op = dp.laplacian(dp.Grid(4, spacing=0.3))
+    u = 1e300 * np.array([1.0, 2.0, 4.0, -3.0])
     np.testing.assert_allclose((op / number)(u), op(u) / number, rtol=2e-15)
     np.testing.assert_allclose((op / number).T(u), op.T(u) / number, rtol=2e-15)
     assert (op / number).name == f"laplacian / {number:g}" or np.iscomplexobj(number)
 
 
 def test_divided_by_a_subnormal_number():
-    op, u = 2.0**-500 * dp.laplacian(dp.Grid(4)), np.array([1.0, 2.0, 4.0, -3.0])
+    op = 2.0**-500 * dp.laplacian(dp.Grid(4))
+    u = np.array([1.0, 2.0, 4.0, -3.0])
     np.testing.assert_allclose((op / 2.0**-1030)(u), np.ldexp(op(u), 1030), rtol=2e-15)
 
 

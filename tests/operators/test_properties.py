@@ -90,13 +90,13 @@ def test_rotations_and_mirrors(u, boundary):
 @given(st.data())
 def test_axes_mean_what_they_say(data):
     """Swapping x and y on a grid that is not square swaps the result."""
-    nx, ny = data.draw(st.integers(1, 5)), data.draw(st.integers(1, 5))
-    hx, hy = (
-        data.draw(arrays(float, nx, elements=st.floats(0.5, 2))),
-        data.draw(arrays(float, ny, elements=st.floats(0.5, 2))),
-    )
+    nx = data.draw(st.integers(1, 5))
+    ny = data.draw(st.integers(1, 5))
+    hx = data.draw(arrays(float, nx, elements=st.floats(0.5, 2)))
+    hy = data.draw(arrays(float, ny, elements=st.floats(0.5, 2)))
     u = data.draw(arrays(float, (nx, ny), elements=FINITE))
-    one, other = dp.Grid((nx, ny), spacing=[hx, hy]), dp.Grid((ny, nx), spacing=[hy, hx])
+    one = dp.Grid((nx, ny), spacing=[hx, hy])
+    other = dp.Grid((ny, nx), spacing=[hy, hx])
     for builder in (dp.gradient, dp.average):
         x, y = one.split(builder(one, dp.dirichlet)(u))
         y_too, x_too = other.split(builder(other, dp.dirichlet)(u.T))
@@ -113,7 +113,8 @@ def test_lift_knows_the_cell_at_its_own_wall(a, b, side):
         condition = [dp.neumann, dp.neumann]
         condition[side] = dp.robin(a, b)
         boundary = {"xy"[axis]: tuple(condition)}
-        lift, wall = dp.lift(grid, boundary), (0.0, grid.size[axis])[side]
+        lift = dp.lift(grid, boundary)
+        wall = (0.0, grid.size[axis])[side]
         values = [np.zeros(part) for part in lift.domain.parts]
         values[2 * axis + side] += a * (2.0 * wall + 1.0) + b * (2.0 if side else -2.0)
         u = 2.0 * grid.centres()[axis] + 1.0

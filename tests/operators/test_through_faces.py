@@ -33,15 +33,18 @@ def test_forward_and_transposed_against_the_entries(shape, rng):
         for op in (chain(grid, rng.uniform(0.1, 9, grid.faces.size), boundary), solid):
             for structure in (op.structure, op.structure.transpose()):
                 assert structure._fused is not None
-                x, matrix = rng.standard_normal(grid.cells.size), structure.explicit()
+                x = rng.standard_normal(grid.cells.size)
+                matrix = structure.explicit()
                 wrong = np.abs(structure.product(x) - matrix @ x)
                 assert np.max(wrong) <= 1e-15 * np.max(abs(matrix) @ np.abs(x))
 
 
 def test_masked_faces_shield_what_is_not_a_number(rng):
-    grid, solid = dp.Grid((6, 5)), np.zeros((6, 5), bool)
+    grid = dp.Grid((6, 5))
+    solid = np.zeros((6, 5), bool)
     solid[2:4, 1:3] = True
-    op, u = dp.laplacian(grid, dp.neumann, solid), rng.standard_normal((6, 5))
+    op = dp.laplacian(grid, dp.neumann, solid)
+    u = rng.standard_normal((6, 5))
     spoilt = np.where(solid, np.nan, u)
     assert np.array_equal(op(spoilt)[~solid], op(np.where(solid, 0.0, u))[~solid])
 
@@ -59,7 +62,8 @@ def test_a_coefficient_that_is_zero_shields_nothing(rng):
 
 
 def test_other_products_are_left_to_their_members():
-    grid, line = dp.Grid((6, 5)), dp.Grid(8)
+    grid = dp.Grid((6, 5))
+    line = dp.Grid(8)
     middle = dp.diagonal(grid.faces, np.ones(grid.faces.size) * 1j)
     for op in (
         -dp.divergence(grid) @ middle @ dp.gradient(grid),
@@ -71,7 +75,9 @@ def test_other_products_are_left_to_their_members():
 
 def test_the_same_bits_with_one_thread_and_two(rng):
     grid = dp.Grid((90, 80, 75))
-    op, u, found = chain(grid, rng.uniform(1, 2, grid.faces.size)), rng.standard_normal(grid.shape), []
+    op = chain(grid, rng.uniform(1, 2, grid.faces.size))
+    u = rng.standard_normal(grid.shape)
+    found = []
     for threads in (1, None):
         dp.set_threads(threads)
         found.append(op(u))
@@ -84,5 +90,6 @@ def test_a_parametric_operator_acts_in_one_pass(rng):
     op = Elliptic(-dp.divergence(grid), dp.gradient(grid, dp.robin(1, 2)), rng.uniform(0.1, 9, grid.faces.size), 0.7)
     for structure in (op, op.transpose()):
         assert structure.members[1]._fused is not None
-        x, matrix = rng.standard_normal(grid.cells.size), structure.explicit()
+        x = rng.standard_normal(grid.cells.size)
+        matrix = structure.explicit()
         assert np.max(np.abs(structure.product(x) - matrix @ x)) <= 2e-15 * np.max(abs(matrix) @ np.abs(x))

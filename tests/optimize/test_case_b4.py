@@ -16,9 +16,11 @@ def plume(grid, source, dt, steps, scheme, viscosity=0.0):
     """Smoke and velocity after each step: carried, lifted by the smoke, slowed down, projected."""
     smoke_moves = dp.transport(grid, scheme)
     wind_moves = dp.transport(grid, "semi_lagrangian", boundary=dp.dirichlet, of="faces")
-    lift, project = dp.average(grid), dp.projection(grid)
+    lift = dp.average(grid)
+    project = dp.projection(grid)
     upwards = grid.join(np.zeros(grid.face_shape(0)), np.ones(grid.face_shape(1)))
-    smoke, v = np.zeros(grid.shape), np.zeros(grid.faces.size)
+    smoke = np.zeros(grid.shape)
+    v = np.zeros(grid.faces.size)
     for _ in range(steps):
         smoke = smoke_moves(smoke, v, dt) + source
         v = wind_moves(v, v, dt) + dt * upwards * lift(smoke)

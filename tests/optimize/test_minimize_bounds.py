@@ -27,7 +27,8 @@ def test_a_step_is_that_of_the_dense_formula(rng, k):
 
 
 def test_pairs_without_curvature_and_no_memory_at_all():
-    g, s = np.array([3.0, -4.0]), np.array([[1.0, 0.0], [0.0, 1.0]])
+    g = np.array([3.0, -4.0])
+    s = np.array([[1.0, 0.0], [0.0, 1.0]])
     assert np.array_equal(quasi_newton_step(g, s[:0], s[:0], 0.5), -g / 2)
     assert np.array_equal(quasi_newton_step(g, s, -s, 0.5), -g / 2)
 
@@ -39,7 +40,9 @@ def test_starts_on_bounds_and_close_to_them(seed):
     n = int(rng.integers(2, 60))
     basis = np.linalg.qr(rng.standard_normal((n, n)))[0]
     matrix = (basis * np.geomspace(1, 10 ** rng.uniform(0, 5), n)) @ basis.T
-    linear, lower, upper = matrix @ rng.uniform(-2, 2, n), -rng.uniform(0.1, 1, n), rng.uniform(0.1, 1, n)
+    linear = matrix @ rng.uniform(-2, 2, n)
+    lower = -rng.uniform(0.1, 1, n)
+    upper = rng.uniform(0.1, 1, n)
     near = lower + 10.0 ** -rng.uniform(1, 14, n) * (upper - lower)
     start = [lower, near, np.where(rng.random(n) < 0.5, lower + 1e-9, upper - 1e-9)][seed % 3]
     loss = lambda x: 0.5 * anp.dot(x, anp.dot(matrix, x)) - anp.dot(linear, x)
@@ -73,7 +76,8 @@ def valley(x):
 
 
 def test_bounds_at_all_scales(rng):
-    start, upper = rng.uniform(-1, 0.4, 20), np.where(np.arange(20) % 3, 2.0, 0.5)
+    start = rng.uniform(-1, 0.4, 20)
+    upper = np.where(np.arange(20) % 3, 2.0, 0.5)
     plain_run = dp.minimize(valley, start, bounds=(-1.5, upper))
     for height, length in ((2.0**600, 1.0), (2.0**-600, 1.0), (1.0, 2.0**400), (2.0**-300, 2.0**-300)):
         scaled = dp.minimize(
@@ -127,7 +131,8 @@ def bounded_problem(seed):
     """Random residuals, bounds (some infinite, some equal) and a start inside; every third start is on bounds."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(2, 8))
-    matrix, data = rng.normal(size=(n + 3, n)) * np.exp(rng.normal(size=n)), 3 * rng.normal(size=n + 3)
+    matrix = rng.normal(size=(n + 3, n)) * np.exp(rng.normal(size=n))
+    data = 3 * rng.normal(size=n + 3)
     corner = rng.integers(-1, 2, n).astype(float)
     residuals = [
         lambda x: anp.dot(matrix, x) - data,
@@ -139,7 +144,8 @@ def bounded_problem(seed):
     lower = rng.uniform(-1.5, 0.2, n)
     upper = lower + rng.uniform(0.1, 2.5, n)
     if seed % 5 == 2:
-        lower, upper = -np.ones(n), np.ones(n)
+        lower = -np.ones(n)
+        upper = np.ones(n)
     kind = rng.integers(0, 5, n)
     lower[kind == 0], upper[kind == 1] = -np.inf, np.inf
     upper[kind == 2] = lower[kind == 2]
@@ -196,7 +202,8 @@ def test_gauss_newton_with_large_residuals_is_damped(rng):
 def test_a_linear_problem_in_a_box_takes_one_step(rng):
     """The step is the minimum inside the bounds, whichever of them hold: exact for linear residuals."""
     for _ in range(20):
-        matrix, data = rng.normal(size=(30, 20)), 5 * rng.normal(size=30)
+        matrix = rng.normal(size=(30, 20))
+        data = 5 * rng.normal(size=30)
         best = dp.minimize(lambda x, a=matrix, d=data: a @ x - d, np.zeros(20), "gauss_newton", bounds=(-0.3, 0.4))
         known = lsq_linear(matrix, data, bounds=(-0.3, 0.4), tol=1e-14)
         assert best.converged and len(best.history) <= 3 and np.allclose(best.x, known.x, atol=1e-8)

@@ -68,7 +68,8 @@ def test_bounds_against_scipy(rng, method):
 @pytest.mark.parametrize("options", [{}, {"dense": False}, {"apart": True}])
 def test_bounded_least_squares_against_scipy(rng, method, options):
     """A step that counts on an unknown at its bound is no descent for the others; it must not pass for converged."""
-    matrix, data = rng.standard_normal((12, 8)), 3 * rng.standard_normal(12)
+    matrix = rng.standard_normal((12, 8))
+    data = 3 * rng.standard_normal(12)
     misses = lambda x: anp.sum(matrix * x, axis=-1) - data  # of copies of x too
     best = dp.minimize(misses, np.zeros(8), method, bounds=(-0.3, 0.4), **options)
     known = lsq_linear(matrix, data, bounds=(-0.3, 0.4), tol=1e-14)
@@ -83,7 +84,8 @@ def test_bounded_least_squares_against_scipy(rng, method, options):
 
 def test_half_inverse_leaves_what_presses_against_a_bound():
     draw = np.random.default_rng(1)
-    matrix, data = draw.standard_normal((12, 8)), 3 * draw.standard_normal(12)
+    matrix = draw.standard_normal((12, 8))
+    data = 3 * draw.standard_normal(12)
     best = dp.minimize(lambda x: matrix @ x - data, np.zeros(8), "half_inverse", bounds=(-0.3, 0.4))
     assert best.converged and np.allclose(best.x, lsq_linear(matrix, data, bounds=(-0.3, 0.4), tol=1e-14).x, atol=1e-6)
 
@@ -152,7 +154,8 @@ def test_a_projection_that_is_not_affine_only_near_the_result_is_refused():
 @pytest.mark.parametrize("method", ["lbfgs", "gd", "newton_cg", "gauss_newton", "levenberg_marquardt"])
 def test_an_affine_projection_and_a_gradient_of_the_user(method):
     """The gradient of the user is that of the loss; with project it was taken at x, and not projected."""
-    target, mean_two = np.array([1.0, 2.0, 6.0]), lambda x: x - anp.mean(x) + 2.0
+    target = np.array([1.0, 2.0, 6.0])
+    mean_two = lambda x: x - anp.mean(x) + 2.0
     squares = method in ("gauss_newton", "levenberg_marquardt")
     loss = (lambda x: x - target) if squares else lambda x: anp.sum((x - target) ** 2)
     options = {} if squares or method == "newton_cg" else {"gradient": lambda x: 2 * (x - target)}
@@ -166,7 +169,8 @@ def test_a_projection_and_bounds_are_not_taken_together():
 
 
 def test_history_counts_forward_and_adjoint_solves(tmp_path):
-    solve, target = dp.inverse(-dp.laplacian(dp.Grid((6, 5)), dp.dirichlet)), np.arange(30.0).reshape(6, 5)
+    solve = dp.inverse(-dp.laplacian(dp.Grid((6, 5)), dp.dirichlet))
+    target = np.arange(30.0).reshape(6, 5)
 
     def run(maxiter, **options):
         return dp.minimize(lambda b: anp.sum((solve(b) - target) ** 2), 0 * target, maxiter=maxiter, **options)

@@ -64,7 +64,8 @@ def test_unknowns_of_any_magnitude(method, options, bounds):
 @pytest.mark.parametrize("exponent", [-1000, 1000])
 @pytest.mark.parametrize("method, options", [("gd", {}), ("newton_cg", {}), ("lbfgs", {}), ("adam", {"rate": 0.05})])
 def test_losses_of_any_magnitude(method, options, exponent):
-    factor, start = 2.0**exponent, np.array([0.1, 0.0, -0.2])
+    factor = 2.0**exponent
+    start = np.array([0.1, 0.0, -0.2])
     known = dp.minimize(loss, start, method, maxiter=60, **options)
     best = dp.minimize(lambda x: factor * loss(x), start, method, maxiter=60, **options)
     assert np.allclose(best.x, known.x, rtol=1e-9) and best.converged == known.converged
@@ -80,7 +81,8 @@ def test_half_inverse_depends_on_the_scale_and_claims_nothing(exponent):
 
 def test_half_inverse_takes_the_same_steps_beyond_the_range_of_squares():
     """The direction is the residuals' scale to the power 1/2 times that of residuals near 1."""
-    unit, rate = 2.0**-600, 0.25
+    unit = 2.0**-600
+    rate = 0.25
     best = dp.minimize(residuals, np.zeros(3), "half_inverse", rate=rate, maxiter=3)
     scaled = dp.minimize(
         lambda x: unit * residuals(x), np.zeros(3), "half_inverse", rate=rate / np.sqrt(unit), maxiter=3
@@ -92,7 +94,8 @@ def test_half_inverse_takes_the_same_steps_beyond_the_range_of_squares():
 @pytest.mark.parametrize("method", ["gd", "newton_cg"])
 def test_a_kink_is_no_rounding(method, bounds, rng):
     """Steps became so short that no change of the loss was seen, far from the minimum."""
-    matrix, data = rng.normal(size=(8, 5)), rng.normal(size=8)
+    matrix = rng.normal(size=(8, 5))
+    data = rng.normal(size=8)
     matrix[0] *= 30
     kinked = lambda x: anp.sum(anp.abs(anp.dot(matrix, x) - data)) + 0.5 * anp.sum(x**2)
     best = dp.minimize(kinked, np.zeros(5), method, maxiter=500, bounds=bounds)
@@ -124,7 +127,8 @@ def test_the_hint_of_least_squares_sums_the_residuals():
 def test_a_rule_as_tolerance_sees_losses_that_it_can_compare(exponent):
     """Records of residuals near 1e-300 hold a loss and a gradient of 0: a rule called the start converged."""
     rule = lambda record, first: record.gradient_norm <= 1e-6 * first.gradient_norm
-    factor, start = 2.0**exponent, np.array([0.1, 0.0, -0.2])
+    factor = 2.0**exponent
+    start = np.array([0.1, 0.0, -0.2])
     with np.errstate(over="ignore"):
         best = dp.minimize(lambda x: factor * residuals(x), start, "levenberg_marquardt", tolerance=rule)
     known = dp.minimize(residuals, start, "levenberg_marquardt", tolerance=rule)

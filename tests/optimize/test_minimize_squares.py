@@ -40,7 +40,8 @@ def test_few_unknowns_go_forward_and_few_residuals_in_reverse(rng, method):
     best = dp.minimize(lambda x: x[0] * tall.rule(-x[1] * TIMES) - data, np.ones(2), method)
     assert best.converged and tall.reverse <= 1  # the gradient at the start, before the shape is known
     assert tall.forward <= 2 * len(best.history)  # the covariance takes the last Jacobian
-    wide, matrix = Counted(), rng.standard_normal((3, 20))
+    wide = Counted()
+    matrix = rng.standard_normal((3, 20))
     best = dp.minimize(lambda x: anp.dot(matrix, wide.rule(x)) - 1.0, np.zeros(20), method)
     assert best.value < 1e-12 and wide.forward == 0 and wide.reverse >= 3 * (len(best.history) - 1)
 
@@ -49,7 +50,8 @@ def test_few_unknowns_go_forward_and_few_residuals_in_reverse(rng, method):
 def test_a_rule_without_a_forward_derivative(rng, method):
     data = 3 * np.exp(-1.3 * TIMES) + 0.1 * rng.standard_normal(30)
     fit = lambda rule: dp.minimize(lambda x: x[0] * rule(-x[1] * TIMES) - data, np.ones(2), method)
-    with_it, without = fit(Counted().rule), fit(Counted(jvp=False).rule)
+    with_it = fit(Counted().rule)
+    without = fit(Counted(jvp=False).rule)
     assert np.allclose(with_it.x, without.x, rtol=1e-9) and np.allclose(with_it.covariance, without.covariance)
 
 
@@ -63,7 +65,8 @@ def test_lotka_volterra(rng):
     step = dp.stepper("rk4", rate, 0.1)
     path = lambda p: dp.rollout(step, np.array([1.0, 0.5]), p, 200, keep="all")[::10].ravel()
     data = path(np.array([1.0, 0.8, 0.6])) + 0.02 * rng.standard_normal(42)
-    start, passes = np.array([0.9, 0.9, 0.7]), []
+    start = np.array([0.9, 0.9, 0.7])
+    passes = []
     best = dp.minimize(lambda p: passes.append(p) or path(p) - data, start, "levenberg_marquardt")
     known, spread = curve_fit(lambda _, *p: path(np.array(p)), np.arange(42.0), data, start, xtol=1e-12, ftol=1e-12)
     assert best.converged and np.allclose(best.x, known, rtol=1e-6)
@@ -102,7 +105,8 @@ def test_covariance_by_hand_and_as_curve_fit_has_it(rng, method, scale):
 
 
 def test_covariance_where_it_is_not_known(rng):
-    data, matrix = rng.standard_normal(10), rng.standard_normal((10, 3))
+    data = rng.standard_normal(10)
+    matrix = rng.standard_normal((10, 3))
     run = lambda columns, loss=None, **options: dp.minimize(
         loss or (lambda x: anp.dot(columns, x) - data), np.zeros(columns.shape[1]), "levenberg_marquardt", **options
     )
@@ -136,7 +140,8 @@ def test_covariance_where_it_is_not_known(rng):
 @pytest.mark.parametrize("method", [*METHODS, "half_inverse"])
 def test_absolute_sigma_is_that_of_curve_fit(rng, method):
     """Residuals divided by known standard deviations: the posterior covariance of a linear model is exact."""
-    matrix, sigma = rng.standard_normal((20, 3)), rng.uniform(0.5, 2.0, 20)
+    matrix = rng.standard_normal((20, 3))
+    sigma = rng.uniform(0.5, 2.0, 20)
     data = matrix @ np.array([1.0, -2.0, 0.5]) + sigma * rng.standard_normal(20)
     weighted = matrix / sigma[:, None]
     run = lambda **options: dp.minimize(lambda x: anp.dot(weighted, x) - data / sigma, np.zeros(3), method, **options)
@@ -155,7 +160,8 @@ def test_absolute_sigma_is_that_of_curve_fit(rng, method):
 @pytest.mark.parametrize("exponent", [-1000, -700, 500])
 def test_covariance_of_residuals_of_any_magnitude(rng, exponent):
     """The covariance does not depend on a factor of the residuals, and with absolute_sigma on its square."""
-    matrix, data = rng.standard_normal((10, 3)), rng.standard_normal(10)
+    matrix = rng.standard_normal((10, 3))
+    data = rng.standard_normal(10)
     factor = 2.0**exponent
     run = lambda factor, **options: dp.minimize(
         lambda x: factor * (anp.dot(matrix, x) - data), np.zeros(3), "levenberg_marquardt", **options

@@ -16,7 +16,8 @@ GRIDS = [
 @pytest.mark.parametrize("grid", GRIDS)
 def test_a_ramp_counts_the_same_everywhere(grid):
     x = grid.centres()[0]
-    slope, volume = 3.0, np.sum(grid.volumes)
+    slope = 3.0
+    volume = np.sum(grid.volumes)
     assert dp.total_variation(grid, 1e-9)(slope * x) == pytest.approx(slope * volume, rel=1e-8)
     assert dp.smoothness(grid)(slope * x) == pytest.approx(0.5 * slope**2 * volume, rel=1e-12)
     assert dp.total_variation(grid, 1.0)(5.0 + 0 * x) == 0
@@ -33,16 +34,19 @@ def by_hand(grid, u, eps, solid):
                 jumps = [(u[p] - u[i, j]) ** 2 for p in neighbours if 0 <= p[0] < n and 0 <= p[1] < m and not solid[p]]
                 square += sum(jumps) / max(len(jumps), 1)
             if not solid[i, j]:
-                total, smooth = total + np.sqrt(square + eps**2) - eps, smooth + 0.5 * square
+                total = total + np.sqrt(square + eps**2) - eps
+                smooth = smooth + 0.5 * square
     return total, smooth
 
 
 def test_obstacles_are_left_out():
-    grid, rng = dp.Grid((5, 4)), np.random.default_rng(0)
+    grid = dp.Grid((5, 4))
+    rng = np.random.default_rng(0)
     solid = np.zeros(grid.shape, bool)
     solid[1:3, 2] = solid[4, 0] = True
     u = rng.standard_normal(grid.shape)
-    tv, h1 = dp.total_variation(grid, 0.1, solid), dp.smoothness(grid, solid)
+    tv = dp.total_variation(grid, 0.1, solid)
+    h1 = dp.smoothness(grid, solid)
     assert (tv(u), h1(u)) == pytest.approx(by_hand(grid, u, 0.1, solid), rel=1e-13)
     other = np.where(solid, 1e6, u)
     assert (tv(other), h1(other)) == pytest.approx((tv(u), h1(u)), rel=1e-12)
@@ -53,7 +57,8 @@ def test_obstacles_are_left_out():
 @pytest.mark.parametrize("make", [lambda grid: dp.total_variation(grid, 5.0), dp.smoothness])
 @pytest.mark.parametrize("grid", GRIDS[1:])
 def test_derivatives(grid, make):
-    term, u = make(grid), np.random.default_rng(0).standard_normal(grid.shape)
+    term = make(grid)
+    u = np.random.default_rng(0).standard_normal(grid.shape)
     found = dp.check.gradient(lambda u: term(u) + anp.sum(u**2), u)  # of a constant it sees rounding alone
     assert found.verdict == "agrees" and found.hessian == "agrees"
 
@@ -70,9 +75,11 @@ def test_refused_numbers():
 @pytest.mark.parametrize("share", [2.0**-30, 1.0, 2.0**30])
 def test_total_variation_of_slopes_of_any_magnitude(exponent, share, rng):
     """With eps it scales: their squares underflow or overflow, they themselves do not."""
-    grid, factor = dp.Grid((5, 4), size=1.0), 2.0**exponent
+    grid = dp.Grid((5, 4), size=1.0)
+    factor = 2.0**exponent
     u, v = share * rng.normal(size=(2, *grid.shape))
-    tv, scaled = dp.total_variation(grid, 1e-3), dp.total_variation(grid, 1e-3 * factor)
+    tv = dp.total_variation(grid, 1e-3)
+    scaled = dp.total_variation(grid, 1e-3 * factor)
     assert scaled(factor * u) == factor * tv(u)
     assert np.array_equal(dp.grad(scaled)(factor * u), dp.grad(tv)(u))
     assert np.allclose(dp.hvp(scaled, factor * u, factor * v), dp.hvp(tv, u, v), rtol=1e-12, atol=0)
@@ -104,7 +111,8 @@ def test_admm_soft_thresholds():
 def test_admm_is_optimal_for_jumps(inner):
     """Subgradient: K^T s = -grad / weight with |s| <= 1, and s = sign(K x) where K x is not 0."""
     n = 12 if inner == 10 else 40
-    grid, rng = dp.Grid(n), np.random.default_rng(0)
+    grid = dp.Grid(n)
+    rng = np.random.default_rng(0)
     G = dp.interior(grid) @ dp.gradient(grid)
     y = np.where(grid.centres()[0] < n / 3, 1.0, -0.5) + 0.1 * rng.standard_normal(n)
     if inner == "exact":
@@ -174,7 +182,8 @@ def test_admm_refuses_a_penalty_that_is_no_float(size):
 
 
 def test_admm_stops_when_asked():
-    loss, seen = lambda x: anp.sum((x - 1) ** 2), []
+    loss = lambda x: anp.sum((x - 1) ** 2)
+    seen = []
     best = dp.minimize(loss, np.zeros(3), "admm", maxiter=3, tolerance=0.0, weight=0.1)
     assert len(best.history) == 4 and best.message == "stopped after 3 rounds, as maxiter asks"
     call = lambda record, x: seen.append(record) or len(seen) == 2
@@ -213,7 +222,8 @@ def test_admm_refuses():
 def test_total_variation_of_small_slopes_has_all_its_digits(scale):
     """Slopes far below eps count by their square."""
     u = np.random.default_rng(0).standard_normal(GRIDS[1].shape)
-    tv, h1 = dp.total_variation(GRIDS[1], 1.0), dp.smoothness(GRIDS[1])
+    tv = dp.total_variation(GRIDS[1], 1.0)
+    h1 = dp.smoothness(GRIDS[1])
     assert tv(scale * u) == pytest.approx(h1(scale * u), rel=50 * scale**2 + 1e-13, abs=0)
 
 

@@ -170,7 +170,8 @@ def test_another_leaf_that_is_not_an_unknown_is_refused(tmp_path, leaf):
 
 def test_the_order_of_names_is_part_of_the_start(tmp_path):
     loss = lambda tree: anp.sum(tree["a"] ** 2) + anp.sum(tree["b"] ** 2)
-    a, b = {"a": START, "b": START}, {"b": START, "a": START}
+    a = {"a": START, "b": START}
+    b = {"b": START, "a": START}
     refused(tmp_path, "start", {"start": a}, {"start": b}, loss=loss)
 
 
@@ -203,13 +204,15 @@ def test_each_batch_is_asked_for_once():
 
 def test_bounds_that_print_alike_are_others(tmp_path):
     """NumPy prints the ends of a long array and eight digits."""
-    start, lower = np.full(2000, 0.5), np.full(2000, -1.0)
+    start = np.full(2000, 0.5)
+    lower = np.full(2000, -1.0)
     for place, change in ((1000, 0.5), (0, 1e-12)):
         other = lower.copy()
         other[place] += change
         assert repr(other) == repr(lower)
         folder = tmp_path / str(place)
-        begun, given = {"bounds": (lower, None)}, {"bounds": (other, None)}
+        begun = {"bounds": (lower, None)}
+        given = {"bounds": (other, None)}
         refused(folder, "pair of bounds", begun, given, loss=valley, start=start)
 
 
@@ -255,7 +258,8 @@ LOSSES_0_2 = {
 def test_resumes_a_checkpoint_of_version_0_2(tmp_path, name):
     """The run goes on along the iterations of a run from the start."""
     write_checkpoint_0_2(tmp_path, name)
-    loss, method = LOSSES_0_2.get(name, valley), name.partition(",")[0]
+    loss = LOSSES_0_2.get(name, valley)
+    method = name.partition(",")[0]
     run = {"method": method, "maxiter": 6, "tolerance": 0, **OPTIONS_0_2.get(name, {})}
     whole = dp.minimize(loss, np.array([-1.2, 1.0]), **run)
     best = dp.minimize(loss, np.array([-1.2, 1.0]), checkpoint=tmp_path, **run)
@@ -296,7 +300,8 @@ def newest(folder):
 
 def killed_on_its_way(run, folder, delay):
     """Whether kill -9, so many seconds after the first new state, came before the end of the run."""
-    process, before = subprocess.Popen(run), newest(folder)
+    process = subprocess.Popen(run)
+    before = newest(folder)
     while process.poll() is None and newest(folder) == before:
         time.sleep(1e-3)
     time.sleep(delay)

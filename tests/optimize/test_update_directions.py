@@ -48,7 +48,8 @@ def test_the_family_against_the_svd(rng, shape, power, method):
 @pytest.mark.parametrize("method", ["dense", "krylov"])
 def test_a_cotangent_that_no_direction_reaches(rng, shape, power, method):
     """Outside of the range of J: misses of more outputs than unknowns have such a part."""
-    matrix, g = jacobian(rng, shape), rng.standard_normal(shape[0])
+    matrix = jacobian(rng, shape)
+    g = rng.standard_normal(shape[0])
     found = dp.update_direction(lambda u: matrix @ u, np.zeros(shape[1]), g, power=power, method=method)
     assert gap(found.step, reference(matrix, g, power)) < 1e-9
 
@@ -66,7 +67,8 @@ def test_singular_values_from_gram_matrices(rng, decades, digits, scale):
     kept = s > 1e-10 * s[0]
     assert np.allclose(left.T @ left, np.eye(20), atol=1e-13)
     assert np.allclose(values[kept], s[kept], rtol=10.0**-digits)
-    ours, known = left[:, kept], u[:, kept]  # up to signs
+    ours = left[:, kept]  # up to signs
+    known = u[:, kept]
     assert np.linalg.norm(ours @ (ours.T @ matrix / s[0]) - known @ (known.T @ matrix / s[0])) <= 1e-8
     b = rng.standard_normal(20)
     shares = np.where(kept, s / s[0], np.inf) ** -1.5
@@ -98,7 +100,8 @@ def test_a_jacobian_that_is_not_finite(rng, size, wrong):
 
 
 def test_power_zero_is_the_gradient_to_the_last_digits(rng):
-    matrix, x = jacobian(rng, (7, 11)), rng.standard_normal(11)
+    matrix = jacobian(rng, (7, 11))
+    x = rng.standard_normal(11)
     _, slope = dp.value_and_grad(lambda u: 0.5 * anp.sum((matrix @ u) ** 2))(x)
     assert gap(dp.update_direction(lambda u: matrix @ u, x, power=0).step, slope) < 1e-13
 
@@ -178,7 +181,8 @@ def test_least_squares(method, options):
 
 @pytest.mark.parametrize("method, options", SQUARES)
 def test_a_linear_problem_takes_one_step_and_none_at_rounding(rng, method, options):
-    matrix, data = rng.standard_normal((9, 4)), rng.standard_normal(9)
+    matrix = rng.standard_normal((9, 4))
+    data = rng.standard_normal(9)
     best = dp.minimize(lambda x: matrix @ x - data, np.zeros(4), method, tolerance=0, maxiter=40, **options)
     assert np.allclose(best.x, np.linalg.lstsq(matrix, data, rcond=None)[0], atol=1e-6)
     assert best.converged
@@ -191,7 +195,8 @@ def test_a_singular_jacobian_takes_the_shortest_step():
 
 def test_the_two_variables_of_the_literature():
     """y = (x0, x1^2), L = |y|^2 from (3, 3). Source: Holl, Koltun, Thuerey, 2022; figures of case C1."""
-    start, y = np.array([3.0, 3.0]), lambda x: anp.stack([x[0], x[1] ** 2])
+    start = np.array([3.0, 3.0])
+    y = lambda x: anp.stack([x[0], x[1] ** 2])
     square = lambda v: anp.sum(v**2)
     fixed = {"maxiter": 10, "tolerance": 0}
     descent = dp.minimize(lambda x: square(y(x)), start, "gd", rate=0.01, **fixed)
@@ -238,14 +243,16 @@ def test_the_inverse_simulator():
 def test_half_inverse_losses_as_with_a_dense_svd(rng):
     """Case C2 in small: a batch of 32 with four misses each; losses of six steps equal to 1e-6 and better."""
     physics, states, target = rng.standard_normal((24, 4)), *rng.random((2, 32, 4))
-    first, second = rng.standard_normal((4, 20)), rng.standard_normal((20, 24)) / 5
+    first = rng.standard_normal((4, 20))
+    second = rng.standard_normal((20, 24)) / 5
 
     def misses(w):  # broadcasts over copies of the weights
         hidden = anp.tanh(anp.sum(states[:, :, None] * w[0], axis=-2))
         return anp.sum(hidden[:, :, None] * w[1], axis=-2) @ physics - target
 
     best = dp.minimize(misses, (first, second), "half_inverse", 6, 0, rate=0.1, apart=True)
-    x, losses = np.concatenate([first.ravel(), second.ravel()]), []
+    x = np.concatenate([first.ravel(), second.ravel()])
+    losses = []
     for _ in range(7):
         tree = x[:80].reshape(4, 20), x[80:].reshape(20, 24)
         value, pull = derivative.pullback(misses, tree)
@@ -261,11 +268,14 @@ def test_half_inverse_losses_as_with_a_dense_svd(rng):
 @pytest.mark.parametrize("exponent", [-1000, -550, 550, 1000])
 def test_outputs_of_any_magnitude(method, power, exponent, rng):
     """Squares of the singular values leave the range of floats: directions were NaN or 0."""
-    matrix, data, factor = rng.standard_normal((6, 4)), rng.standard_normal(6), 2.0**exponent
+    matrix = rng.standard_normal((6, 4))
+    data = rng.standard_normal(6)
+    factor = 2.0**exponent
     run = lambda factor: dp.update_direction(
         lambda x: factor * (anp.dot(matrix, x) - data), np.ones(4), method=method, power=power
     )
-    known, scaled = run(1.0), run(factor)
+    known = run(1.0)
+    scaled = run(factor)
     assert np.allclose(scaled.step, known.step * factor ** (2.0 - 2.0 * power), rtol=1e-9)  # J^T (J J^T)^-p r
     assert np.allclose(scaled.spectrum, factor * known.spectrum, rtol=1e-9) and scaled.kept == known.kept
 
@@ -274,7 +284,9 @@ def test_outputs_of_any_magnitude(method, power, exponent, rng):
 @pytest.mark.parametrize("exponent", [-500, 500])
 def test_damped_steps_of_unknowns_of_any_magnitude(method, exponent, rng):
     """Of unknowns times f J is divided by f, the damping by f^2, and the step is times f."""
-    matrix, data, factor = rng.standard_normal((6, 4)), rng.standard_normal(6), 2.0**exponent
+    matrix = rng.standard_normal((6, 4))
+    data = rng.standard_normal(6)
+    factor = 2.0**exponent
     run = lambda factor: dp.update_direction(
         lambda x: anp.dot(matrix, x / factor) - data, factor * np.ones(4), method=method, power=1.0,
         damping=0.25 / factor / factor,

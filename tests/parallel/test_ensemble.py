@@ -46,7 +46,9 @@ class Reversed:
     """An executor that does its tasks when they are asked for, the last one first; what it unpacks is its own."""
 
     def __init__(self, forgets=False):
-        self.tasks, self.forgets, self.sizes = [], forgets, []
+        self.tasks = []
+        self.forgets = forgets
+        self.sizes = []
 
     def submit(self, *task):
         future = Future()
@@ -87,7 +89,8 @@ def test_second_order_in_reverse_alone():
 def test_complex_unknowns(rng):
     f = lambda z, b: np.real(np.sum(z**3 * b)) + np.sum(np.abs(z) ** 4)
     scenes, z, t = rng.standard_normal((3, 4)), *(rng.standard_normal((2, 4)) + 1j * rng.standard_normal((2, 4)))
-    total, wanted = dp.ensemble(f, scenes), lambda z: sum(f(z, b) for b in scenes)
+    total = dp.ensemble(f, scenes)
+    wanted = lambda z: sum(f(z, b) for b in scenes)
     assert close(dp.grad(total)(z), dp.grad(wanted)(z))
     assert close(dp.jvp(total, z, t)[1], dp.jvp(wanted, z, t)[1])
     assert close(dp.hvp(total, z, t), dp.hvp(wanted, z, t))
@@ -153,7 +156,8 @@ def summed(x, scene):
 
 
 def test_what_every_worker_has_is_not_sent_again():
-    large, executor = [onp.full(10_000, float(number)) for number in range(3)], Reversed()
+    large = [onp.full(10_000, float(number)) for number in range(3)]
+    executor = Reversed()
     total = dp.ensemble(summed, large, executor)
     assert [total(2.0), total(2.0)] == [60_000.0] * 2
     assert min(executor.sizes[:3]) > 80_000 and max(executor.sizes[3:]) < 2_000

@@ -17,7 +17,8 @@ FUNCTIONS = "cannot be cut for ranks, for no rank knows its rows; make it of ope
 
 def test_one_process_keeps_its_grid_and_imports_nothing(monkeypatch):
     monkeypatch.delitem(sys.modules, "mpi4py.MPI", raising=False)
-    grid, u = dp.Grid((3, 2)), np.ones(4)
+    grid = dp.Grid((3, 2))
+    u = np.ones(4)
     assert dp.distribute(grid) is grid and dp.gather(u) is u
     assert "mpi4py.MPI" not in sys.modules
 
@@ -86,7 +87,8 @@ OTHERS = [pytest.param(*pair, marks=pytest.mark.whole) for pair in ((1, 2), (2, 
 @pytest.mark.parametrize("first, then", [(2, 1), *OTHERS])
 def test_a_run_goes_on_where_another_number_of_ranks_left_it(tmp_path, first, then):
     """minimize by its folder, to rounding; steps of a rollout by a file of NumPy, on ranks to the same bits."""
-    kept, whole = tmp_path / "kept", tmp_path / "whole"
+    kept = tmp_path / "kept"
+    whole = tmp_path / "whole"
     for folder in (kept, whole):
         folder.mkdir()
     runs = [(first, kept, 3), (then, kept, 6), (then, whole, 6), (then, whole, 6)]

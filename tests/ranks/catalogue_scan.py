@@ -57,11 +57,13 @@ def looked_at(entry, plain, grid):
     one = entry.make(plain, boundary(plain))
     try:
         op = entry.make(grid, boundary(grid))
-        digest, worst = sha256(), 0.0
+        digest = sha256()
+        worst = 0.0
         u, g = (np.random.default_rng(5).standard_normal(space.shape) for space in (one.domain, one.codomain))
         found = []
         for act, wanted, x in ((op, one, u), (op.T, one.T, g)):
-            y, right = whole(act(x)), wanted(x)
+            y = whole(act(x))
+            right = wanted(x)
             assert y.shape == right.shape
             scale = max(np.max(wanted_magnitude(wanted, x), initial=0.0), 1e-300)
             worst = max(worst, float(np.max(np.abs(y - right), initial=0.0) / scale))

@@ -14,7 +14,8 @@ from sparsedp._utils.pytree import leaves
 GRID = dp.Grid((6, 5), size=1.0)
 SOLVE = dp.elliptic_solver(dp.divergence(GRID), dp.gradient(GRID, dp.dirichlet))
 RNG = np.random.default_rng(3)
-SCENES, WEIGHTS = list(RNG.random((7, *GRID.shape))), RNG.random(7)
+SCENES = list(RNG.random((7, *GRID.shape)))
+WEIGHTS = RNG.random(7)
 X, T = ({"k": RNG.random(GRID.faces.size), "s": s} for s in (2.0, 1.0))
 
 

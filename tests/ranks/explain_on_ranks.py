@@ -28,7 +28,8 @@ def counted(loss, x):
 
 
 if __name__ == "__main__":
-    u, talks = GRID.centres()[0] * 1.0, COMM.size > 1
+    u = GRID.centres()[0] * 1.0
+    talks = COMM.size > 1
     step = lambda u, k: u + k * 1e-3 * L(u)
     there_and_back = [2 * talks, 2 * 8 * SEAMS, 1]
     assert counted(lambda u: anp.sum(L(u) ** 2), u) == there_and_back

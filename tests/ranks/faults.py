@@ -109,7 +109,8 @@ def heat(u, k):
     return u + 1e-3 * k * laplacian()(u)
 
 
-FIELD, STEP = poked(1.0), dp.identity(GRID.cells) - 0.3 * dp.laplacian(GRID)
+FIELD = poked(1.0)
+STEP = dp.identity(GRID.cells) - 0.3 * dp.laplacian(GRID)
 WALL = -dp.laplacian(GRID)
 
 # name: (type, words, what meets it). Nothing is planted on one rank in those whose words tell no rank.

@@ -25,7 +25,8 @@ def same_everywhere(value):
 
 def close(value, wanted, tol=1e-13):
     """Compare, in the size of what is wanted."""
-    value, wanted = np.asarray(dp.gather(value)), np.asarray(wanted)
+    value = np.asarray(dp.gather(value))
+    wanted = np.asarray(wanted)
     assert value.shape == wanted.shape and value.dtype == wanted.dtype, (value, wanted)
     same_everywhere(value)
     error = np.abs(np.subtract(value, wanted, dtype=complex))
@@ -108,7 +109,9 @@ def no_function_of_numpy_sees_the_block():
 
 def losses(grid):
     """Losses of (field, number) that meet fields, numbers and operators in every way."""
-    L, G, A = 0.01 * dp.laplacian(grid, dp.dirichlet), dp.gradient(grid, dp.robin(1, 1)), dp.average(grid)
+    L = 0.01 * dp.laplacian(grid, dp.dirichlet)
+    G = dp.gradient(grid, dp.robin(1, 1))
+    A = dp.average(grid)
     points = dp.sample(grid, [[0.3, 0.4], [0.9, 1.9]])
     B = dp.lift(grid, {"y": dp.dirichlet})
     x, y = grid.centres()
@@ -142,17 +145,20 @@ def derivatives_are_those_of_one_process():
             assert type(value[1][0]) is type(given[0][0][0]), number
             slopes = [dp.jvp(act, *pair)[1] for act, pair in zip(acts, given)]
             curved = [dp.hvp(act, *pair) for act, pair in zip(acts, given)]
-            found, right = (value[0], *value[1], slopes[0], *curved[0]), (wanted[0], *wanted[1], slopes[1], *curved[1])
+            found = (value[0], *value[1], slopes[0], *curved[0])
+            right = (wanted[0], *wanted[1], slopes[1], *curved[1])
             for pair in zip(found, right):
                 close(*pair, 1e-12)
 
 
 def rollouts_keep_what_one_process_keeps():
     """The last state and its gradient, for every memory, with a state on ranks or known to all; same bits."""
-    u, found = np.random.default_rng(2).standard_normal(PLAIN.shape), set()
+    u = np.random.default_rng(2).standard_normal(PLAIN.shape)
+    found = set()
     wanted = flow = ()
     for grid, field in ((PLAIN, None), (GRID, None), (GRID, dp.identity(GRID.cells))):
-        L, convect = dp.laplacian(grid, dp.dirichlet), dp.convection(grid)
+        L = dp.laplacian(grid, dp.dirichlet)
+        convect = dp.convection(grid)
         step = lambda u, k, L=L: u + k * 1e-3 * L(anp.tanh(u))
         for memory in (None, 6000, 2600):
             start = u if field is None else field(u)

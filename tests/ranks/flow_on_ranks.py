@@ -20,7 +20,8 @@ BLOCK[6:9, 5:8] = True
 
 def close(value, wanted, tol, name):
     """Compare, and see that all ranks have the same."""
-    value, wanted = np.asarray(dp.gather(value)), np.asarray(wanted)
+    value = np.asarray(dp.gather(value))
+    wanted = np.asarray(wanted)
     assert len(set(COMM.allgather(value.tobytes()))) == 1, name
     error = np.max(np.abs(value - wanted), initial=0.0) / np.max(np.abs(wanted), initial=1e-300)
     assert value.shape == wanted.shape and error <= tol, (name, error)
@@ -74,7 +75,8 @@ def projections():
         def look(grid, field, v=v, t=t, g=g, options=options):
             P = dp.projection(grid, rtol=1e-13, **options)
             loss = lambda v: anp.sum(anp.sin(P(v * v)) ** 2) + anp.sum(anp.cos(P.pressure(v)))
-            x, along = field(grid.faces, v), field(grid.faces, t)
+            x = field(grid.faces, v)
+            along = field(grid.faces, t)
             maps = P(x), P.T(x), P.pressure(x), P.pressure.T(field(grid.cells, g)), P(1e-200 * x)
             assert P.info.forward.status.startswith(("converged", "exact"))
             return *maps, *derivatives(loss, x, along)
@@ -86,10 +88,13 @@ def plume():
     """Smoke that rises round an obstacle, 20 steps with a projection each, in a rollout."""
     plain = dp.Grid((16, 12), size=1.0)
     x, y = plain.centres()
-    smoke, along = np.exp(-((x - 0.3) ** 2 + (y - 0.5) ** 2) / 0.02), np.sin(3 * x + y)
+    smoke = np.exp(-((x - 0.3) ** 2 + (y - 0.5) ** 2) / 0.02)
+    along = np.sin(3 * x + y)
 
     def look(grid, field):
-        P, D, A = dp.projection(grid, BLOCK, rtol=1e-13), dp.divergence(grid), dp.average(grid)
+        P = dp.projection(grid, BLOCK, rtol=1e-13)
+        D = dp.divergence(grid)
+        A = dp.average(grid)
         lift = dp.component(grid, 0).T @ dp.component(grid, 0)
 
         def step(state, buoyancy):
@@ -136,8 +141,10 @@ def cavity():
 
 def flows():
     """Every part that `flow_step` takes: obstacles, openings, heat, implicit viscosity, friction, three axes."""
-    box, room = dp.Grid((12, 10), size=1.0), dp.Grid((6, 4, 5), size=1.0, periodic=(False, True, False))
-    mild, x = 0.02 * SOLID, {"x": (dp.inflow, dp.outflow)}
+    box = dp.Grid((12, 10), size=1.0)
+    room = dp.Grid((6, 4, 5), size=1.0, periodic=(False, True, False))
+    mild = 0.02 * SOLID
+    x = {"x": (dp.inflow, dp.outflow)}
     hot = {"diffusivity": 0.01, "boundary": {"x": dp.dirichlet}, "source": lambda s, p: p * s["heat"] - s["dye"]}
     scalars = {"heat": hot | {"values": np.linspace(0.5, 1.0, 44)}, "dye": {}}
     push = lambda v, s, p: p * anp.mean(s["heat"]) * v

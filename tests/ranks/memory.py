@@ -15,7 +15,9 @@ import sparsedp as dp
 COMM = MPI.COMM_WORLD
 GRID = dp.distribute(dp.Grid((32, 32), size=1.0), COMM)
 B = np.random.default_rng(0).standard_normal(GRID.shape)
-LEAST, COUNT, MOST = 10, 150, 5e6  # set-ups before memory is looked at, after, and the bytes that it may grow
+LEAST = 10  # set-ups before memory is looked at, after, and the bytes that it may grow
+COUNT = 150
+MOST = 5e6
 
 
 def resident():
@@ -26,7 +28,9 @@ def resident():
 
 def set_up(number):
     """One operator and its inverse, forward and adjoint."""
-    D, G, k = dp.divergence(GRID), dp.gradient(GRID, dp.dirichlet), 1.0 + number + np.arange(GRID.faces.size) % 5
+    D = dp.divergence(GRID)
+    G = dp.gradient(GRID, dp.dirichlet)
+    k = 1.0 + number + np.arange(GRID.faces.size) % 5
     inverse = dp.inverse(dp.identity(GRID.cells) - D @ dp.diagonal(GRID.faces, k) @ G, rtol=1e-6)
     dp.grad(lambda b: anp.sum(inverse(b) ** 2))(B)
 

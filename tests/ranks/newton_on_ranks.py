@@ -29,7 +29,9 @@ GRIDS = [
 
 def diffusion(grid):
     """An implicit step of D (k + u^2) G u: a matrix that is not symmetric."""
-    D, G, A = dp.divergence(grid), dp.gradient(grid), dp.average(grid)
+    D = dp.divergence(grid)
+    G = dp.gradient(grid)
+    A = dp.average(grid)
     return lambda x, u, k: x - u - 1e-2 * D((k + A(x) ** 2) * G(x))
 
 
@@ -55,7 +57,9 @@ def species(grid):
 
 def flux(grid):
     """A field on cells and one on faces."""
-    D, G, A = dp.divergence(grid), dp.gradient(grid), dp.average(grid)
+    D = dp.divergence(grid)
+    G = dp.gradient(grid)
+    A = dp.average(grid)
     return lambda x, u, k: {
         "p": x["p"] - k * D(x["q"]) - u,
         "q": x["q"] * (1 + 0.1 * A(x["p"]) ** 2) - k * G(x["p"]),
@@ -72,9 +76,11 @@ def guess(make, grid, field):
 
 def looked_at(make, grid, field):
     """The root, and a loss of it with its derivatives to second order."""
-    solve, start = dp.implicit(make(grid), rtol=1e-13), guess(make, grid, field)
+    solve = dp.implicit(make(grid), rtol=1e-13)
+    start = guess(make, grid, field)
     u, t = np.random.default_rng(1).standard_normal((2, *grid.shape))
-    x, along = (field(grid.cells, u), 0.2), (field(grid.cells, t), -0.3)
+    x = (field(grid.cells, u), 0.2)
+    along = (field(grid.cells, t), -0.3)
 
     def loss(x):
         root = solve(start, *x)
@@ -88,12 +94,18 @@ def looked_at(make, grid, field):
 
 def cavity(grid, field):
     """The steady flow under a lid, velocity and pressure together."""
-    D, G, L, convect = dp.divergence(grid), dp.gradient(grid), dp.face_laplacian(grid), dp.convection(grid)
-    inside, lid, pin = dp.interior(grid), dp.face_lift(grid), np.zeros(grid.shape)
+    D = dp.divergence(grid)
+    G = dp.gradient(grid)
+    L = dp.face_laplacian(grid)
+    convect = dp.convection(grid)
+    inside = dp.interior(grid)
+    lid = dp.face_lift(grid)
+    pin = np.zeros(grid.shape)
     moving, pin[0, 0] = lid(lid.domain.join(0.0, 0.0, 0.0, 1.0)), 1.0
 
     def equations(x, reynolds):
-        v, p = x["v"], x["p"]
+        v = x["v"]
+        p = x["p"]
         momentum = (L(v) + moving) / reynolds - convect(v, v) - G(p)
         return {"v": inside(momentum) + v - inside(v), "p": D(v) + pin * p}
 
@@ -134,7 +146,8 @@ def entries_that_come_late():
     """A residual that meets its neighbours only where it has got far; and other unknowns than before."""
 
     def look(grid, field):
-        L, A = dp.laplacian(grid, dp.dirichlet), dp.average(grid)
+        L = dp.laplacian(grid, dp.dirichlet)
+        A = dp.average(grid)
         solve = dp.implicit(lambda x, k: x - k - 1e-2 * L(anp.maximum(x - 5.0, 0.0)), rtol=1e-13)
         loss = lambda k: anp.sum(solve(field(grid.cells, np.ones(grid.shape)), k) ** 2)
         cube = dp.implicit(lambda x, k: x**3 - k)
@@ -153,7 +166,8 @@ def bits():
         grid = dp.distribute(one, COMM)
         for make in (diffusion, bratu, species, flux):
             start = guess(make, grid, lying)
-            layout, params = Layout(start, "f"), (lying(grid.cells, np.ones(grid.shape)), 0.7)
+            layout = Layout(start, "f")
+            params = (lying(grid.cells, np.ones(grid.shape)), 0.7)
             equation = Equation(make(grid), layout, params, "f")
             settings = dict(method="auto", rtol=1e-10, maxiter=None, nullspace="raise", options={})
             x = layout.laid(np.sin(np.arange(float(layout.size))))
@@ -173,7 +187,8 @@ def narrow(x, k):
 def errors_are_the_same_on_all_ranks():
     """What is raised on one rank, or cannot be, in the same words on all."""
     grid = dp.distribute(PLAIN, COMM)
-    one, L = lying(grid.cells, np.ones(grid.shape)), dp.laplacian(grid)
+    one = lying(grid.cells, np.ones(grid.shape))
+    L = dp.laplacian(grid)
     refused(dp.errors.UnstableStepError, "planted", lambda: dp.implicit(narrow)(3 * one, 2.0))
     solve = dp.implicit(narrow)
     close(solve(0.1 * one, 2.0), np.full(grid.shape, 2**0.5), 1e-12, "a search on all ranks for what one refuses")

@@ -33,8 +33,10 @@ def diffused():
 
 def elliptic():
     """A coefficient by what its solution was seen to be, on one number and a field that every rank has."""
-    D, G = dp.divergence(GRID), dp.gradient(GRID, dp.dirichlet)
-    solve, mean = dp.elliptic_solver(D, G), dp.harmonic_average(GRID)
+    D = dp.divergence(GRID)
+    G = dp.gradient(GRID, dp.dirichlet)
+    solve = dp.elliptic_solver(D, G)
+    mean = dp.harmonic_average(GRID)
     loss = lambda x: anp.sum((solve(mean(anp.exp(x["log k"])), 1.0 + 0.0 * TARGET) * x["a"] - 0.1) ** 2)
     return loss, {"log k": 0.1 * TARGET, "a": 1.0}
 
@@ -54,7 +56,8 @@ def main(folder, iterations):
         told = make.__name__, repr(best.value), digest(best.x), best.resumed.split(" in ")[0]
         if COMM.rank == 0:
             print(*told)
-    path, L = folder / "state.npy", dp.laplacian(GRID, dp.dirichlet)
+    path = folder / "state.npy"
+    L = dp.laplacian(GRID, dp.dirichlet)
     state = np.load(path, mmap_mode="r") if path.exists() else TARGET
     end = dp.gather(dp.rollout(lambda u, k: u + k * L(u), np.array(state), 2e-3, 20))
     told = "steps", np.linalg.norm(end), digest(end)  # all have read the file

@@ -9,7 +9,8 @@ from mpi4py import MPI
 
 import sparsedp as dp
 
-COMM, RNG = MPI.COMM_WORLD, np.random.default_rng(3)
+COMM = MPI.COMM_WORLD
+RNG = np.random.default_rng(3)
 GRIDS = [
     dp.Grid(23, spacing=0.3),
     dp.Grid((12, 9), size=(2.0, 1.0), periodic=(True, False)),
@@ -23,7 +24,8 @@ WALL[5], WALL[2, 3], WALL[6:, 4] = True, True, True
 
 def operators(grid):
     """Name, square operator: regular and singular, symmetric and not, with obstacles."""
-    D, G = dp.divergence(grid), dp.gradient(grid)
+    D = dp.divergence(grid)
+    G = dp.gradient(grid)
     yield "dirichlet", -dp.laplacian(grid, {grid.axes[-1]: dp.robin(1, 2)} if not grid.periodic[-1] else dp.neumann)
     yield "neumann", -D @ G
     yield "negative", dp.laplacian(grid)
@@ -39,7 +41,8 @@ def operators(grid):
 
 def close(value, wanted, tol, name):
     """Compare, and see that all ranks have the same."""
-    value, wanted = np.asarray(dp.gather(value)), np.asarray(wanted)
+    value = np.asarray(dp.gather(value))
+    wanted = np.asarray(wanted)
     assert len(set(COMM.allgather(value.tobytes()))) == 1
     error = np.max(np.abs(value - wanted), initial=0.0) / np.max(np.abs(wanted), initial=1e-300)
     assert error <= tol, (name, error)
@@ -76,10 +79,13 @@ def elliptic_misfits():
         for boundary, solid in ((dp.dirichlet, None), (dp.neumann, None), (dp.dirichlet, holes)):
             results = []
             for grid, lay in ((plain, False), (dp.distribute(plain, COMM), False), (dp.distribute(plain, COMM), True)):
-                D, G, mean = dp.divergence(grid), dp.gradient(grid, boundary, solid), dp.harmonic_average(grid)
+                D = dp.divergence(grid)
+                G = dp.gradient(grid, boundary, solid)
+                mean = dp.harmonic_average(grid)
                 solve = dp.elliptic_solver(D, G, rtol=1e-13, nullspace="project")
                 field = dp.identity(grid.cells) if lay else lambda u: u
-                x, along = (field(np.log(k)), field(b), 0.2), (field(t), field(b[::-1].copy()), 0.3)
+                x = (field(np.log(k)), field(b), 0.2)
+                along = (field(t), field(b[::-1].copy()), 0.3)
                 loss = lambda x, solve=solve, mean=mean: anp.sum(anp.sin(solve(mean(anp.exp(x[0])), x[1], x[2])) ** 2)
                 value, slopes = dp.value_and_grad(loss)(x)
                 results.append((value, *slopes, dp.jvp(loss, x, along)[1], *dp.hvp(loss, x, along)))
@@ -92,7 +98,9 @@ def products_with_inverses():
     """A projection written out: v + G A^-1 D v as one operator, and its transpose."""
     results = []
     for grid in (GRIDS[2], dp.distribute(GRIDS[2], COMM)):
-        D, G, inside = dp.divergence(grid), dp.gradient(grid), dp.interior(grid)
+        D = dp.divergence(grid)
+        G = dp.gradient(grid)
+        inside = dp.interior(grid)
         P = inside + G @ dp.inverse(-D @ G, rtol=1e-12, nullspace="project") @ D @ inside
         v = np.random.default_rng(2).standard_normal(grid.faces.size)
         results.append((P(v), P.T(v)))

@@ -40,7 +40,8 @@ def stiff(method, **options):
     """A rate beside a linear part, and a source."""
 
     def make(grid):
-        L, V = dp.laplacian(grid), grid.volumes
+        L = dp.laplacian(grid)
+        V = grid.volumes
         given = dict(linear=(L, lambda k: k), source=lambda k: k * V, **options)
         return dp.stepper(method, lambda u, k: k * anp.tanh(u), 1e-2, rtol=1e-13, **given)
 
@@ -61,14 +62,16 @@ def tree(grid):
 
 def leapfrog(grid):
     """Waves that die out at the ends."""
-    D, G = dp.divergence(grid), dp.gradient(grid, dp.dirichlet)
+    D = dp.divergence(grid)
+    G = dp.gradient(grid, dp.dirichlet)
     step = dp.stepper("leapfrog", (lambda v, k: k * D(v), lambda p, k: k * G(p)), 0.05, damping=dp.sponge(grid, 2, 1.0))
     return lambda u, k: step((u, G(u) * k), k)[0]
 
 
 def root(grid):
     """A root, whose residual is moved by a field."""
-    L, A = dp.laplacian(grid), dp.average(grid)
+    L = dp.laplacian(grid)
+    A = dp.average(grid)
     solve = dp.implicit(lambda x, u, k: x - u - k * 1e-2 * L(anp.tanh(x)) + 0.1 * anp.sum(A(x) ** 2) * u, rtol=1e-13)
     return lambda u, k: solve(np.zeros(grid.shape), u, k)
 
@@ -94,9 +97,11 @@ KNOWN_TO_ALL = {
 def looked_at(name, make, grid, field):
     """Two steps in a rollout and their gradient; of some methods derivatives of all kinds, of one step."""
     u, t = RNG_FIELDS[grid.shape]
-    step, n = make(grid), 1 if name in BENT else 2
+    step = make(grid)
+    n = 1 if name in BENT else 2
     loss = lambda x: anp.sum(anp.sin(dp.rollout(step, x[0], x[1], n)) ** 2)
-    x, along = (field(grid.cells, u), 0.7), (field(grid.cells, t), -0.3)
+    x = (field(grid.cells, u), 0.7)
+    along = (field(grid.cells, t), -0.3)
     if name not in BENT:
         value, slopes = dp.value_and_grad(loss)(x)
         return value, *slopes
@@ -143,12 +148,14 @@ def states_on_the_way():
         seen = lambda i, state: (i * state["u"], anp.sum(state["u"] ** 2), state["t"])
 
         def loss(x):
-            states, looks = every(x), dp.rollout(step, *start(x), keep=seen, memory=3000)
+            states = every(x)
+            looks = dp.rollout(step, *start(x), keep=seen, memory=3000)
             first = sum(anp.sum(u**2) * (i + 1) for i, u in enumerate(states["u"])) + anp.sum(states["t"] ** 2)
             return first + sum(anp.sum(anp.sin(u)) * total + t for u, total, t in looks)
 
         u, t = RNG_FIELDS[grid.shape]
-        x, along = (field(grid.cells, u), 0.7), (field(grid.cells, t), -0.3)
+        x = (field(grid.cells, u), 0.7)
+        along = (field(grid.cells, t), -0.3)
         value, slopes, tangent, bent = derivatives(loss, x, along)
         return value, *slopes, tangent, *bent, *every(x)["u"], every(x)["t"]
 

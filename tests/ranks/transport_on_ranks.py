@@ -46,7 +46,8 @@ class Case:
     """A step of transport on a grid, what goes in, and a direction; drawn from a seed."""
 
     def __init__(self, number, grid, options, velocity, of, solid):
-        rng, self.options = np.random.default_rng(number), dict(options, velocity=velocity, of=of)
+        rng = np.random.default_rng(number)
+        self.options = dict(options, velocity=velocity, of=of)
         self.options["boundary"] = {name: SIDES[name] for name, wraps in zip(grid.axes, grid.periodic) if not wraps}
         if solid:
             self.options["solid"] = rng.random(grid.shape) < 0.3
@@ -99,19 +100,22 @@ def steps_of_one_process():
         close(move(on[0](u).astype(np.float32), v, dt, 0.7), one(u.astype(np.float32), v, dt, 0.7), 1e-6)
         close(move((9 * u).astype(int), v, dt), one((9 * u).astype(int), v, dt), tol)
     one, move = (dp.transport(grid, "maccormack") for grid in (LINE, dp.distribute(LINE, COMM)))
-    u, fast = np.sin(np.arange(13.0)), np.where(np.arange(13) < 6, 0.1, -3.0)  # on one of two ranks alone
+    u = np.sin(np.arange(13.0))  # on one of two ranks alone
+    fast = np.where(np.arange(13) < 6, 0.1, -3.0)
     for v in (fast, -fast):
         close(move(u, v, 0.5), one(u, v, 0.5), 1e-13)
 
 
 def wind_of_a_rollout():
     """50 upwind steps on unequal blocks: the gradient of one process, the same bits for every memory."""
-    grid, found = dp.distribute(SQUARE, COMM), set()
+    grid = dp.distribute(SQUARE, COMM)
+    found = set()
     start = np.exp(-20 * sum((x - 0.4) ** 2 for x in SQUARE.centres()))
     wind = np.sin(np.arange(SQUARE.faces.size))
 
     def gradient(grid, field, memory=None):
-        move, inside = dp.transport(grid), dp.interior(grid)
+        move = dp.transport(grid)
+        inside = dp.interior(grid)
         end = lambda v: dp.rollout(lambda u, v: move(u, v, 0.01), field(start), v, 50, memory=memory)
         return dp.value_and_grad(lambda v: anp.sum((end(inside(v)) - 0.3) ** 2))(wind)
 
@@ -127,7 +131,9 @@ def wind_of_a_rollout():
 def messages_of_a_step():
     """On two ranks a step reads one row of cells; with its gradient it reads two, and sends back two."""
     grid = dp.distribute(dp.Grid((8, 6)), COMM)
-    move, u, v = dp.transport(grid), dp.identity(grid.cells)(np.ones((8, 6))), np.full(110, 0.1)
+    move = dp.transport(grid)
+    u = dp.identity(grid.cells)(np.ones((8, 6)))
+    v = np.full(110, 0.1)
     v = dp.identity(grid.faces)(v)
     loss = lambda v, n: anp.sum(dp.rollout(lambda u, v: move(u, v, 0.1), u, v, n))
     told = []
@@ -135,7 +141,8 @@ def messages_of_a_step():
         act(v, 5)
         counts = [counted(act, v, n) for n in (5, 8)]
         told.append([(more - less) / 3 for less, more in zip(*counts)])
-    row, of_v = 2 * 6 * 8, (6 * 2 + 7 + 6 + 7) * 8
+    row = 2 * 6 * 8
+    of_v = (6 * 2 + 7 + 6 + 7) * 8
     if COMM.size == 2:
         assert told == [[1, row, 0], [4, 3 * row + of_v, 0]], told
     else:
@@ -162,7 +169,9 @@ def told_by(act):
 
 def refusals_are_those_of_one_process():
     """The same words on every rank, also where the fault lies on one of them, and none for what is beyond a block."""
-    road, u, v = dp.Grid(13, spacing=0.5), np.linspace(0, 1, 13), np.ones(14)
+    road = dp.Grid(13, spacing=0.5)
+    u = np.linspace(0, 1, 13)
+    v = np.ones(14)
     bad, fast = (np.where(np.arange(14) == 9, value, 1.0) for value in (np.nan, 9.0))
     wrong = [(bad[1:], v, 0.1), (u, bad, 0.1), (u, v, 0.1, np.inf), (u[:5], v, 0.1), (u, v, -1.0), (u, fast, 0.4)]
     for scheme, args in [
@@ -174,7 +183,8 @@ def refusals_are_those_of_one_process():
         assert told_by(lambda args=args, move=move: move(*args)) == told_by(lambda args=args, one=one: one(*args))
     acts = [lambda act=act: dp.rollout(lambda u, v: act(u, v, 0.4), u, fast, 3) for act in (move, one)]
     assert told_by(acts[0]) == told_by(acts[1])  # within a call that ranks make together
-    grid, v = dp.distribute(LINE, COMM), v[1:]
+    grid = dp.distribute(LINE, COMM)
+    v = v[1:]
     one, move = (dp.transport(some, "upwind", of="faces") for some in (LINE, grid))
     close(move(u, v, 0.45), one(u, v, 0.45), 1e-15)  # half a cell at the end of a block would be too small
     for fast in range(13):  # at the end of one block alone

@@ -17,7 +17,8 @@ from sparsedp.solvers.system import System
 
 GRID = dp.Grid((20, 20), size=1.0)
 L = dp.laplacian(GRID, dp.dirichlet)
-D, G = dp.divergence(GRID), dp.gradient(GRID, dp.dirichlet)
+D = dp.divergence(GRID)
+G = dp.gradient(GRID, dp.dirichlet)
 X, Y = GRID.centres()
 B = np.exp(-20 * ((X - 0.3) ** 2 + (Y - 0.6) ** 2))
 GOAL = 0.01 * np.sin(3 * X) * Y
@@ -76,10 +77,8 @@ def test_split_by_solve_and_advice():
     """Two solvers, one of them loose: it gets the blame, and the advice helps."""
 
     def loss(rtol):
-        first, second = (
-            dp.inverse(-L, "krylov", rtol=rtol),
-            dp.inverse(dp.identity(GRID.cells) - L, "krylov", rtol=1e-9),
-        )
+        first = dp.inverse(-L, "krylov", rtol=rtol)
+        second = dp.inverse(dp.identity(GRID.cells) - L, "krylov", rtol=1e-9)
         return lambda b: anp.sum((second(first(b)) - GOAL) ** 2)
 
     found = dp.certify(loss(1e-2), B, target=1e-4)
@@ -107,7 +106,8 @@ def test_parallel_branches_are_not_mistaken():
     def loss(solve):
         return lambda b: anp.sum(solve(b) * GOAL) + anp.sum(solve(b[::-1]) ** 2)
 
-    value, found = loss(exact)(B), dp.certify(loss(loose), B)
+    value = loss(exact)(B)
+    found = dp.certify(loss(loose), B)
     assert 0.5 <= found.value_error / (value - found.value) <= 2
 
 
@@ -158,15 +158,19 @@ def test_certified_control(method):
 class Sweeps(Engine):
     """Jacobi sweeps: u += (b - A u) / diagonal."""
 
-    method, unit, iterative = "sweeps", "sweeps", True
+    method = "sweeps"
+    unit = "sweeps"
+    iterative = True
 
     def __init__(self, system):
         self.system = system
 
     def solve(self, b, goal, transposed):
-        u, used = np.zeros_like(b), 0
+        u = np.zeros_like(b)
+        used = 0
         while np.linalg.norm(r := b - self.system.product(u, transposed)) > goal and used < 100_000:
-            u, used = u + r / self.system.diagonal, used + 1
+            u = u + r / self.system.diagonal
+            used = used + 1
         return u, used, ""
 
 

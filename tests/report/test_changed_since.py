@@ -43,7 +43,8 @@ def test_arrays_of_functions_that_change_before_the_way_back(make):
         work[3] = 5.0 if change else work[3]
         return anp.sum(anp.sin(y))
 
-    direction, h = np.cos(np.arange(6)), 1e-5
+    direction = np.cos(np.arange(6))
+    h = 1e-5
     difference = (loss(START + h * direction, False) - loss(START - h * direction, False)) / (2 * h)
     assert value_and_grad(loss)(START, False)[1] @ direction == pytest.approx(difference, rel=1e-8)
     act = make(work)  # one that keeps no Jacobian of before
@@ -68,7 +69,8 @@ def test_a_number_at_a_fixed_point_sees_the_rate_of_today(method):
     """Its root does not move, so that only its Jacobian tells one rate from the other."""
     share = 1.0
     rate = lambda u, p: share * (p - u)
-    step, root = dp.stepper(method, rate, 0.5), dp.implicit(rate)
+    step = dp.stepper(method, rate, 0.5)
+    root = dp.implicit(rate)
     slope = lambda step, u: dp.grad(lambda u: anp.sum(step(u, 2.0)))(u)
     slope(step, 2.0)
     assert dp.grad(lambda p: root(2.0, p))(2.0) == pytest.approx(1.0)
@@ -80,7 +82,8 @@ def test_a_number_at_a_fixed_point_sees_the_rate_of_today(method):
 
 @pytest.mark.parametrize("kind", [np.float64, np.float32])
 def test_adopted_code_that_changes_between_gradients_is_refused(kind):
-    share, x = [1.0], np.arange(1, 5).astype(kind)
+    share = [1.0]
+    x = np.arange(1, 5).astype(kind)
     act = dp.from_blackbox(lambda x: share[0] * x**2)
     loss = value_and_grad(lambda x: anp.sum(act(x)))
     assert np.array_equal(loss(x)[1], 2 * x)

@@ -94,7 +94,9 @@ def test_it_ends_with_what_to_try_next(finished):
 
 def test_a_log_is_written_before_each_long_piece_of_work(monkeypatch):
     """Into a file or a pipe too: what was printed before a minimization is there when it begins."""
-    raw, seen, real = io.BytesIO(), [], dp.minimize
+    raw = io.BytesIO()
+    seen = []
+    real = dp.minimize
     ground = terrain.load(None)
     study = story.prepare(ground, story.grids_for(ground, 12))
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(raw, encoding="utf-8"))
@@ -188,7 +190,8 @@ def test_a_wrong_gradient_is_not_a_success(tmp_path, monkeypatch, capsys):
 
 
 def test_remap_is_the_mean_over_cells():
-    fine, coarse = dp.Grid((24, 16), size=(2.0, 1.0)), dp.Grid((6, 4), size=(2.0, 1.0))
+    fine = dp.Grid((24, 16), size=(2.0, 1.0))
+    coarse = dp.Grid((6, 4), size=(2.0, 1.0))
     u = relief((24, 16))
     assert np.allclose(terrain.remap(fine, coarse)(u), u.reshape(6, 4, 4, 4).mean(axis=(1, 3)), rtol=1e-13)
     x, y = fine.centres()
@@ -198,7 +201,8 @@ def test_remap_is_the_mean_over_cells():
 
 
 def test_generated_terrain_is_the_same_everywhere():
-    one, other = terrain.generated((40, 32)), terrain.generated((40, 32))
+    one = terrain.generated((40, 32))
+    other = terrain.generated((40, 32))
     assert one.shape == (40, 32) and np.array_equal(one, other)
     assert one.std() > 0.2 * np.abs(one).max()
 

@@ -12,7 +12,8 @@ import sparsedp as dp
 from sparsedp._utils.counters import count, note
 
 GRID = dp.Grid((12, 10), size=(1.0, 1.0))
-G, D = dp.gradient(GRID, dp.dirichlet), dp.divergence(GRID)
+G = dp.gradient(GRID, dp.dirichlet)
+D = dp.divergence(GRID)
 L = dp.laplacian(GRID, dp.dirichlet)
 U = np.sin(np.arange(120.0)).reshape(GRID.shape)
 K = 1.5 + np.sin(np.arange(float(GRID.faces.size)))

@@ -13,12 +13,14 @@ U = np.sin(np.arange(120.0)).reshape(GRID.shape)
 
 def test_a_time_loop():
     """Every state kept: nothing runs twice. Under a budget: fewer bytes, more steps, and both are said."""
-    move, wind = dp.transport(GRID, "upwind"), 0.1 * np.sin(np.arange(float(GRID.faces.size)))
+    move = dp.transport(GRID, "upwind")
+    wind = 0.1 * np.sin(np.arange(float(GRID.faces.size)))
 
     def loss(memory):
         return lambda v: anp.sum(dp.rollout(lambda u, w: move(u, w, 0.01), U, v, 20, memory=memory) ** 2)
 
-    free, tight = dp.explain(loss(None), wind), dp.explain(loss(8 * U.nbytes + 2 * wind.nbytes), wind)
+    free = dp.explain(loss(None), wind)
+    tight = dp.explain(loss(8 * U.nbytes + 2 * wind.nbytes), wind)
     assert free.counts["rollout.step", "forward"] == free.counts["rollout.step", "vjp"] == 20
     assert free.recomputation == 1.0 and free.tape_bytes >= 20 * U.nbytes
     assert tight.recomputation == 1 + tight.counts["rollout.step", "recomputed"] / 20 > 1.0
@@ -51,7 +53,8 @@ def test_comparisons_and_shapes_in_a_loss():
 
 def test_each_scene_leaves_out_what_it_does_not_need():
     """By the public steps alone: what is not needed is not built, not solved, not taped, and a line says so."""
-    n, move = 4, dp.transport(GRID, "upwind")
+    n = 4
+    move = dp.transport(GRID, "upwind")
     wind = 0.1 * np.sin(np.arange(float(GRID.faces.size)))
     carried = dp.explain(lambda v: anp.sum(dp.rollout(lambda u, w: move(u, w, 0.01), U, v, n) ** 2), wind)
     for word in ("hierarchies built", "set-ups built", "matrices assembled", "forward solves", "adjoint solves"):

@@ -191,7 +191,8 @@ def test_without_matplotlib(monkeypatch):
 
 
 def test_a_film_of_a_face_field_shares_the_range_of_its_magnitude(monkeypatch):
-    grid, seen = dp.Grid((3, 3)), []
+    grid = dp.Grid((3, 3))
+    seen = []
     monkeypatch.setattr(plots, "plot", lambda *args, **options: seen.append(options["limits"]))
     film = io.BytesIO()
     dp.animate(grid, [grid.join(-3.0, 4.0), grid.join(0.0, 0.0)], film)

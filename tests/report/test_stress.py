@@ -238,7 +238,8 @@ def test_implicit_diffusion_passes_and_has_a_map():
 
 @shared
 def test_what_it_is_as_data_and_text(stable):
-    result, data = stable, stable.to_dict()
+    result = stable
+    data = stable.to_dict()
     assert data["counts"] == result.counts and len(data["rows"]) == len(result.rows)
     assert sum(result.counts.values()) == len(result.rows)
     assert len(result.csv().splitlines()) == len(result.rows) + 1

@@ -66,7 +66,8 @@ def heat(scheme, steps):
     """u' = -u from p, to time 1."""
 
     def loss(p):
-        u, dt = p, 1 / steps
+        u = p
+        dt = 1 / steps
         for _ in range(steps):
             u = u * (1 - dt) if scheme == 1 else u * (1 - dt + dt**2 / 2) if scheme == 2 else u * np.exp(-dt)
         return u**2
@@ -176,7 +177,8 @@ def test_a_run_without_gradient_and_an_output():
 
 def test_a_file_is_continued(tmp_path):
     """Finished rows are kept when a run is cut off, also in the middle of a line."""
-    file, built = tmp_path / "runs.csv", []
+    file = tmp_path / "runs.csv"
+    built = []
 
     def counted(cells, method, rtol=1e-10):
         built.append((cells, method))

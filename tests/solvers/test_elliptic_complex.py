@@ -25,10 +25,13 @@ METHODS = pytest.mark.parametrize("method", ["direct", "krylov"])
 
 def setting(kind, method="direct", boundary=dp.dirichlet, shape=(7, 5), **options):
     """A solver, its arguments and a direction for each."""
-    grid, rng = stretched(*shape), np.random.default_rng(4)
+    grid = stretched(*shape)
+    rng = np.random.default_rng(4)
     draw = lambda shape: rng.uniform(0.5, 1.5, shape)
     mixed = lambda shape: draw(shape) - 1j * draw(shape)
-    k, b, shift = draw(grid.faces.size), rng.standard_normal(grid.shape), draw(grid.shape)
+    k = draw(grid.faces.size)
+    b = rng.standard_normal(grid.shape)
+    shift = draw(grid.shape)
     if kind == "complex number":
         shift = -0.4 + 0.3j
     if kind in ("complex field", "all complex"):
@@ -149,10 +152,14 @@ def test_set_ups_are_kept_by_the_content_of_the_shift():
 
 
 def test_a_field_as_shift_goes_to_the_method_that_takes_it():
-    grid, rng = dp.Grid((80, 70), size=1.0), np.random.default_rng(0)
+    grid = dp.Grid((80, 70), size=1.0)
+    rng = np.random.default_rng(0)
     make = lambda method: dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet), method)
-    auto, direct, b = make("auto"), make("direct"), rng.standard_normal(grid.shape)
-    waves, reacts = -np.full(grid.shape, 2e3), 100 * rng.random(grid.shape)
+    auto = make("auto")
+    direct = make("direct")
+    b = rng.standard_normal(grid.shape)
+    waves = -np.full(grid.shape, 2e3)
+    reacts = 100 * rng.random(grid.shape)
     for shift, words in (
         (reacts, ("structured", "direct: 5600")),
         (waves, ("direct: 5600",)),
@@ -219,19 +226,23 @@ def test_auto_leaves_lu_where_it_would_not_fit(monkeypatch):
 
 
 def test_the_cycle_of_shifted_laplace_has_an_exact_transpose():
-    grid, rng = stretched(40, 30), np.random.default_rng(0)
+    grid = stretched(40, 30)
+    rng = np.random.default_rng(0)
     op = dp.diagonal(grid.cells, -0.3 - 0.2j * rng.random(grid.shape)) - dp.laplacian(grid, dp.dirichlet)
     hierarchy, unit = shifted_laplace(System(op))
     assert len(hierarchy.levels) > 1
     b, g = rng.standard_normal((2, grid.cells.size)) + 1j * rng.standard_normal((2, grid.cells.size))
-    x, y = hierarchy.cycle(b), hierarchy.T.cycle(g)
+    x = hierarchy.cycle(b)
+    y = hierarchy.T.cycle(g)
     assert abs(np.sum(x * g) - np.sum(b * y)) <= 1e-13 * np.linalg.norm(x) * np.linalg.norm(g)
 
 
 def test_absorbing_layers_reflect_less_than_a_thousandth():
     """A sponge by a complex shift; a perfectly matched layer by a complex coefficient too, on a line and in 2-D."""
-    cells, grid = 10, dp.Grid(200)
-    k, ends = 2 * np.pi / cells, lambda x: np.maximum(1 - np.minimum(x, 200 - x) / (2 * cells), 0) ** 3
+    cells = 10
+    grid = dp.Grid(200)
+    k = 2 * np.pi / cells
+    ends = lambda x: np.maximum(1 - np.minimum(x, 200 - x) / (2 * cells), 0) ** 3
     (x,), (face,) = grid.centres(), grid.face_centres(0)
     solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet))
     phase = np.arccos(1 - k**2 / 2) * np.arange(120)
@@ -244,8 +255,10 @@ def test_absorbing_layers_reflect_less_than_a_thousandth():
     ends = [lambda x, n=n: 1 - 2j * np.maximum(1 - np.minimum(x, n - x) / (2 * cells), 0) ** 3 for n in grid.shape]
     (fx, y), (x, fy) = grid.face_centres(0), grid.face_centres(1)
     coefficient = grid.join(ends[1](y) / ends[0](fx), ends[0](x) / ends[1](fy))
-    shift, b = -(k**2) * np.outer(ends[0](x[:, 0]), ends[1](y[0])), np.eye(80)[:60].T
-    D, G = dp.divergence(grid), dp.gradient(grid, dp.dirichlet)
+    shift = -(k**2) * np.outer(ends[0](x[:, 0]), ends[1](y[0]))
+    b = np.eye(80)[:60].T
+    D = dp.divergence(grid)
+    G = dp.gradient(grid, dp.dirichlet)
     waves = dp.elliptic_solver(D, G, "krylov", preconditioner="shifted_laplace")
     close(waves(coefficient, b, shift), dp.elliptic_solver(D, G)(coefficient, b, shift), 1e-8)
     assert waves.info.forward.iterations <= 60
@@ -254,7 +267,9 @@ def test_absorbing_layers_reflect_less_than_a_thousandth():
 def test_waves_without_damping_have_a_real_solution():
     """A real operator of both signs: complex iterations, and the real part of what they give."""
     grid = dp.Grid((24, 24), size=1.0)
-    D, G, b = dp.divergence(grid), dp.gradient(grid, dp.dirichlet), np.sin(np.arange(576.0)).reshape(24, 24)
+    D = dp.divergence(grid)
+    G = dp.gradient(grid, dp.dirichlet)
+    b = np.sin(np.arange(576.0)).reshape(24, 24)
     solve = dp.elliptic_solver(D, G, "krylov", preconditioner="shifted_laplace")
     x = solve(1.0, b, -150.0)
     close(x, dp.elliptic_solver(D, G, "direct")(1.0, b, -150.0), 1e-7)
@@ -287,7 +302,8 @@ def test_factors_in_single_precision_meet_the_same_tolerance(damped):
 
 def test_single_precision_is_left_where_refinement_would_not_converge():
     """Next to an eigenvalue, and where entries leave its range."""
-    grid, b = dp.Grid((12, 12)), np.cos(np.arange(144.0)).reshape(12, 12)
+    grid = dp.Grid((12, 12))
+    b = np.cos(np.arange(144.0)).reshape(12, 12)
     op = dp.laplacian(grid, dp.dirichlet)
     lowest = -8 * np.sin(np.pi / 24) ** 2
     tiny = dp.diagonal(grid.cells, np.where(np.arange(144).reshape(12, 12) % 2, 1.0, 1e-60))
@@ -353,8 +369,10 @@ def test_a_million_unknowns_at_ten_cells_a_wavelength():
 
 @pytest.mark.parametrize("turn", [1.0, 1.0 - 0.5j])
 def test_coefficients_over_24_decades(turn):
-    grid, rng = dp.Grid((16, 16), size=1.0), np.random.default_rng(3)
-    k, b = turn * 10.0 ** rng.uniform(-12, 12, grid.faces.size), rng.standard_normal(grid.shape)
+    grid = dp.Grid((16, 16), size=1.0)
+    rng = np.random.default_rng(3)
+    k = turn * 10.0 ** rng.uniform(-12, 12, grid.faces.size)
+    b = rng.standard_normal(grid.shape)
     shift = turn * 10.0 ** rng.uniform(-6, 6, grid.shape)
     solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet))
     solve(k, b, shift)
@@ -400,9 +418,12 @@ def test_single_precision_one_cell_and_no_cells():
 
 @pytest.mark.parametrize("options", [{}, {"preconditioner": "shifted_laplace"}], ids=str)
 def test_singular_systems_and_solids_in_complex_numbers(options):
-    grid, rng = stretched(9, 8), np.random.default_rng(0)
-    D, b = dp.divergence(grid), rng.standard_normal(grid.shape)
-    k, even = rng.uniform(0.5, 1.5, grid.faces.size) * (1 - 0.4j), b - np.sum(b * grid.volumes) / np.sum(grid.volumes)
+    grid = stretched(9, 8)
+    rng = np.random.default_rng(0)
+    D = dp.divergence(grid)
+    b = rng.standard_normal(grid.shape)
+    k = rng.uniform(0.5, 1.5, grid.faces.size) * (1 - 0.4j)
+    even = b - np.sum(b * grid.volumes) / np.sum(grid.volumes)
     exact, solve = (dp.elliptic_solver(D, dp.gradient(grid), m, **o) for m, o in (("direct", {}), ("krylov", options)))
     close(solve(k, even), exact(k, even), 1e-7)
     assert abs(np.sum(solve(k, even) * grid.volumes)) <= 1e-11
@@ -412,7 +433,9 @@ def test_singular_systems_and_solids_in_complex_numbers(options):
         solve(k, b + 1)
     solid = np.zeros(grid.shape, dtype=bool)
     solid[3:5, 2:4] = True
-    G, b, shift = dp.gradient(grid, dp.dirichlet, solid), np.where(solid, 0.0, b), -0.3 * (1 + 0.2j) * ~solid
+    G = dp.gradient(grid, dp.dirichlet, solid)
+    b = np.where(solid, 0.0, b)
+    shift = -0.3 * (1 + 0.2j) * ~solid
     x = dp.elliptic_solver(D, G, "krylov", **options)(k, b, shift)
     assert not np.any(x[solid])
     close(x, dp.elliptic_solver(D, G, "direct")(k, b, shift), 1e-8)
@@ -420,6 +443,7 @@ def test_singular_systems_and_solids_in_complex_numbers(options):
 
 def test_a_complex_number_as_shift():
     """It is an array without axes."""
-    solve, k = dp.elliptic_solver(dp.divergence(dp.Grid(1)), dp.gradient(dp.Grid(1), dp.dirichlet)), np.ones(2)
+    solve = dp.elliptic_solver(dp.divergence(dp.Grid(1)), dp.gradient(dp.Grid(1), dp.dirichlet))
+    k = np.ones(2)
     assert solve(k, np.array([2.0]), -1 - 0.5j)[0] == pytest.approx(2 / (3 - 0.5j))
     assert solve(k, np.array([2.0]), np.asarray(-1e-300j))[0] == pytest.approx(0.5)

@@ -21,7 +21,8 @@ def solver(grid, boundary=dp.dirichlet, method="auto", **options):
 
 def tensors(grid, seed=0, skew=0.0):
     """A random positive definite matrix in each cell, symmetric but for `skew`."""
-    rng, dim = np.random.default_rng(seed), grid.dim
+    rng = np.random.default_rng(seed)
+    dim = grid.dim
     root = rng.standard_normal((dim, dim, *grid.shape))
     identity = np.eye(dim).reshape(dim, dim, *[1] * dim)
     twist = skew * np.triu(np.ones((dim, dim)), 1).reshape(identity.shape)
@@ -70,7 +71,8 @@ def exact(dim, kind):
 @pytest.mark.parametrize("kind", ["dirichlet", "periodic", "neumann"])
 @pytest.mark.parametrize("sizes", [(16, 32, 64), (6, 12, 24)], ids=["2-D", "3-D"])
 def test_order_two_by_a_manufactured_solution(kind, sizes):
-    dim, errors = 2 if sizes[0] == 16 else 3, []
+    dim = 2 if sizes[0] == 16 else 3
+    errors = []
     K, u, f = exact(dim, kind)
     for n in sizes:
         grid = dp.Grid((n,) * dim, size=1.0, periodic=kind == "periodic")
@@ -100,7 +102,8 @@ def test_no_flux_through_closed_walls_at_any_angle():
 def test_a_tensor_that_is_a_number_gives_what_the_number_gives(shape):
     grid = stretched(*shape)
     for boundary in (dp.dirichlet, dp.neumann, {"x": (dp.dirichlet, dp.robin(1, 2))}):
-        solve, b = solver(grid, boundary), np.random.default_rng(0).standard_normal(shape)
+        solve = solver(grid, boundary)
+        b = np.random.default_rng(0).standard_normal(shape)
         K = 1.7 * np.eye(grid.dim).reshape(grid.dim, grid.dim, *[1] * grid.dim) * np.ones(shape)
         close(solve(K, b, 0.3), solve(1.7, b, 0.3), 1e-10)
 
@@ -132,9 +135,13 @@ def test_symmetric_and_positive_where_the_tensor_is(shape):
 @SHAPES
 @pytest.mark.parametrize("boundary", [dp.dirichlet, dp.neumann], ids=["dirichlet", "neumann"])
 def test_gradient_tangent_and_second_order_in_the_tensor(shape, boundary):
-    grid, rng = stretched(*shape), np.random.default_rng(2)
-    solve, K, b = solver(grid, boundary, rtol=1e-12), tensors(grid, skew=0.3), rng.standard_normal(shape)
-    point, direction = (K, b, 0.4), (rng.uniform(-0.1, 0.1, K.shape), rng.standard_normal(shape), 0.2)
+    grid = stretched(*shape)
+    rng = np.random.default_rng(2)
+    solve = solver(grid, boundary, rtol=1e-12)
+    K = tensors(grid, skew=0.3)
+    b = rng.standard_normal(shape)
+    point = (K, b, 0.4)
+    direction = (rng.uniform(-0.1, 0.1, K.shape), rng.standard_normal(shape), 0.2)
     loss = lambda t: anp.sum(anp.sin(2 * solve(*t)))
     gradient = lambda t: value_and_grad(loss)(t)[1]
     along = lambda h: tuple(p + h * d for p, d in zip(point, direction))
@@ -144,7 +151,8 @@ def test_gradient_tangent_and_second_order_in_the_tensor(shape, boundary):
     x, tangent = pushforward(lambda t: solve(*t), point, direction)
     assert np.sum(2 * np.cos(2 * x) * tangent) == pytest.approx(dot(gradient(point)), rel=1e-9)
     slope = lambda t: sum(anp.sum(g * d) for g, d in zip(gradient(t), direction))
-    reverse, forward = value_and_grad(slope)(point)[1], pushforward(gradient, point, direction)[1]
+    reverse = value_and_grad(slope)(point)[1]
+    forward = pushforward(gradient, point, direction)[1]
     for one, other, up, down in zip(reverse, forward, gradient(along(h)), gradient(along(-h))):
         close(one, other, 1e-8)
         close((up - down) / (2 * h), one, 1e-6)
@@ -152,8 +160,11 @@ def test_gradient_tangent_and_second_order_in_the_tensor(shape, boundary):
 
 def test_twin_in_autograd_on_a_periodic_grid():
     """The energy, written down with np.roll: its Hessian is the matrix, and autograd differentiates the dense solve."""
-    grid, rng = dp.Grid((5, 4), size=1.0, periodic=True), np.random.default_rng(0)
-    K, b, h = tensors(grid), rng.standard_normal(grid.shape), [1 / 5, 1 / 4]
+    grid = dp.Grid((5, 4), size=1.0, periodic=True)
+    rng = np.random.default_rng(0)
+    K = tensors(grid)
+    b = rng.standard_normal(grid.shape)
+    h = [1 / 5, 1 / 4]
 
     def matrix(K):
         columns = []
@@ -178,11 +189,13 @@ def test_twin_in_autograd_on_a_periodic_grid():
 
 def test_complex_tensors():
     grid = dp.Grid((5, 4), size=1.0)
-    solve, b = solver(grid, rtol=1e-12), np.random.default_rng(1).standard_normal((5, 4))
+    solve = solver(grid, rtol=1e-12)
+    b = np.random.default_rng(1).standard_normal((5, 4))
     K = tensors(grid) * (1 - 0.4j)
     assert np.linalg.solve(dense(solve, K), b.ravel()) == pytest.approx(solve(K, b).ravel(), rel=1e-9)
     loss = lambda K: anp.sum(anp.abs(solve(K, b)) ** 2)
-    slope, h = np.real(np.sum(value_and_grad(loss)(K)[1] * 1j * K)), 1e-6
+    slope = np.real(np.sum(value_and_grad(loss)(K)[1] * 1j * K))
+    h = 1e-6
     assert slope == pytest.approx((loss(K * (1 + h * 1j)) - loss(K * (1 - h * 1j))) / (2 * h), rel=1e-6)
 
 
@@ -190,7 +203,8 @@ def test_complex_tensors():
 
 
 def rotated(grid, ratio, angle=0.5):
-    c, s = np.cos(angle), np.sin(angle)
+    c = np.cos(angle)
+    s = np.sin(angle)
     matrix = np.array([[c, -s], [s, c]]) @ np.diag([1.0, ratio]) @ np.array([[c, s], [-s, c]])
     return matrix[..., None, None] * np.ones(grid.shape)
 
@@ -208,7 +222,9 @@ def test_rotated_anisotropy_solves_or_raises(method, ratio):
 
 def test_what_is_no_tensor_is_refused():
     grid = dp.Grid((4, 3))
-    solve, K, b = solver(grid), tensors(grid), np.ones((4, 3))
+    solve = solver(grid)
+    K = tensors(grid)
+    b = np.ones((4, 3))
     message = "k, a tensor for each cell, must have shape (2, 2, 4, 3), got (3, 3, 4, 3)"
     with pytest.raises(dp.errors.ShapeError, match=f"^{re.escape(message)}$"):
         solve(np.ones((3, 3, 4, 3)), b)
@@ -237,7 +253,9 @@ def test_what_is_no_tensor_is_refused():
 
 def test_kinds_of_arrays_and_units():
     grid = stretched(6, 5)
-    solve, K, b = solver(grid), tensors(grid), np.random.default_rng(0).standard_normal((6, 5))
+    solve = solver(grid)
+    K = tensors(grid)
+    b = np.random.default_rng(0).standard_normal((6, 5))
     x = solve(K, b)
     for given in (K.tolist(), np.asfortranarray(K), np.repeat(K, 2, axis=3)[..., ::2]):
         assert np.array_equal(solve(given, b), x)
@@ -257,13 +275,15 @@ def test_small_and_thin_grids():
         number = 2.0 * np.eye(grid.dim).reshape(grid.dim, grid.dim, *[1] * grid.dim) * np.ones(shape)
         b = np.sin(np.arange(grid.cells.size)).reshape(shape)
         assert solver(grid)(number, b, 0.5) == pytest.approx(solver(grid)(2.0, b, 0.5), rel=1e-12)
-    line, k = dp.Grid(5), 1.0 + np.arange(5.0)
+    line = dp.Grid(5)
+    k = 1.0 + np.arange(5.0)
     faces = np.array([1.0, 1.5, 2.5, 3.5, 4.5, 5.0])
     assert solver(line)(k[None, None], np.ones(5)) == pytest.approx(solver(line)(faces, np.ones(5)), rel=1e-12)
 
 
 def test_solids_and_singular_systems():
-    grid, rng = dp.Grid((6, 5), size=1.0), np.random.default_rng(0)
+    grid = dp.Grid((6, 5), size=1.0)
+    rng = np.random.default_rng(0)
     solid = np.zeros(grid.shape, dtype=bool)
     solid[2:4, 1:3] = True
     solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.neumann, solid), nullspace="project")
@@ -282,15 +302,19 @@ WALLS = {"x": dp.dirichlet, "y": (dp.neumann, dp.dirichlet)}
 
 def turned(grid, angle=0.5):
     """A tensor that varies."""
-    c, s, big = np.cos(angle), np.sin(angle), 3.0 + np.sin(np.arange(grid.cells.size)).reshape(grid.shape)
+    c = np.cos(angle)
+    s = np.sin(angle)
+    big = 3.0 + np.sin(np.arange(grid.cells.size)).reshape(grid.shape)
     return np.array([[c * c + big * s * s, (1 - big) * s * c], [(1 - big) * s * c, s * s + big * c * c]])
 
 
 @pytest.mark.parametrize("kind", ["number", "faces", "tensor"])
 def test_flux_operator_and_solve_are_one_term(kind, rng):
     grid = dp.Grid((6, 5), size=1.0)
-    D, G = dp.divergence(grid), dp.gradient(grid, WALLS)
-    solve, u = dp.elliptic_solver(D, G), rng.normal(size=grid.shape)
+    D = dp.divergence(grid)
+    G = dp.gradient(grid, WALLS)
+    solve = dp.elliptic_solver(D, G)
+    u = rng.normal(size=grid.shape)
     k = {"number": 0.7, "faces": 0.5 + rng.random(grid.faces.size), "tensor": turned(grid)}[kind]
     b = 2.0 * u - D(solve.flux(k, G(u)))
     np.testing.assert_allclose(solve.operator(k, 2.0)(u), b, rtol=1e-12, atol=1e-10)
@@ -302,14 +326,18 @@ def test_flux_operator_and_solve_are_one_term(kind, rng):
 
 def test_values_at_walls_beside_a_tensor():
     """A ramp is a steady state of a constant tensor: of second differences nothing is left, at walls too."""
-    grid, k = dp.Grid((7, 6), size=1.0), np.array([[2.0, 0.5], [0.5, 1.0]])[:, :, None, None] * np.ones((7, 6))
-    D, G, lift = dp.divergence(grid), dp.gradient(grid, dp.dirichlet), dp.lift(grid, dp.dirichlet)
+    grid = dp.Grid((7, 6), size=1.0)
+    k = np.array([[2.0, 0.5], [0.5, 1.0]])[:, :, None, None] * np.ones((7, 6))
+    D = dp.divergence(grid)
+    G = dp.gradient(grid, dp.dirichlet)
+    lift = dp.lift(grid, dp.dirichlet)
     ramp = lambda x, y: 1.0 + 2.0 * x - 3.0 * y
     walls = []
     for axis in (0, 1):
         x, y = grid.face_centres(axis)
         walls += [np.take(ramp(x, y), side, axis) for side in (0, -1)]
-    solve, values = dp.elliptic_solver(D, G), lift(lift.domain.join(*walls))
+    solve = dp.elliptic_solver(D, G)
+    values = lift(lift.domain.join(*walls))
     np.testing.assert_allclose(solve(k, D(solve.flux(k, values))), ramp(*grid.centres()), rtol=1e-9)
 
 
@@ -317,8 +345,12 @@ def test_values_at_walls_beside_a_tensor():
 def test_steps_with_a_tensor(method, rng):
     """As the stiff part they are those of the matrix; as a rate they have a derivative in every entry."""
     grid = dp.Grid((5, 4), size=1.0)
-    D, G = dp.divergence(grid), dp.gradient(grid, WALLS)
-    solve, u, k, dt = dp.elliptic_solver(D, G), rng.normal(size=grid.shape), turned(grid), 0.01
+    D = dp.divergence(grid)
+    G = dp.gradient(grid, WALLS)
+    solve = dp.elliptic_solver(D, G)
+    u = rng.normal(size=grid.shape)
+    k = turned(grid)
+    dt = 0.01
     L = -1.0 * solve.operator(k)
     stiff, matrix = (
         dp.stepper(method, None, dt, linear=op) for op in (L, dp.from_matrix(L.matrix, grid.cells, grid.cells))

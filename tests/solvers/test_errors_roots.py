@@ -7,8 +7,12 @@ import pytest
 import sparsedp as dp
 from sparsedp.autodiff.derivative import value_and_grad
 
-SHAPE, TYPE, VALUE = dp.errors.ShapeError, TypeError, ValueError
-FINITE, DERIVATIVE, FAILED = dp.errors.NonFiniteError, dp.errors.DerivativeError, dp.errors.ConvergenceError
+SHAPE = dp.errors.ShapeError
+TYPE = TypeError
+VALUE = ValueError
+FINITE = dp.errors.NonFiniteError
+DERIVATIVE = dp.errors.DerivativeError
+FAILED = dp.errors.ConvergenceError
 TWO = np.ones(2)
 BAND = np.diag(np.full(12, 3.0)) - np.diag(np.ones(11), 1)
 WRONG = BAND.copy()

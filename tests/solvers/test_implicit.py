@@ -47,10 +47,12 @@ def test_the_residual_is_zero_at_the_root(problem):
 
 def test_taylor_rates(problem):
     """Order 2 with the gradient and 3 with the Hessian; order 1 and 2 without them."""
-    loss, p = problem.loss(implicit(problem.residual)), problem.params
+    loss = problem.loss(implicit(problem.residual))
+    p = problem.params
     d = directions(p)
     value, g = value_and_grad(loss)(p)
-    slope, curvature = dot(g, d), dot(pushforward(lambda p: value_and_grad(loss)(p)[1], p, d)[1], d)
+    slope = dot(g, d)
+    curvature = dot(pushforward(lambda p: value_and_grad(loss)(p)[1], p, d)[1], d)
     change = lambda h: loss(moved(p, h, d)) - value
     assert rate(lambda h: change(h)) == pytest.approx(1.0, abs=0.1)
     assert rate(lambda h: change(h) - h * slope) >= 1.95
@@ -58,7 +60,8 @@ def test_taylor_rates(problem):
 
 
 def test_every_mode_of_second_order_agrees(problem):
-    loss, p = problem.loss(implicit(problem.residual)), problem.params
+    loss = problem.loss(implicit(problem.residual))
+    p = problem.params
     d = directions(p)
     slope = lambda p: value_and_grad(loss)(p)[1]
     along = lambda p: pushforward(loss, p, d)[1]
@@ -82,7 +85,8 @@ def test_gradient_is_the_dense_formula(name):
 def test_checker_agrees_and_sees_planted_mistakes(monkeypatch):
     """J for its transpose, and a second derivative that holds x still."""
     problem = PROBLEMS["advection 1-D"]()
-    loss, p = problem.loss(implicit(problem.residual)), problem.params
+    loss = problem.loss(implicit(problem.residual))
+    p = problem.params
     assert dp.check.gradient(loss, p, quick=True).verdict == "agrees"
     d = directions(p)
     curvature = lambda: dot(pushforward(lambda p: value_and_grad(loss)(p)[1], p, d)[1], d)
@@ -198,7 +202,9 @@ def full(x, p):
 
 @pytest.mark.parametrize(("residual", "kind", "most"), [(with_a_full_row, "vjp", 5), (full, "vjp", N)])
 def test_a_full_row_is_coloured_by_rows_and_a_full_jacobian_by_columns(residual, kind, most):
-    root, p, d = implicit(residual), np.ones(N), np.cos(np.arange(N))
+    root = implicit(residual)
+    p = np.ones(N)
+    d = np.cos(np.arange(N))
     loss = lambda p: anp.sum(root(np.ones(N), p) ** 2)
     value, slope = value_and_grad(loss)(p)
     with recording() as calls:
@@ -210,7 +216,8 @@ def test_a_full_row_is_coloured_by_rows_and_a_full_jacobian_by_columns(residual,
 def test_entries_that_probing_missed_are_found():
     """With p = 0 the pattern has no upper diagonal; the next call has one."""
     residual = lambda x, p: 2 * x + x**3 / 10 + p * anp.roll(x, -1) - 1.0
-    root, fresh = implicit(residual), implicit(residual)
+    root = implicit(residual)
+    fresh = implicit(residual)
     root(np.zeros(30), 0.0)
     assert "1 products" in str(root)
     for p in (0.5, 1.5):
@@ -223,10 +230,12 @@ def test_upwind_switches_are_met():
     """Each side of the switch is an entry, whatever the sign at the guess."""
 
     def residual(u, f):
-        back, ahead = u - anp.roll(u, 1), anp.roll(u, -1) - u
+        back = u - anp.roll(u, 1)
+        ahead = anp.roll(u, -1) - u
         return u + 0.3 * (anp.maximum(u, 0.0) * back + anp.minimum(u, 0.0) * ahead) - f
 
-    f, d = np.sin(np.arange(50) / 3.0 + 0.2), np.cos(np.arange(50))
+    f = np.sin(np.arange(50) / 3.0 + 0.2)
+    d = np.cos(np.arange(50))
     root = implicit(residual)
     loss = lambda f: anp.sum(root(np.zeros(50), f) ** 2)
     value, slope = value_and_grad(loss)(f)
@@ -253,7 +262,8 @@ def forms_of_jacobian():
 @pytest.mark.parametrize("form", ["array", "sparse", "Operator", "functions"])
 def test_a_jacobian_that_is_given(form):
     problem, given = forms_of_jacobian()
-    root, wanted = implicit(problem.residual, given[form]), implicit(problem.residual)
+    root = implicit(problem.residual, given[form])
+    wanted = implicit(problem.residual)
     with recording() as calls:
         slope = value_and_grad(problem.loss(root))(problem.params)[1]
     assert ("implicit(residual).jacobian", "jvp") not in calls

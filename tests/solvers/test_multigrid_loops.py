@@ -57,7 +57,8 @@ def prolongation(level):
     """The weights of black-box interpolation as a matrix."""
     from sparsedp.solvers.multigrid.cycle import Transfer, interpolation_weights
 
-    layout, coarse = level.grid, level.grid.coarse()
+    layout = level.grid
+    coarse = level.grid.coarse()
     transfer = Transfer(layout, coarse, interpolation_weights(level))
 
     def interpolated_field(values):
@@ -97,7 +98,8 @@ def test_restriction_is_the_transpose_of_interpolation(shape, periodic, rng):
 @pytest.mark.parametrize("shape, periodic", GRIDS)
 def test_the_cycle_is_symmetric_and_positive(shape, periodic, rng):
     engine = engine_of(shape, periodic, rng)
-    fine, layout = engine.finest, engine.padded_grid
+    fine = engine.finest
+    layout = engine.padded_grid
     held = layout.cells(engine.level.root_diagonal).reshape(-1) > 0.0
 
     def cycle(field):
@@ -117,7 +119,8 @@ def test_every_neighbour_is_where_the_layout_says(shape, rng):
     from sparsedp.solvers.multigrid.loops import PaddedGrid
 
     for periodic in product((False, True), repeat=len(shape)):
-        layout, values = PaddedGrid(shape, periodic), rng.standard_normal(shape)
+        layout = PaddedGrid(shape, periodic)
+        values = rng.standard_normal(shape)
         field = layout.zeros()
         layout.cells(field)[...] = values
         layout.fill_ghosts(field)

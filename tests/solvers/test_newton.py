@@ -81,8 +81,10 @@ def test_a_kink_without_a_root_is_not_taken_for_rounding():
 @pytest.mark.parametrize("name", ["diffusion 2-D", "advection 1-D", "fields in one array"])
 def test_krylov_gives_the_same_derivatives(name):
     problem = PROBLEMS[name]()
-    free, assembled = implicit(problem.residual, method="krylov"), implicit(problem.residual)
-    p, d = problem.params, directions(problem.params)
+    free = implicit(problem.residual, method="krylov")
+    assembled = implicit(problem.residual)
+    p = problem.params
+    d = directions(problem.params)
     slope = lambda p, root: value_and_grad(problem.loss(root))(p)[1]
     slopes = [slope(p, root) for root in (free, assembled)]
     hessian = [pushforward(partial(slope, root=root), p, d)[1] for root in (free, assembled)]
@@ -102,8 +104,10 @@ BARE = dp.differentiable("bare", lambda x: x**2 + np.sin(x), lambda nums, ans, x
 def test_a_residual_without_jvp_is_assembled_by_rows():
     op = dp.laplacian(dp.Grid(30, size=1.0), dp.dirichlet)
     residual = lambda smooth: lambda u, p: p[0] * smooth(u) - op(u) - p[1]
-    with_jvp, without = implicit(residual(lambda x: x**2 + anp.sin(x))), implicit(residual(bare))
-    p, d = (0.7, np.ones(30)), (0.3, np.cos(np.arange(30.0)))
+    with_jvp = implicit(residual(lambda x: x**2 + anp.sin(x)))
+    without = implicit(residual(bare))
+    p = (0.7, np.ones(30))
+    d = (0.3, np.cos(np.arange(30.0)))
 
     def derivatives(root):
         slope = lambda p: value_and_grad(lambda p: anp.sum(root(np.zeros(30), p) ** 2))(p)[1]
@@ -192,7 +196,8 @@ def test_a_failed_solve_hands_over_its_best_iterate():
     root = implicit(problem.residual, maxiter=2)
     with pytest.raises(ConvergenceError) as caught:
         root(problem.guess, problem.params)
-    error, start = caught.value, problem.residual(problem.guess, problem.params)
+    error = caught.value
+    start = problem.residual(problem.guess, problem.params)
     assert error.info.iterations == root.info.forward.iterations == 2 and error.info.status == "max_iterations"
     assert np.linalg.norm(problem.residual(error.best, problem.params)) < 0.2 * np.linalg.norm(start)
 
@@ -203,7 +208,8 @@ def test_a_traced_value_that_is_not_a_parameter_is_named():
 
 
 def test_a_root_that_is_not_isolated_has_no_derivative_unless_asked():
-    op, f = dp.laplacian(dp.Grid(10, size=1.0)), np.cos(np.pi * (np.arange(10) + 0.5) / 10)
+    op = dp.laplacian(dp.Grid(10, size=1.0))
+    f = np.cos(np.pi * (np.arange(10) + 0.5) / 10)
     loss = lambda root: lambda f: anp.sum(root(np.zeros(10), f) ** 2)
     refused, projected = (implicit(lambda u, f: op(u) - f, nullspace=word) for word in ("raise", "project"))
     assert loss(refused)(f) == pytest.approx(loss(projected)(f))

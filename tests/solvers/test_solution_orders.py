@@ -17,9 +17,11 @@ SIDES = {
 
 def error(n, dim, boundary, periodic, stretched):
     """L2 error of the solution of lap u = f on n^dim cells; constants do not count where they are free."""
-    grid, field = grid_of(n, dim, periodic, stretched), Field(periodic)
+    grid = grid_of(n, dim, periodic, stretched)
+    field = Field(periodic)
     boundary = {a: s for a, s in boundary.items() if a in grid.axes} if isinstance(boundary, dict) else boundary
-    exact, D = field(grid.centres()), dp.divergence(grid)
+    exact = field(grid.centres())
+    D = dp.divergence(grid)
     source = field.laplacian(grid, boundary)[1]
     source = source - D(dp.lift(grid, boundary)(field.wall_values(grid, boundary)))
     u = dp.inverse(D @ dp.gradient(grid, boundary), nullspace="project")(source)

@@ -58,7 +58,8 @@ ALL = {**PROBLEMS, **SINGULAR}
 def test_solution_and_adjoint_against_dense_algebra(problem, method, rng):
     takes(problem, method)
     op = PROBLEMS[problem]()
-    inv, matrix = dp.inverse(op, method), op.matrix.toarray()
+    inv = dp.inverse(op, method)
+    matrix = op.matrix.toarray()
     b, g = rng.standard_normal((2, *op.domain.shape))
     assert inv(b) == pytest.approx(np.linalg.solve(matrix, b.ravel()).reshape(b.shape), rel=1e-7, abs=1e-9)
     assert inv.T(g) == pytest.approx(np.linalg.solve(matrix.T, g.ravel()).reshape(b.shape), rel=1e-7, abs=1e-9)
@@ -72,7 +73,8 @@ def test_the_adjoint_is_the_transpose(problem, method, rng):
     op = ALL[problem]()
     inv = dp.inverse(op, method, nullspace="project")
     b, g = rng.standard_normal((2, *op.domain.shape)) + 1.0
-    x, y = inv(b), inv.T(g)
+    x = inv(b)
+    y = inv.T(g)
     assert abs(np.sum(x * g) - np.sum(b * y)) <= 1e-9 * np.linalg.norm(x) * np.linalg.norm(g)
     assert inv.info.forward.status.startswith("converged") and inv.info.adjoint.status.startswith("converged")
 
@@ -124,7 +126,9 @@ class Scripted(Engine):
 
     def __init__(self, op, error, word="", refines=True):
         self.inverse = np.linalg.inv(op.matrix.toarray())
-        self.error, self.word, self.calls = error, word, 0
+        self.error = error
+        self.word = word
+        self.calls = 0
         self.refines = refines
 
     def solve(self, b, goal, transposed):

@@ -14,8 +14,10 @@ from sparsedp.solvers import direct
 from sparsedp.solvers.nullspace import find_null_space
 from sparsedp.solvers.system import System
 
-SHAPE, FINITE = dp.errors.ShapeError, dp.errors.NonFiniteError
-FAILED, INCOMPATIBLE = dp.errors.ConvergenceError, dp.errors.IncompatibleError
+SHAPE = dp.errors.ShapeError
+FINITE = dp.errors.NonFiniteError
+FAILED = dp.errors.ConvergenceError
+INCOMPATIBLE = dp.errors.IncompatibleError
 
 
 class Case(NamedTuple):
@@ -237,8 +239,10 @@ SETTINGS = [
     ),
 ]
 
-D, G = dp.divergence(GRID), dp.gradient(GRID, dp.dirichlet)
-SOLVE, K = dp.elliptic_solver(D, G), np.ones(17)
+D = dp.divergence(GRID)
+G = dp.gradient(GRID, dp.dirichlet)
+SOLVE = dp.elliptic_solver(D, G)
+K = np.ones(17)
 BAD = np.where(np.arange(17) > 14, np.nan, 1.0)
 
 ELLIPTIC = [

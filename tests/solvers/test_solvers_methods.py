@@ -43,7 +43,8 @@ def test_the_transposed_cycle_is_the_transpose(cycle, sweeps, rng):
     backward = forward.T
     assert len(forward.levels) >= 4
     b, g = rng.standard_normal((2, 2500))
-    x, y = forward.cycle(b), backward.cycle(g)
+    x = forward.cycle(b)
+    y = backward.cycle(g)
     assert abs(x @ g - b @ y) <= 1e-14 * np.linalg.norm(x) * np.linalg.norm(g)
 
 
@@ -123,7 +124,8 @@ def test_anisotropy_and_aspect(boundary, rng):
 def test_an_operator_that_only_acts(rng):
     op = PROBLEMS["robin, stretched"]()
     bare = dp.from_functions(op, op.T, op.domain, op.codomain, name="black box")
-    inv, other = dp.inverse(bare), dp.inverse(op)
+    inv = dp.inverse(bare)
+    other = dp.inverse(op)
     assert inv.method == "krylov" and "conjugate gradients" in inv.info.hierarchy
     b = rng.standard_normal(op.domain.shape)
     assert inv(b) == pytest.approx(other(b), rel=1e-7, abs=1e-9)
@@ -151,7 +153,8 @@ def test_preconditioners(rng):
 def test_a_stale_preconditioner_costs_iterations_but_no_digits(rng):
     """A hierarchy of other coefficients: the true operator decides."""
     k = coefficients("inclusion", 32)
-    old, new = heterogeneous(np.ones((32, 32))), heterogeneous(k)
+    old = heterogeneous(np.ones((32, 32)))
+    new = heterogeneous(k)
     b = rng.standard_normal((32, 32))
     inv = dp.inverse(new, "krylov", preconditioner=dp.inverse(old))
     assert inv(b) == pytest.approx(dp.inverse(new)(b), rel=1e-6, abs=1e-9)
@@ -175,7 +178,9 @@ def test_obstacles_that_are_held_follow_from_the_fluid(method, nu, rng):
     solid = np.hypot(*(x - 0.4 for x in grid.centres())) < 0.25
     L = dp.laplacian(grid, {"x": (dp.dirichlet, dp.neumann)}, solid, dp.dirichlet)
     A = dp.identity(grid.cells) - nu * L
-    inv, dense, b = dp.inverse(A, method), A.matrix.toarray(), rng.standard_normal(grid.shape)
+    inv = dp.inverse(A, method)
+    dense = A.matrix.toarray()
+    b = rng.standard_normal(grid.shape)
     for solve, matrix in ((inv, dense), (inv.T, dense.T)):
         for data in (b, np.where(solid, b, 0.0), np.where(solid, 0.0, 1e-300 * b)):
             wanted = np.linalg.solve(matrix, data.ravel()).reshape(grid.shape)

@@ -18,7 +18,8 @@ EXPONENTS = [600, -600, 664, -664, 150, -150, 198, -198, 206, -206, -900]
 
 def scene(dim, coefficients):
     """(D, G, k on faces, data)."""
-    grid, rng = dp.Grid(SHAPES[dim], size=1.0), np.random.default_rng(dim)
+    grid = dp.Grid(SHAPES[dim], size=1.0)
+    rng = np.random.default_rng(dim)
     k = np.ones(grid.faces.size) if coefficients == "equal" else np.exp(rng.standard_normal(grid.faces.size))
     return dp.divergence(grid), dp.gradient(grid, dp.dirichlet), k, rng.standard_normal(grid.shape)
 
@@ -39,7 +40,8 @@ def entries(method, D, G, k):
 
 def solved(how, method, D, G, k, b):
     solve = how(method, D, G, k)
-    x, y = solve(b), solve.T(b)
+    x = solve(b)
+    y = solve.T(b)
     return x, y, [(info.iterations, info.status) for info in (solve.info.forward, solve.info.adjoint)]
 
 
@@ -88,7 +90,8 @@ def test_a_region_with_faint_data_has_digits_of_its_own(method, closed):
     """Two rooms that nothing links, with data of 1e-30 in one of them, forward and backward."""
     if method == "structured" and not kernels.compiled():
         pytest.skip("structured needs numba")
-    grid, rng = dp.Grid((12, 11), size=1.0), np.random.default_rng(3)
+    grid = dp.Grid((12, 11), size=1.0)
+    rng = np.random.default_rng(3)
     wall = np.zeros(grid.shape, dtype=bool)
     wall[6] = True
     op = -dp.laplacian(grid, dp.neumann if closed else {"x": dp.dirichlet}, wall)

@@ -127,7 +127,8 @@ def test_each_region_has_its_own_mean(method, count, rng):
 
 def test_noise_on_a_quiet_region_is_not_refused():
     """Rounding left by a divergence, on a region where nothing happens, is below the tolerance."""
-    grid, solid = dp.Grid((14, 9)), walled(3)[:14]
+    grid = dp.Grid((14, 9))
+    solid = walled(3)[:14]
     inv = dp.inverse(neumann(grid, solid))
     b = np.zeros(grid.shape)
     b[0, 0], b[0, 1], b[5, 0] = 1.0, -1.0, 1e-17
@@ -190,7 +191,8 @@ def test_a_null_vector_that_is_not_known_beforehand(method, turned, rng):
     assert space.count == 1
     assert np.max(np.abs(matrix @ space.right)) <= 1e-12 and np.max(np.abs(matrix.T @ space.left)) <= 1e-12
     b, g = rng.standard_normal((2, *op.domain.shape))
-    x, y = inv(b), inv.T(g)
+    x = inv(b)
+    y = inv.T(g)
     assert np.sum(x * g) == pytest.approx(np.sum(b * y), rel=1e-8)
     assert op(x) == pytest.approx(space.project(b.ravel()).reshape(b.shape), abs=1e-8)
     with pytest.raises(INCOMPATIBLE):
@@ -215,7 +217,8 @@ def test_labels_from_factors_are_those_from_entries():
     explicit = dp.from_matrix(op.matrix)
     assert System(op).components == System(explicit).components == (None, 1)
     along = dp.upwind(grid, "y")  # every line of cells along y is a component
-    one, other = System(along).components, System(dp.from_matrix(along.matrix)).components
+    one = System(along).components
+    other = System(dp.from_matrix(along.matrix)).components
     assert one[1] == other[1] == 24 == len(np.unique(one[0])) == len(np.unique(one[0] * 1000 + other[0]))
 
 
@@ -252,7 +255,8 @@ def test_an_equation_whose_own_unknown_is_not_used_is_refused(method, nullspace)
 
 
 def test_unused_unknowns_of_other_operators():
-    complex_entries, single = UNUSED.astype(complex), UNUSED.astype(np.float32)
+    complex_entries = UNUSED.astype(complex)
+    single = UNUSED.astype(np.float32)
     scaled = dp.from_matrix([[1.0, 0.0], [1.0, 1.0]]) @ dp.diagonal(dp.from_matrix(np.eye(2)).domain, [1e200, 1e-200])
     wind = dp.upwind(dp.Grid(5), "x").T
     for op in (dp.from_matrix(complex_entries), dp.from_matrix(single), -1e10 * scaled, wind):
@@ -270,7 +274,8 @@ def test_an_equation_is_left_out_by_a_mask():
     used[:, 2] = 1.0
     keep = np.array([True, True, False])
     space = dp.from_matrix(used).domain
-    b, g = np.array([1.0, 0.3, 0.0]), np.array([1.0, -2.0, 5.0])
+    b = np.array([1.0, 0.3, 0.0])
+    g = np.array([1.0, -2.0, 5.0])
     rows = dp.mask(space, keep) @ dp.from_matrix(UNUSED)
     for op in (rows, dp.from_matrix(used) @ dp.mask(space, keep), rows @ dp.mask(space, keep)):
         inv = dp.inverse(op)

@@ -51,7 +51,8 @@ def blocks(rng, dtype=float):
 
 def peeled(matrix, links):
     """The unknowns that are found one after the other, each of which only links to those found before."""
-    found, size = set(), matrix.shape[0]
+    found = set()
+    size = matrix.shape[0]
     while True:
         new = {i for i in range(size) if i not in found and set(np.flatnonzero(links[i])) - {i} <= found}
         if not new:
@@ -97,7 +98,8 @@ def test_every_method_solves_the_coupled_unknowns(method, rng):
     ring = dp.Grid((6, 7), size=1.0, periodic=(True, False))
     op = dp.upwind(ring, "x") + dp.upwind(ring, "y", 1, {"y": SIDES[1]})  # rings, one after the other
     matrix = sp.block_array([[chain(9), None], [random_entries(rng, (42, 9), 0.1), op.matrix]])
-    inv, b = dp.inverse(dp.from_matrix(matrix), method, rtol=1e-12, maxiter=5000), rng.standard_normal(51)
+    inv = dp.inverse(dp.from_matrix(matrix), method, rtol=1e-12, maxiter=5000)
+    b = rng.standard_normal(51)
     np.testing.assert_allclose(inv(b), np.linalg.solve(matrix.toarray(), b), rtol=1e-8)
     np.testing.assert_allclose(inv.T(b), np.linalg.solve(matrix.toarray().T, b), rtol=1e-8)
 
@@ -139,8 +141,13 @@ def test_upwind_sweeps(shape, signs, method, rng, both):
 def test_a_sweep_takes_no_longer_than_that_of_scipy(shape):
     """At most three times the processor's seconds of `spsolve_triangular`; the best of a few runs of each in turn."""
     op = sweep(shape, (1,) * len(shape))
-    matrix, b, inv = op.matrix, np.ones(shape), dp.inverse(op)
-    flat, ours, theirs, adjoint = b.reshape(-1), [], [], []
+    matrix = op.matrix
+    b = np.ones(shape)
+    inv = dp.inverse(op)
+    flat = b.reshape(-1)
+    ours = []
+    theirs = []
+    adjoint = []
     for _ in range(4):
         for seconds, act in (
             (ours, lambda: inv(b)),
@@ -172,7 +179,9 @@ def test_derivatives_in_the_entries(signs, rng):
     """Values, first and second derivatives of a sweep given by its entries, beside dense algebra."""
     matrix = sp.coo_array(sweep((4, 5), signs).matrix)
     solve = dp.matrix_solver.from_coo(matrix.row, matrix.col)
-    data, b, v = matrix.data, rng.standard_normal(20), rng.standard_normal(matrix.nnz)
+    data = matrix.data
+    b = rng.standard_normal(20)
+    v = rng.standard_normal(matrix.nnz)
     places = np.eye(400)[matrix.row * 20 + matrix.col]
 
     def twin(data):
@@ -197,7 +206,8 @@ def test_derivatives_in_the_wind(scheme, sign, rng):
     """Of an implicit step, beside a dense one of the same scheme."""
     grid = dp.Grid((5, 4), size=1.0)
     x, y = (dp.upwind(grid, axis, sign, {axis: SIDES[sign]}) for axis in "xy")
-    dense_x, dense_y = x.matrix.toarray(), y.matrix.toarray()
+    dense_x = x.matrix.toarray()
+    dense_y = y.matrix.toarray()
     u = rng.standard_normal(grid.shape)
     step = dp.stepper(scheme, lambda u, wind: -wind[0] * x(u) - wind[1] * y(u), 0.05)
 
@@ -205,7 +215,9 @@ def test_derivatives_in_the_wind(scheme, sign, rng):
         return anp.sum(anp.sin(step(u, wind)))
 
     def twin(wind):
-        A, one, flat = wind[0] * dense_x + wind[1] * dense_y, np.eye(20), u.reshape(-1)
+        A = wind[0] * dense_x + wind[1] * dense_y
+        one = np.eye(20)
+        flat = u.reshape(-1)
         if scheme == "backward_euler":
             return anp.sum(anp.sin(anp.linalg.solve(one + 0.05 * A, flat)))
         g = 2 - np.sqrt(2.0)
@@ -214,7 +226,8 @@ def test_derivatives_in_the_wind(scheme, sign, rng):
         last = (middle - (1 - g) ** 2 * flat) / (g * (2 - g))
         return anp.sum(anp.sin(anp.linalg.solve(one + d * A, last)))
 
-    wind, v = sign * np.array([1.0, 0.7]), np.array([0.3, -0.2])
+    wind = sign * np.array([1.0, 0.7])
+    v = np.array([0.3, -0.2])
     assert loss(wind) == pytest.approx(twin(wind), rel=1e-9)
     np.testing.assert_allclose(dp.grad(loss)(wind), dp.grad(twin)(wind), rtol=1e-7)
     assert dp.jvp(loss, wind, v)[1] == pytest.approx(dp.grad(twin)(wind) @ v, rel=1e-7)
@@ -244,7 +257,8 @@ def test_null_vectors_reach_into_the_triangular_parts(both, rng):
     assert space.count == 1
     np.testing.assert_allclose(space.right / space.right[2], right, atol=1e-15)
     np.testing.assert_allclose(space.left / space.left[2], left, atol=1e-15)
-    inv, b = dp.inverse(dp.from_matrix(matrix)), rng.standard_normal(5)
+    inv = dp.inverse(dp.from_matrix(matrix))
+    b = rng.standard_normal(5)
     for solve, A, r, l in ((inv, matrix, right, left), (inv.T, matrix.T, left, right)):
         data = b - r * (l @ b) / (l @ r)
         x = solve(data)
@@ -305,7 +319,8 @@ def test_coupled_unknowns_of_another_magnitude(rng):
     """The norm of the whole does not hide the scale of the coupled unknowns."""
     cycle = 1e-100 * np.array([[2.0, 1.0], [1.0, 3.0]])
     matrix = np.block([[cycle, np.zeros((2, 2))], [1e-100 * np.ones((2, 2)), np.diag([1.0, 4.0])]])
-    inv, x = dp.inverse(dp.from_matrix(matrix)), np.array([1.0, -2.0, 3.0, 0.5])
+    inv = dp.inverse(dp.from_matrix(matrix))
+    x = np.array([1.0, -2.0, 3.0, 0.5])
     np.testing.assert_allclose(inv(np.r_[matrix[:2] @ x, 0.0, 0.0])[:2], x[:2], rtol=1e-12)
 
 
@@ -328,7 +343,8 @@ def test_components_in_another_numbering_are_not_split(monkeypatch):
 
 def test_the_choice_is_about_the_coupled_unknowns():
     """A ring of 30 cells with a long inlet and a long outlet: 30 unknowns are factored."""
-    size, matrix = 30_060, chain(30_060).tolil()
+    size = 30_060
+    matrix = chain(30_060).tolil()
     matrix[15_015, 15_044] = -0.5
     inv = dp.inverse(dp.from_matrix(matrix.tocsr()))
     assert "30 coupled unknowns without a grid, 30030 others by substitution; up to 50000" in inv.reason
@@ -408,7 +424,8 @@ def test_blocks_are_factored_one_by_one(kind, dtype, rng):
     matrix = {"two fields": two_fields((9, 8), (1, -1)), "rings": lines(80), "sweep between cycles": between(rng)}[kind]
     matrix = (matrix * (1 + 0.3j) if dtype is complex else matrix).tocsr()
     order = rng.permutation(matrix.shape[0])
-    matrix, b = sp.csr_array(matrix[order][:, order]), rng.standard_normal(order.size).astype(dtype)
+    matrix = sp.csr_array(matrix[order][:, order])
+    b = rng.standard_normal(order.size).astype(dtype)
     inv = dp.inverse(dp.from_matrix(matrix), "direct")
     np.testing.assert_allclose(inv(b), np.linalg.solve(matrix.toarray(), b), rtol=1e-11, atol=1e-12)
     np.testing.assert_allclose(inv.T(b), np.linalg.solve(matrix.toarray().T, b), rtol=1e-11, atol=1e-12)

@@ -85,8 +85,11 @@ def test_complex_data(method, rng):
 def test_complex_data_leave_one_record_of_both_solves(adjoint, rng):
     op = PROBLEMS["dirichlet"]()
     inv = dp.inverse(op, "krylov")
-    solve, record = (inv.T if adjoint else inv), lambda: inv.info.adjoint if adjoint else inv.info.forward
-    b, c, none = rng.standard_normal(op.domain.shape), np.ones(op.domain.shape), np.zeros(op.domain.shape)
+    solve = inv.T if adjoint else inv
+    record = lambda: inv.info.adjoint if adjoint else inv.info.forward
+    b = rng.standard_normal(op.domain.shape)
+    c = np.ones(op.domain.shape)
+    none = np.zeros(op.domain.shape)
     solve(b)
     one = record()
     solve(c)
@@ -133,7 +136,8 @@ def test_complex_operators_take_the_direct_method_or_gmres(rng):
 @pytest.mark.parametrize("options", [{}, {"diff": "unrolled"}])
 def test_a_start_is_checked_by_name(options):
     inv = dp.inverse(PROBLEMS["dirichlet"](), "krylov", **options)
-    b, start = np.ones((26, 22)), np.zeros((26, 22))
+    b = np.ones((26, 22))
+    start = np.zeros((26, 22))
     start[3, 4] = np.nan
     name = re.escape(f"the start of {inv.name} must be finite, got 1 that are NaN or infinite, the first at (3, 4)")
     with pytest.raises(dp.errors.NonFiniteError, match=f"^{name}$"):
@@ -200,7 +204,8 @@ def test_what_is_composed_with_an_inverse_refuses_no_cotangent_either(wrap, rng)
 def test_projection_in_a_chain_has_second_derivatives(rng):
     """Divergences are compatible; the cotangents inside are projected, never refused."""
     grid = stretched(6, 5)
-    G, D = dp.gradient(grid), dp.divergence(grid)
+    G = dp.gradient(grid)
+    D = dp.divergence(grid)
     keep = dp.interior(grid)
     chain = G @ dp.inverse(D @ G) @ D @ keep
     v, d = rng.standard_normal((2, grid.faces.size))
@@ -213,10 +218,12 @@ def test_projection_in_a_chain_has_second_derivatives(rng):
 
 def used(method):
     """Make and differentiate solves; weak references to all that was set up."""
-    op, grid = ALL["wind"](), stretched(20, 19)
+    op = ALL["wind"]()
+    grid = stretched(20, 19)
     inv = dp.inverse(op, method)
     solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet), method)
-    b, k = op(np.ones((24, 25))), np.ones(grid.faces.size)
+    b = op(np.ones((24, 25)))
+    k = np.ones(grid.faces.size)
     value_and_grad(lambda b: anp.sum(inv(b, start=0 * b) ** 2 + inv(b)))(b)
     value_and_grad(lambda k: anp.sum(solve(k, grid.volumes)))(k + 1e-3 * np.arange(k.size))
     kept = (inv, inv.solver.engine, inv.solver.system, solve, solve._cache.last)
@@ -296,7 +303,8 @@ def test_a_small_right_hand_side_gives_the_same_bits(method, exponent):
 def test_a_coefficient_may_be_reused_before_the_pullback():
     grid = dp.Grid((6, 5), size=1.0)
     solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet))
-    k, b = 1.0 + np.arange(float(grid.faces.size)) / 9, np.cos(np.arange(30.0)).reshape(6, 5)
+    k = 1.0 + np.arange(float(grid.faces.size)) / 9
+    b = np.cos(np.arange(30.0)).reshape(6, 5)
     wanted = pullback(lambda b: solve(k, b), b)[1](b)
     pull = pullback(lambda b: solve(k, b), b)[1]
     k *= 5.0

@@ -28,7 +28,9 @@ def bratu_exact(x, lam):
 def burgers(n, nu):
     """Steady Burgers on (-1, 1): -tanh(x / 2 nu), whose values on the walls are the parameters."""
     grid = dp.Grid(n, size=2.0, origin=-1.0)
-    D, G, B = dp.divergence(grid), dp.gradient(grid, dp.dirichlet), dp.lift(grid, dp.dirichlet)
+    D = dp.divergence(grid)
+    G = dp.gradient(grid, dp.dirichlet)
+    B = dp.lift(grid, dp.dirichlet)
     A = dp.average(grid, dp.dirichlet)
 
     def residual(u, ends):
@@ -45,7 +47,8 @@ class Flow:
         self.grid = grid = dp.Grid((n, n), size=1.0)
         self.D, self.G, self.inside = dp.divergence(grid), dp.gradient(grid), dp.interior(grid)
         self.L, self.convect = dp.face_laplacian(grid), dp.convection(grid)
-        lid, hot = dp.face_lift(grid), {"x": dp.dirichlet}
+        lid = dp.face_lift(grid)
+        hot = {"x": dp.dirichlet}
         self.moving = lid(lid.domain.join(0.0, 0.0, 0.0, 1.0))
         self.pin = (np.arange(n * n) == 0.0).reshape(n, n)
         self.slope, self.mean, lift = dp.gradient(grid, hot), dp.average(grid), dp.lift(grid, hot)
@@ -104,7 +107,8 @@ def test_bratu_in_one_dimension():
 
 
 def test_burgers_in_one_dimension():
-    nu, errors = 0.1, []
+    nu = 0.1
+    errors = []
     ends = np.tanh(0.5 / nu) * np.array([1.0, -1.0])
     for n in (50, 100):
         grid, residual = burgers(n, nu)
@@ -121,13 +125,15 @@ def test_burgers_in_one_dimension():
 
 def test_a_fold_is_met_with_true_derivatives_or_an_error():
     """Bratu in 2-D by its height: lambda is an unknown of the tree, the fold is where it is largest."""
-    rate, middle = bratu(15, 2), (7, 7)
+    rate = bratu(15, 2)
+    middle = (7, 7)
 
     def by_height(x, height):
         return {"u": rate(x["u"], x["lam"]), "lam": x["u"][middle] - height}
 
     heights = np.arange(0.2, 2.0, 0.1)
-    state, branch = {"u": np.zeros((15, 15)), "lam": 1.0}, dp.implicit(by_height)
+    state = {"u": np.zeros((15, 15)), "lam": 1.0}
+    branch = dp.implicit(by_height)
     curve = []
     for height in heights:
         state = branch(state, height)
@@ -139,7 +145,8 @@ def test_a_fold_is_met_with_true_derivatives_or_an_error():
     for height in (0.5, 1.0, 1.35, 1.385):  # from far below to just below the fold
         state = branch(state, height)
         slope = dp.grad(lambda h, s=state: branch(s, h)["lam"])(height)
-        lam, ahead = float(state["lam"]), state["u"]
+        lam = float(state["lam"])
+        ahead = state["u"]
         assert dp.grad(lambda lam, u=ahead: find(u, lam)[middle])(lam) == pytest.approx(1 / slope, rel=1e-6)
     with pytest.raises(ConvergenceError, match=r"after \d+ Newton steps: relative residual .* for nearby parameters"):
         find(np.zeros((15, 15)), 7.0)
@@ -150,7 +157,8 @@ def test_a_fold_is_met_with_true_derivatives_or_an_error():
 
 def test_cavity_is_what_the_time_loop_comes_to():
     scene = Flow(12)
-    project, x = dp.projection(scene.grid), dp.steady(scene.cavity, scene.rest, 50.0)
+    project = dp.projection(scene.grid)
+    x = dp.steady(scene.cavity, scene.rest, 50.0)
     advance = lambda v, re: project(v + 0.02 * ((scene.L(v) + scene.moving) / re - scene.convect(v, v)))
     v = dp.rollout(advance, scene.rest["v"], 50.0, 3000)
     assert np.max(np.abs(x["v"] - v)) < 1e-9
@@ -188,7 +196,8 @@ def test_convection_at_32_takes_pseudo_time(monkeypatch):
 
 @pytest.mark.slow
 def test_cavity_and_convection_at_128():
-    scene, state = Flow(128), None
+    scene = Flow(128)
+    state = None
     for re, known in {  # Botella and Peyret, 1998; in between Ghia, Ghia and Shin, 1982
         100.0: (-0.2140417, 0.1795728, -0.2538030),
         400.0: (-0.32726, 0.30203, -0.44993),
@@ -206,13 +215,16 @@ def test_cavity_and_convection_at_128():
 def test_two_fields_against_a_dense_twin(rng):
     """State and gradient of a reaction, beside Newton's method and one transposed solve with full matrices."""
     L = dp.laplacian(dp.Grid(9, size=1.0), dp.dirichlet)
-    dense, weights, p = L.matrix.toarray(), rng.standard_normal(18), {"a": 3.0, "b": rng.uniform(0.5, 1.0, 9)}
+    dense = L.matrix.toarray()
+    weights = rng.standard_normal(18)
+    p = {"a": 3.0, "b": rng.uniform(0.5, 1.0, 9)}
 
     def residual(x, p):
         return [L(x[0]) + p["a"] * x[1] ** 2 + 1.0, 0.1 * L(x[1]) - x[0] * x[1] + p["b"]]
 
     def twin(x, p):
-        u, w = x[:9], x[9:]
+        u = x[:9]
+        w = x[9:]
         return anp.concatenate([anp.dot(dense, u) + p["a"] * w**2 + 1.0, 0.1 * anp.dot(dense, w) - u * w + p["b"]])
 
     x = np.zeros(18)
@@ -231,7 +243,9 @@ def test_two_fields_against_a_dense_twin(rng):
 def test_the_pattern_of_fields_on_one_grid_is_guessed(shape, periodic):
     """Velocity and pressure: every place that is not 0, from a few products for each kind of field."""
     grid = dp.Grid(shape, periodic=(periodic,) + (False,) * (len(shape) - 1))
-    L, G, D = dp.face_laplacian(grid), dp.gradient(grid), dp.divergence(grid)
+    L = dp.face_laplacian(grid)
+    G = dp.gradient(grid)
+    D = dp.divergence(grid)
     whole = sp.block_array([[L.matrix, G.matrix], [D.matrix, None]]).tocsr()
     products = []
 
@@ -246,7 +260,8 @@ def test_the_pattern_of_fields_on_one_grid_is_guessed(shape, periodic):
 
 def test_fields_are_paired_by_name():
     """Whatever the order in which a residual names them: the same bits, and each in its own units."""
-    scene, states = Flow(5), []
+    scene = Flow(5)
+    states = []
     for turned in (False, True):
         residual = lambda x, re, turned=turned: dict(list(scene.cavity(x, re).items())[:: -1 if turned else 1])
         loss = dp.value_and_grad(lambda re, residual=residual: anp.sum(dp.steady(residual, scene.rest, re)["v"] ** 3))
@@ -288,7 +303,8 @@ def test_kinds_of_guesses():
 
 def test_guesses_as_they_come_are_left_as_they_are(rng):
     """Fortran order, strides, read-only and broadcast arrays give the same bits."""
-    scene, plain = Flow(4), rng.standard_normal((4, 4))
+    scene = Flow(4)
+    plain = rng.standard_normal((4, 4))
     want = dp.steady(scene.cavity, scene.rest | {"p": plain.copy()}, 20.0)
     wide = np.repeat(plain, 2, axis=1)[:, ::2]
     still = np.broadcast_to(0.0, scene.rest["v"].shape)
@@ -352,13 +368,16 @@ def test_refusals():
 def test_a_jacobian_leans_on_the_factors_of_one_before(monkeypatch, most, own):
     """GMRES with the LU of a matrix nearby, an LU of its own where that does not do: the same root, the same bits."""
     grid, residual = burgers(200, 0.1)
-    ends, factored, made = np.array([1.0, -1.0]), [], preconditioners.direct_engine
+    ends = np.array([1.0, -1.0])
+    factored = []
+    made = preconditioners.direct_engine
     find = dp.implicit(residual)
     loss = dp.value_and_grad(lambda ends: anp.sum(find(-grid.centres()[0], ends) ** 2))
     exact = loss(ends)
     monkeypatch.setattr(preconditioners, "direct_engine", lambda system: factored.append(system) or made(system))
     monkeypatch.setattr(preconditioners, "MOST", most)
     monkeypatch.setattr(newton, "NEAR_FROM", 100)
-    found, again = loss(ends), loss(ends)
+    found = loss(ends)
+    again = loss(ends)
     assert found[0] == again[0] and np.array_equal(found[1], again[1]) and bool(factored) == own
     assert found[0] == pytest.approx(exact[0], rel=1e-9) and found[1] == pytest.approx(exact[1], rel=1e-6)

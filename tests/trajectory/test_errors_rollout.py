@@ -13,7 +13,10 @@ from sparsedp.errors import DerivativeError, GrowthWarning, NonFiniteError, Shap
 
 U = np.array([1.0, 2.0, 3.0])
 Pair = namedtuple("Pair", "ink wind")
-SHAPE, VALUE, FINITE, NONE = ShapeError, ValueError, NonFiniteError, DerivativeError
+SHAPE = ShapeError
+VALUE = ValueError
+FINITE = NonFiniteError
+NONE = DerivativeError
 
 
 def same(u, p):
@@ -352,7 +355,8 @@ def test_growth_warning():
 
 
 def test_inputs_are_not_changed():
-    state, params = {"a": U.copy(), "n": np.zeros(2, int)}, {"k": U.copy()}
+    state = {"a": U.copy(), "n": np.zeros(2, int)}
+    params = {"k": U.copy()}
     out = dp.rollout(lambda s, p: {"a": s["a"] * p["k"], "n": s["n"] + 1}, state, params, 2)
     assert np.array_equal(state["a"], U) and not state["n"].any() and np.array_equal(params["k"], U)
     assert np.array_equal(out["a"], U**3) and np.array_equal(out["n"], [2, 2])

@@ -15,11 +15,14 @@ from extremes import (  # isort: skip
 import sparsedp as dp
 from sparsedp.autodiff.derivative import pullback
 
-NONFINITE, SHAPE = dp.errors.NonFiniteError, dp.errors.ShapeError
+NONFINITE = dp.errors.NonFiniteError
+SHAPE = dp.errors.ShapeError
 GRID = stretched(13, 11)
 STEPS = 5
 IMPLICIT = dp.identity(GRID.cells) - 0.3 * dp.laplacian(GRID, {"x": dp.dirichlet})
-D, G, INSIDE = dp.divergence(GRID), dp.gradient(GRID), dp.interior(GRID)
+D = dp.divergence(GRID)
+G = dp.gradient(GRID)
+INSIDE = dp.interior(GRID)
 PRESSURE = dp.inverse(neumann(GRID))  # refuses data out of its range
 
 
@@ -106,7 +109,8 @@ def test_the_projection_everywhere(where, rng):
     """Regions, islands, solids, no cells, sizes: against dense algebra; twice is once; closed faces rest."""
     shape, solid = GEOMETRIES[where]
     grid = stretched(*shape)
-    P, matrix = dp.projection(grid, solid), projection("direct", grid, solid).matrix
+    P = dp.projection(grid, solid)
+    matrix = projection("direct", grid, solid).matrix
     v, g = rng.standard_normal((2, grid.faces.size))
     u = P(v)
     agree(u, matrix @ v, size=1.0)
@@ -120,7 +124,9 @@ def test_the_projection_everywhere(where, rng):
 def test_jumps_within_their_certificate(name, few, rng):
     """The true error of a gradient through loose solves is the one that `certify` estimates."""
     grid = dp.Grid((16, 14))
-    k, D, G = coefficient(name, grid), dp.divergence(grid), dp.gradient(grid, dp.dirichlet)
+    k = coefficient(name, grid)
+    D = dp.divergence(grid)
+    G = dp.gradient(grid, dp.dirichlet)
     u, w = rng.standard_normal((2, *grid.shape))
     memory = 48 * u.size + 24 * k.size if few else None
 
@@ -140,7 +146,8 @@ def test_jumps_within_their_certificate(name, few, rng):
 def test_ten_thousand_steps_of_a_projection(rng):
     """Within the memory of a hundred states nothing drifts, forward or backward."""
     grid = stretched(8, 7)
-    P, v = dp.projection(grid, walled()[:8, :7]), rng.standard_normal(stretched(8, 7).faces.size)
+    P = dp.projection(grid, walled()[:8, :7])
+    v = rng.standard_normal(stretched(8, 7).faces.size)
     run = lambda v: dp.rollout(lambda v, _: P(v), v, None, 10_000, memory=800 * v.size)
     value, pull = pullback(run, v)
     agree(value, P(v), 1e-10)

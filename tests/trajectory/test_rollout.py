@@ -20,7 +20,8 @@ MEMORY = [1216, 1296, 1376, 1456, 1536, 1700, "2 kB", 1e6]
 
 
 def step(state, params, force=0.0):
-    u, v = state["u"], state["v"]
+    u = state["u"]
+    v = state["v"]
     moved = v - 0.1 * u * anp.roll(u, 1) * params["c"] + 0.1 * force
     return {"v": moved, "u": u + 0.1 * anp.sin(params["k"] * v), "turn": state["turn"] + 1, "name": "a"}
 
@@ -55,7 +56,8 @@ def gap(one, other):
 @pytest.mark.parametrize("inputs", [None, FORCE])
 def test_value_and_gradient(inputs):
     x = (START, PARAMS, inputs)
-    wanted, found = dp.value_and_grad(by_loop)(x), dp.value_and_grad(by_rollout)(x)
+    wanted = dp.value_and_grad(by_loop)(x)
+    found = dp.value_and_grad(by_rollout)(x)
     assert wanted[0] == found[0]
     assert gap(wanted[1], found[1]) < 1e-14
     assert dp.check.gradient(by_rollout, x, quick=True)
@@ -179,7 +181,8 @@ def test_steps_run_once_where_their_tapes_fit():
     """Small tapes and large budgets: no step and no solve runs again, and no bit of the gradient changes."""
     grid = dp.Grid((6, 5), size=1.0)
     solve = dp.inverse(dp.identity(grid.cells) - 0.01 * dp.laplacian(grid))
-    u, calls = np.cos(np.arange(30.0)).reshape(grid.shape), []
+    u = np.cos(np.arange(30.0)).reshape(grid.shape)
+    calls = []
 
     def step(u, k):
         calls.append(1)
@@ -201,7 +204,10 @@ def test_steps_run_once_where_their_tapes_fit():
 @pytest.mark.parametrize("period", [0, 2, 4, 11])
 def test_steps_may_write_into_arrays_of_their_own(memory, period):
     """A tape that is kept must not see what a later step, or another rollout, writes there."""
-    start, own, order, n = np.linspace(0.5, 1.0, 30), np.empty(30), np.empty(30, int), 12
+    start = np.linspace(0.5, 1.0, 30)
+    own = np.empty(30)
+    order = np.empty(30, int)
+    n = 12
     forcing = np.cos(np.arange(n) % (period or n))
 
     def reused(u, p, x):
@@ -225,7 +231,8 @@ def test_steps_may_write_into_arrays_of_their_own(memory, period):
 
 
 def test_masked_arrays_are_refused():
-    u, end = np.arange(3.0), "; fill it first, and hand the mask along as an array of its own"
+    u = np.arange(3.0)
+    end = "; fill it first, and hand the mask along as an array of its own"
     masked = np.ma.masked_array(u, u > 1)
     for message, call in {
         "rollout takes plain arrays, got a masked array as state['b'][1]": lambda: (same, {"b": (u, masked)}, None),

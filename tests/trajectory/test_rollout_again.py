@@ -13,7 +13,8 @@ from sparsedp.autodiff.derivative import pullback, pushforward
 from sparsedp.errors import DerivativeError
 from sparsedp.trajectory.layout import fingerprint
 
-N, U = 12, np.array([0.3, -0.5, 0.8, 0.1])
+N = 12
+U = np.array([0.3, -0.5, 0.8, 0.1])
 BUDGETS = [None, *(16 + 2 * 8 * N + 32 * (slots + 4) for slots in (1, 2, 3, 4, 6, 9, 12, 200))]
 WEIGHTS = np.cos(np.arange(4.0 * (N + 1))).reshape(N + 1, 4)
 KEEPS = {
@@ -54,7 +55,8 @@ class Counted:
     """A step that knows how often it was called."""
 
     def __init__(self, name):
-        self.calls, self.of = 0, STEPS[name]
+        self.calls = 0
+        self.of = STEPS[name]
 
     def __call__(self, u, p, *inputs):
         self.calls += 1
@@ -62,7 +64,8 @@ class Counted:
 
 
 def by_loop(name, keep, inputs, truncate, p):
-    step, states = Counted(name), [U]
+    step = Counted(name)
+    states = [U]
     for i in range(N):
         u = autograd.tracer.getval(states[-1]) if truncate and i and (N - i) % truncate == 0 else states[-1]
         states.append(step(u, p, *([] if inputs is None else [inputs[i]])))
@@ -78,7 +81,8 @@ def test_refused_or_right(name, keep):
     for inputs, truncate in ((None, None), (0.1 * np.sin(np.arange(N)), None), (None, 5)):
         value, slope = autograd.value_and_grad(lambda p: by_loop(name, keep, inputs, truncate, p))(1.3)
         for memory in BUDGETS:
-            step, options = Counted(name), {"inputs": inputs, "memory": memory, "truncate": truncate}
+            step = Counted(name)
+            options = {"inputs": inputs, "memory": memory, "truncate": truncate}
             loss = lambda p: KEEPS[keep][1](dp.rollout(step, U, p, N, keep=KEEPS[keep][0], **options))
             try:
                 found = dp.value_and_grad(loss)(1.3)
@@ -151,10 +155,12 @@ def test_what_a_step_uses_is_changed_before_the_way_back(changed, keep):
     }
     for memory in BUDGETS[:1] + BUDGETS[2:]:
         for step in steps.values():
-            given, table = list(np.linspace(0.5, 1.5, 4 * N).reshape(N, 4)), {"k": 0.1}
+            given = list(np.linspace(0.5, 1.5, 4 * N).reshape(N, 4))
+            table = {"k": 0.1}
             given = [one.copy() for one in given]
             loss = lambda p: anp.sum(dp.rollout(step, (U, 0), p, N, memory=memory, keep=keep)[0])
-            wanted, pull = dp.value_and_grad(loss)(0.9)[1], pullback(loss, 0.9)[1]
+            wanted = dp.value_and_grad(loss)(0.9)[1]
+            pull = pullback(loss, 0.9)[1]
             table["k"] = 0.3 if changed == "a number" else 0.1
             for one in {"one array": given[3:4], "all arrays": given}.get(changed, []):
                 one[:] = 7.0
@@ -166,7 +172,8 @@ def test_what_a_step_uses_is_changed_before_the_way_back(changed, keep):
 
 def donor(name):
     """A step with a derivative of its own, whose forward is impure in many ways; and its calls."""
-    calls, own = [], np.empty(4)
+    calls = []
+    own = np.empty(4)
 
     def forward(u, p):
         calls.append(0)
@@ -275,7 +282,8 @@ def test_a_step_that_keeps_what_it_made_of_params_is_refused(memory):
 
 def stored_in(name):
     """A step of a state (field, number of the step), and what it stores."""
-    stored, at = {}, int(name.split()[-1])
+    stored = {}
+    at = int(name.split()[-1])
 
     def step(s, p):
         u, i = s

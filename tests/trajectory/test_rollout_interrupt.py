@@ -16,9 +16,11 @@ from sparsedp.autodiff import tape
 from sparsedp.autodiff.derivative import pullback, pushforward
 
 pytestmark = pytest.mark.filterwarnings("ignore::sparsedp.errors.BudgetWarning")
-N, GRID = 9, dp.Grid((6, 5), size=1.0, periodic=True)
+N = 9
+GRID = dp.Grid((6, 5), size=1.0, periodic=True)
 MOVE = dp.transport(GRID, velocity="cells")
-U, V = np.random.default_rng(0).random((6, 5)), 0.1 * np.random.default_rng(1).random((2, 6, 5))
+U = np.random.default_rng(0).random((6, 5))
+V = 0.1 * np.random.default_rng(1).random((2, 6, 5))
 WIDE = np.array(V[0])
 
 
@@ -26,7 +28,9 @@ class Stops:
     """A step that is interrupted at one of its calls."""
 
     def __init__(self, step, at=None):
-        self.step, self.at, self.calls = step, at, 0
+        self.step = step
+        self.at = at
+        self.calls = 0
 
     def __call__(self, u, p):
         self.calls += 1
@@ -90,10 +94,13 @@ def left_over():
 @pytest.mark.parametrize("name", LOOPS)
 def test_interrupted_at_any_call_of_the_step(name, job):
     step = Stops(LOOPS[name][0])
-    wanted, before, calls = told(job(name, step)), left_over(), step.calls
+    wanted = told(job(name, step))
+    before = left_over()
+    calls = step.calls
     assert calls >= N
     for at in range(1, calls + 1, 5 if job is product else 1):
-        step.calls, step.at = 0, at
+        step.calls = 0
+        step.at = at
         try:
             assert told(job(name, step)) == wanted and job is twice
         except KeyboardInterrupt:

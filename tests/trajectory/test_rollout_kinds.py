@@ -87,7 +87,8 @@ def test_every_kind_of_result(name, memory):
 
 @pytest.mark.parametrize("name", KEEPS)
 def test_second_order_of_every_kind(name, rng):
-    x, along = (U, 1.3), (rng.normal(size=3), 0.7)
+    x = (U, 1.3)
+    along = (rng.normal(size=3), 0.7)
 
     def product(f, reverse):
         def slope(x):
@@ -143,7 +144,8 @@ def test_no_step_one_and_two(n, keep, inputs, options):
             return 0.0 * k + n + 1.0 + anp.sum(states[0][0])
         return sum(anp.sum(s[0] ** 2) for s in (states if keep == "all" else states[-1:]))
 
-    x, along = (U, 1.3, force), (np.ones(3), 0.5, None if force is None else np.ones(n))
+    x = (U, 1.3, force)
+    along = (np.ones(3), 0.5, None if force is None else np.ones(n))
     slope = lambda f: lambda x: dp.value_and_grad(lambda x: f(*x))(x)[1]
     for way in (
         lambda f: f(*x),
@@ -176,7 +178,8 @@ def test_states_without_numbers(state, keep):
 
 def test_taylor_remainder_of_third_order(rng):
     """f(x + t d) - f - t f' - t^2/2 f'' falls as t^3."""
-    x, d = (U, 1.3), (rng.normal(size=3), 0.7)
+    x = (U, 1.3)
+    d = (rng.normal(size=3), 0.7)
     loss = lambda x: KEEPS["last"][0](*x, memory=160)
     slope = lambda x: dp.value_and_grad(loss)(x)[1]
     (value, g), (_, h) = dp.value_and_grad(loss)(x), pushforward(slope, x, d)
@@ -244,7 +247,8 @@ def test_truncation(k, memory, losses):
 
 @pytest.mark.parametrize("dtype", ["f4", "f8", "c16"])
 def test_dtypes(dtype):
-    u, p = (U + (0.2j if dtype == "c16" else 0)).astype(dtype), np.dtype(dtype).type(1.3)
+    u = (U + (0.2j if dtype == "c16" else 0)).astype(dtype)
+    p = np.dtype(dtype).type(1.3)
     size = lambda x: anp.sum(anp.abs(x) ** 2)
     value, slope = dp.value_and_grad(lambda x: size(dp.rollout(bend_twice, *x, 5)))((u, p))
     wanted, exact = dp.value_and_grad(lambda x: size(dp.rollout(bend_twice, *x, 5, memory=1e6)))((u, p))
@@ -277,7 +281,8 @@ def test_complex_and_real_fields_of_different_shapes(rng):
         return anp.stack([z for z, _ in states]), anp.stack([r for _, r in states])
 
     size = lambda z, r: anp.sum(anp.imag(z[-1]) ** 3) + anp.sum(anp.real(z[0]) ** 2 * r[-1])
-    x, along = (U + 0.2j, 0.7, 1.3), (U[::-1] - 1j * U, -0.3, 0.4)
+    x = (U + 0.2j, 0.7, 1.3)
+    along = (U[::-1] - 1j * U, -0.3, 0.4)
     for n in (0, 1, 3):
         ours = lambda x, n=n: size(*dp.rollout(step, x[:2], x[2], n, keep="all"))
         wanted = lambda x, n=n: size(*by_loop(*x, n))
@@ -313,7 +318,8 @@ def test_numbers_as_state_and_inputs():
 
 def test_numbers_of_python_keep_a_float32_state_in_nested_rollouts():
     """A step gets a number of Python as such: as float64 it would widen the state of the inner rollout."""
-    u, p = np.ones(3, np.float32), {"rate": 0.5}
+    u = np.ones(3, np.float32)
+    p = {"rate": 0.5}
     types = []
 
     def step(u, p):
@@ -374,7 +380,9 @@ def test_nothing_is_left_behind(memory):
 
 
 def test_an_argument_changed_after_the_run_is_not_seen():
-    u, p, f = U.copy(), np.array([1.3]), np.ones((4, 3))
+    u = U.copy()
+    p = np.array([1.3])
+    f = np.ones((4, 3))
     step = lambda u, p, f: u * p + 0.1 * f * u
     value, pull = pullback(lambda x: anp.sum(dp.rollout(step, x[0], x[1], 4, inputs=x[2])), (u, p, f))
     wanted = dp.value_and_grad(lambda x: anp.sum(dp.rollout(step, *x[:2], 4, inputs=x[2])))((u.copy(), p + 0, f + 0))
@@ -391,7 +399,8 @@ KINDS = {
     "seen backwards": lambda one, other, p: one[::-1],
     "sum": lambda one, other, p: one * anp.sum(other) * 0.3,
 }
-CONSTANT, FEW = np.array([0.2, 0.1, -0.4]), np.array([1.0, 0.0, -0.6])
+CONSTANT = np.array([0.2, 0.1, -0.4])
+FEW = np.array([1.0, 0.0, -0.6])
 
 
 @pytest.mark.filterwarnings("ignore:Output seems independent")

@@ -28,7 +28,8 @@ SCENES = {  # grid, arguments of transport, inflow
 def scene(name):
     grid, options, inflow = SCENES[name]
     move = dp.transport(grid, **options)
-    u, v = RNG.standard_normal(move.space.shape), 0.4 * RNG.standard_normal(move.setting.velocity_shapes[0])
+    u = RNG.standard_normal(move.space.shape)
+    v = 0.4 * RNG.standard_normal(move.setting.velocity_shapes[0])
     return (lambda u, v: move(u, v, 0.15, inflow)), u, v, RNG.standard_normal(u.shape)
 
 
@@ -39,7 +40,8 @@ def test_steps_of_transport_in_a_rollout_have_the_bits_of_a_budget_and_the_value
     step, u, v, weights = scene(name)
 
     def loss(x, **options):
-        a, b = x.get("u", u), x.get("v", v)
+        a = x.get("u", u)
+        b = x.get("v", v)
         end = dp.rollout(step, a, b, N, **options)
         return anp.sum(weights * end * end)  # in NumPy 1.26 the bits of a power are others on a tape
 
@@ -96,7 +98,8 @@ def test_single_precision_and_other_kinds_take_the_way_by_single_steps():
 
 def test_the_loop_stops_at_the_step_that_goes_wrong():
     move = dp.transport(dp.Grid(8, periodic=True))
-    u, v = np.arange(8.0), np.full(8, 1.5)
+    u = np.arange(8.0)
+    v = np.full(8, 1.5)
     with pytest.raises(UnstableStepError, match="dt = 1 is too large at 8 of 8 points"):
         dp.rollout(lambda u, v: move(u, v, 1.0), u, v, 5)
     with pytest.raises(NonFiniteError, match="cannot represent the result"):
@@ -149,12 +152,14 @@ STEPS = {f.__name__: f for f in (bend, now_and_then, turned, forgetful, constant
 @pytest.mark.parametrize("n", [1, 2, 9, 40])
 def test_linked_steps_have_the_bits_of_single_steps(name, n):
     def loss(x, **options):
-        u, p = x.get("u", WHERE), {"rate": x.get("rate", 0.7), "shift": x.get("shift", NUMBERS), "flag": None}
+        u = x.get("u", WHERE)
+        p = {"rate": x.get("rate", 0.7), "shift": x.get("shift", NUMBERS), "flag": None}
         end = dp.rollout(STEPS[name], u, p, n, **options)
         return anp.sum(NUMBERS * end * end)
 
     for x in ({"u": WHERE}, {"rate": 0.7, "shift": NUMBERS}, {"u": WHERE, "rate": 0.7, "shift": NUMBERS}):
-        free, tight = [], []
+        free = []
+        tight = []
         value, g = dp.value_and_grad(lambda x, free=free: loss(x, record=free.append))(x)
         other, h = dp.value_and_grad(lambda x, tight=tight: loss(x, memory=1200, record=tight.append))(x)
         assert value == other == loss(x)
@@ -223,6 +228,7 @@ def _chain(step, u, p, n):
 
 def test_two_pullbacks_of_one_linked_run():
     value, pull = pullback(lambda x: dp.rollout(lambda u, p: u + p * anp.sin(u), x[0], x[1], 20), (WHERE, NUMBERS))
-    first, second = pull(np.ones(6)), pull(2 * np.ones(6))
+    first = pull(np.ones(6))
+    second = pull(2 * np.ones(6))
     assert all(np.array_equal(2 * a, b) for a, b in zip(first, second, strict=True))
     assert all(np.array_equal(a, b) for a, b in zip(first, pull(np.ones(6)), strict=True))

@@ -51,8 +51,10 @@ RULE = shift()
 KINDS = pytest.mark.parametrize("step", [RULE, plain], ids=["rule", "formula"])
 
 
-N, CELLS = 40, 12
-U0, C0 = np.sin(np.arange(CELLS)), 0.4 + 0.2 * np.cos(np.arange(CELLS))
+N = 40
+CELLS = 12
+U0 = np.sin(np.arange(CELLS))
+C0 = 0.4 + 0.2 * np.cos(np.arange(CELLS))
 WEIGHTS = np.cos(np.arange(CELLS * (N + 1.0))).reshape(N + 1, CELLS)
 BUDGETS = [CELLS * 8 * k for k in (7, 8, 9, 11, 17, 46)]
 
@@ -82,7 +84,8 @@ def test_a_wrong_rule_is_caught_by_the_check():
 
 
 def test_an_input_is_never_overwritten():
-    u, c = U0.copy(), C0.copy()
+    u = U0.copy()
+    c = C0.copy()
     end = dp.rollout(RULE, u, c, 5)
     assert np.array_equal(u, U0) and np.array_equal(c, C0)
     kept = end.copy()
@@ -129,11 +132,13 @@ def test_steps_are_run_again_as_rarely_as_possible(step, slots, n):
 
 def test_many_steps_without_recursion():
     """10^5 steps of 16^2 cells, 24 states kept."""
-    u, c = np.random.default_rng(0).random((16, 16)), np.full((16, 16), 0.3)
+    u = np.random.default_rng(0).random((16, 16))
+    c = np.full((16, 16), 0.3)
     kept = slots_within(31 * 2048, 2048, 100_000, 2 * 2048)
     assert kept == 24 and advances(100_000, kept) < 5 * 100_000 - 1
     runs: list = []
-    step, n = RULE, 2_000  # the test itself is shorter; the benchmark runs all
+    step = RULE  # the test itself is shorter; the benchmark runs all
+    n = 2_000
     slope = dp.value_and_grad(lambda u: anp.sum(dp.rollout(step, u, c, n, memory=31 * 2048, record=runs.append)))(u)[1]
     assert np.max(np.abs(slope - 1)) < 1e-9 and runs[-1].steps == n
 
@@ -155,7 +160,8 @@ def peak(call):
 def test_peak_is_the_trajectory(step, keep, monkeypatch):
     """Where tapes have no room beside it."""
     monkeypatch.setattr("sparsedp.trajectory.rollout.ROOM", 2**22)
-    u, n = np.random.default_rng(0).random(20_000), 100
+    u = np.random.default_rng(0).random(20_000)
+    n = 100
     c = np.full(u.shape, 0.5)
     weights = np.ones(()) if keep == "last" else np.ones((n + 1, 1))
 
@@ -171,7 +177,8 @@ def test_peak_is_the_trajectory(step, keep, monkeypatch):
 @KINDS
 @pytest.mark.parametrize("states", [7, 12, *(pytest.param(states, marks=pytest.mark.whole) for states in (9, 24))])
 def test_peak_under_a_budget(step, states):
-    u, n = np.random.default_rng(0).random(20_000), 60
+    u = np.random.default_rng(0).random(20_000)
+    n = 60
     c = np.full(u.shape, 0.5)
     gradient = lambda: dp.value_and_grad(lambda x: anp.sum(dp.rollout(step, *x, n, memory=states * u.nbytes)))((u, c))
     gradient()
@@ -191,12 +198,16 @@ SCALED = Rule("scaled", lambda u, c: u * c, lambda nums, ans, u, c: lambda g: tu
 @pytest.mark.parametrize("states", [8, 9, 12, 16, 24, 80])
 def test_the_budget_is_what_a_step_without_needs_of_its_own_takes(states, params, keep):
     """All of it, the result and its cotangent included; the states that are kept fill it."""
-    n, rng, size = 60, np.random.default_rng(0), 400_000
+    n = 60
+    rng = np.random.default_rng(0)
+    size = 400_000
     u = rng.random(size // 8)
-    v, weights = rng.random(u.shape), np.cos(u)
+    v = rng.random(u.shape)
+    weights = np.cos(u)
     for given in (u, v, weights):  # nobody writes into them: the tape of the loss keeps no copies beside the rollout
         given.flags.writeable = False
-    step, runs = SCALED, []
+    step = SCALED
+    runs = []
 
     def total(u, v):
         options = {"keep": lambda i, u: anp.sum(u[:3])} if keep == "each" else {}
@@ -214,7 +225,9 @@ def test_the_budget_is_what_a_step_without_needs_of_its_own_takes(states, params
 
 def test_a_budget_that_a_little_more_would_help_says_so():
     """100 steps: the numbers of runs are those of the formula, the least budget is found by trying."""
-    n, size, runs = 100, U0.nbytes, []
+    n = 100
+    size = U0.nbytes
+    runs = []
     tight = lambda memory: dp.value_and_grad(
         lambda u: anp.sum(dp.rollout(RULE, u, C0, n, memory=memory, record=runs.append))
     )(U0)
@@ -227,7 +240,8 @@ def test_a_budget_that_a_little_more_would_help_says_so():
     tight(7 * size)
     assert runs[-1].factor == 8.46
     for slots in range(1, 101):
-        beside, memory = size, (slots + 5 + min(5, slots // 15)) * size
+        beside = size
+        memory = (slots + 5 + min(5, slots // 15)) * size
         told = budget_within_reach(memory, size, n, beside)
         runs_of = lambda memory: advances(n, slots_within(memory, size, n, beside)) + 1
         found = [more for more in range(memory, 2 * memory + 1, size) if runs_of(more) <= runs_of(memory) / 3]
@@ -237,7 +251,8 @@ def test_a_budget_that_a_little_more_would_help_says_so():
 def test_all_states_handed_out_are_states_kept():
     """Whatever the budget: no step is run again."""
     for step in (RULE, plain):
-        runs, wanted = [], dp.value_and_grad(lambda x: loss(step, x, "all"))((U0, C0))
+        runs = []
+        wanted = dp.value_and_grad(lambda x: loss(step, x, "all"))((U0, C0))
         value, slopes = dp.value_and_grad(lambda x: loss(step, x, "all", memory=7 * U0.nbytes, record=runs.append))(
             (U0, C0)
         )
@@ -248,13 +263,15 @@ def test_all_states_handed_out_are_states_kept():
 @pytest.mark.slow
 @pytest.mark.parametrize("memory", ["1 GB", "100 MB"])
 def test_ten_thousand_steps_at_256(memory):
-    u, c = np.random.default_rng(0).random((256, 256)), np.full((256, 256), 0.4)
+    u = np.random.default_rng(0).random((256, 256))
+    c = np.full((256, 256), 0.4)
 
     def gradient(n, memory):
         return dp.value_and_grad(lambda x: anp.sum(dp.rollout(RULE, *x, n, memory=memory) ** 2))((u, c))
 
     assert peak(lambda: gradient(10_000, memory)) < (1.0 if memory == "1 GB" else 0.1) * 1e9
-    short, full = gradient(1000, memory), gradient(1000, None)
+    short = gradient(1000, memory)
+    full = gradient(1000, None)
     assert all(a.tobytes() == b.tobytes() for a, b in zip(short[1], full[1]))
 
 
@@ -262,10 +279,14 @@ def test_ten_thousand_steps_at_256(memory):
 @pytest.mark.parametrize("memory", [None, "1 MB"])
 def test_a_hundred_thousand_steps(memory):
     """16^2 cells, no recursion trouble; the wind turns once, mass stays, and the gradient of the mass says so."""
-    grid, n = dp.Grid((16, 16), size=1.0, periodic=True), 100_000
-    move, x = dp.transport(grid, velocity="cells"), grid.centres()[0]
+    grid = dp.Grid((16, 16), size=1.0, periodic=True)
+    n = 100_000
+    move = dp.transport(grid, velocity="cells")
+    x = grid.centres()[0]
     step = lambda u, v: move(u, v, 1e-3)
-    u, v, runs = 1.0 + np.sin(2 * np.pi * x), np.stack([np.ones(x.shape), 0.3 * np.ones(x.shape)]), []
+    u = 1.0 + np.sin(2 * np.pi * x)
+    v = np.stack([np.ones(x.shape), 0.3 * np.ones(x.shape)])
+    runs = []
     loss = lambda p: anp.sum(dp.rollout(step, *p, n, memory=memory, record=runs.append))
     value, slopes = dp.value_and_grad(loss)((u, v))
     assert value == pytest.approx(256.0, rel=1e-10) and np.max(np.abs(slopes[0] - 1.0)) < 1e-10
@@ -275,7 +296,8 @@ def test_a_hundred_thousand_steps(memory):
 def test_steps_that_solve_run_once_where_no_budget_is_given():
     """Their tapes are kept beyond those of other steps: here 60 of more than 130 kB each."""
     grid = dp.Grid((128, 128), size=1.0)
-    step, u = dp.stepper("crank_nicolson", dp.laplacian(grid, dp.dirichlet), 1e-4), np.sin(3 * grid.centres()[0])
+    step = dp.stepper("crank_nicolson", dp.laplacian(grid, dp.dirichlet), 1e-4)
+    u = np.sin(3 * grid.centres()[0])
     with recording() as calls:
         dp.value_and_grad(lambda u: anp.sum(dp.rollout(step, u, None, 60) ** 2))(u)
     assert calls["stepper(crank_nicolson)", "solve"] == 60
@@ -284,7 +306,9 @@ def test_steps_that_solve_run_once_where_no_budget_is_given():
 def test_constants_of_a_step_leave_its_tapes_where_they_are():
     """The velocity, 4 MB, and the weights are the same for all steps: no tape holds more than the states do."""
     grid = dp.Grid((512, 512), periodic=True)
-    move, u, v = dp.transport(grid), np.sin(grid.centres()[0]), 0.1 * np.ones(grid.faces.size)
+    move = dp.transport(grid)
+    u = np.sin(grid.centres()[0])
+    v = 0.1 * np.ones(grid.faces.size)
     with recording() as calls:
         dp.value_and_grad(lambda u: anp.sum(dp.rollout(lambda u, v: move(u, v, 1.0), u, v, 5) ** 2))(u)
     assert calls["transport upwind", "forward"] == 5
@@ -294,7 +318,8 @@ def test_constants_of_a_step_leave_its_tapes_where_they_are():
 def test_tapes_of_large_steps_keep_to_their_room(given, monkeypatch):
     """A step that makes arrays far larger than the state, as between all pairs of bodies: few of them stay on tapes."""
     monkeypatch.setattr("sparsedp.trajectory.rollout.ROOM", 2**24)
-    x, pairs = np.random.default_rng(0).random((120, 3)), 120**2 * 8
+    x = np.random.default_rng(0).random((120, 3))
+    pairs = 120**2 * 8
 
     def step(x, strength):
         apart = x[:, None] - x[None]

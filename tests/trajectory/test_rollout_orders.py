@@ -10,8 +10,10 @@ from sparsedp.autodiff.derivative import pushforward
 from sparsedp.autodiff.tape import plain
 
 pytestmark = pytest.mark.filterwarnings("ignore::sparsedp.errors.BudgetWarning")
-N, U = 7, np.array([0.3, -0.5, 0.8])
-FORCE, WEIGHTS = np.cos(np.arange(3.0 * N)).reshape(N, 3), np.cos(np.arange(3.0 * (N + 1))).reshape(N + 1, 3)
+N = 7
+U = np.array([0.3, -0.5, 0.8])
+FORCE = np.cos(np.arange(3.0 * N)).reshape(N, 3)
+WEIGHTS = np.cos(np.arange(3.0 * (N + 1))).reshape(N + 1, 3)
 
 
 def own_pull(nums, ans, u, p):
@@ -106,7 +108,8 @@ def test_every_order_is_that_of_the_loop(name, order, options, rng):
 
 
 def test_a_derivative_forward_runs_each_step_once_and_keeps_one_state():
-    calls, runs = [], []
+    calls = []
+    runs = []
     step = lambda u, p: calls.append(0) or u * p
     pushforward(lambda p: anp.sum(dp.rollout(step, U, p, N, record=runs.append)), 0.9, 1.0)
     assert len(calls) == N and [(run.direction, run.kept) for run in runs] == [("forward", 0)]

@@ -78,7 +78,8 @@ class Linear(Ingredient):
 
     def twin(self, box):
         scaled = matrix(box, self.expression) / bound(box, self.expression)
-        shape, result_shape = box.field_shape(self.source), box.field_shape(self.target)
+        shape = box.field_shape(self.source)
+        result_shape = box.field_shape(self.target)
         if not self.keep:
             return lambda u, p: flat_product(scaled, u, shape, result_shape)
         return lambda u, p: self.keep * u + flat_product(scaled, u, shape, result_shape)
@@ -99,18 +100,19 @@ class WallValues(OnCells):
         return bound(box, ("laplacian", self.sides, None, "neumann"))
 
     def library(self, box):
-        grid, scale = box.grid(), self._scale(box)
-        D, G, B = (
-            dp.divergence(grid),
-            dp.gradient(grid, boundary(box, self.sides)),
-            dp.lift(grid, boundary(box, self.sides)),
-        )
+        grid = box.grid()
+        scale = self._scale(box)
+        D = dp.divergence(grid)
+        G = dp.gradient(grid, boundary(box, self.sides))
+        B = dp.lift(grid, boundary(box, self.sides))
         return lambda u, p: u + D(G(u) + B(p["values"])) / scale
 
     def twin(self, box):
-        table, scale = dense(box, self.sides), self._scale(box)
+        table = dense(box, self.sides)
+        scale = self._scale(box)
         D = table.divergence()
-        laplacian, lifted = D @ table.gradient() / scale, D @ table.lift() / scale
+        laplacian = D @ table.gradient() / scale
+        lifted = D @ table.lift() / scale
 
         def act(u, p):
             values = anp.reshape(anp.dot(lifted, p["values"]), box.shape)
@@ -152,7 +154,8 @@ class Solve(Ingredient):
         system = matrix(box, self._system())
         inverse = np.linalg.inv(system) if self.shift else inverse_without_mean(system, cell_volumes(box))
         inverse = inverse.T if self.transposed else inverse
-        weight, shape = self.shift or 1.0, box.field_shape(self.source)
+        weight = self.shift or 1.0
+        shape = box.field_shape(self.source)
         return lambda u, p: flat_product(weight * inverse, u, shape, shape)
 
 
@@ -219,11 +222,14 @@ class Elliptic(OnCells):
 
     def twin(self, box):
         table = dense(box, self.sides, self.solid)
-        D, G, plain = table.divergence(), table.gradient(), dense(box)
+        D = table.divergence()
+        G = table.gradient()
+        plain = dense(box)
         average = plain.average()
         pairs, shares = face_neighbours(plain)
         volumes = cell_volumes(box)
-        size, faces = len(volumes), D.shape[1]
+        size = len(volumes)
+        faces = D.shape[1]
         singular = self.shift == "none" and np.linalg.cond(D @ G) > 1e12
         without_mean = np.eye(size) - np.outer(np.ones(size), volumes) / volumes.sum()
 
@@ -256,11 +262,13 @@ def face_neighbours(table):
 
     At a wall both are the cell beside it.
     """
-    pairs, shares = [], []
+    pairs = []
+    shares = []
     for axis, place in table.faces:
         low, high = table.beside(axis, place)
         low, high = (high if low is None else low), (low if high is None else high)
-        low_width, high_width = table.width(low, axis), table.width(high, axis)
+        low_width = table.width(low, axis)
+        high_width = table.width(high, axis)
         pairs.append((table.cells[low], table.cells[high]))
         shares.append(low_width / (low_width + high_width))
     return np.array(pairs), np.array(shares)
@@ -422,13 +430,21 @@ class Diffusion(OnCells):
         return 5 * bound(box, ("laplacian", self.sides, None, "neumann"))
 
     def library(self, box):
-        grid, sides, scale = box.grid(), boundary(box, self.sides), self._scale(box)
-        D, G, A = dp.divergence(grid), dp.gradient(grid, sides, obstacle(box, self.solid)), dp.average(grid, sides)
+        grid = box.grid()
+        sides = boundary(box, self.sides)
+        scale = self._scale(box)
+        D = dp.divergence(grid)
+        G = dp.gradient(grid, sides, obstacle(box, self.solid))
+        A = dp.average(grid, sides)
         return lambda u, p: u + D((1 + anp.sin(A(u)) ** 2) * p["k"] * G(u)) / scale
 
     def twin(self, box):
-        table, scale, faces = dense(box, self.sides, self.solid), self._scale(box), box.field_shape("faces")
-        D, G, A = table.divergence() / scale, table.gradient(), table.average()
+        table = dense(box, self.sides, self.solid)
+        scale = self._scale(box)
+        faces = box.field_shape("faces")
+        D = table.divergence() / scale
+        G = table.gradient()
+        A = table.average()
 
         def act(u, p):
             flow = (1 + anp.sin(flat_product(A, u, box.shape, faces)) ** 2) * p["k"]
@@ -549,7 +565,9 @@ def convection_factors(box, sides, solid):
     table = dense(box, sides, solid)
     units = np.eye(len(table.faces))
     free = table.flags((dp.outflow,))
-    carried, carrying, balance = [], [], []
+    carried = []
+    carrying = []
+    balance = []
 
     def add(row, weight, carried_row, carrying_row):
         carried.append(carried_row)
@@ -586,7 +604,8 @@ def mean_of_two(table, axis, node, component, place, units):
 
     Beyond a wall the value is 0 (no_slip) or that of the last cell (free_slip).
     """
-    cells, widths = table.shape[axis], table.h[axis]
+    cells = table.shape[axis]
+    widths = table.h[axis]
 
     def weights(index):
         at = at_index(place, axis, index)
@@ -595,9 +614,11 @@ def mean_of_two(table, axis, node, component, place, units):
         return units[table.faces[component, at]]
 
     if table.periodic[axis]:
-        low, high = (node - 1) % cells, node % cells
+        low = (node - 1) % cells
+        high = node % cells
     elif 0 < node < cells:
-        low, high = node - 1, node
+        low = node - 1
+        high = node
     else:
         side = int(node > 0)
         sticks = table.sides[axis][side] in (dp.no_slip, dp.inflow)
@@ -707,7 +728,9 @@ def tr_bdf2(equation, u, h):
 
 
 def imex(equation, u, h):
-    d, e, z = 1 - np.sqrt(0.5), -np.sqrt(0.5), h * equation.p["nu"]
+    d = 1 - np.sqrt(0.5)
+    e = -np.sqrt(0.5)
+    z = h * equation.p["nu"]
     first = equation.reaction(u)
     x = equation.linear_solve(d * z, u + h * d * first)
     explicit = h * (e * first + (1 - e) * equation.reaction(x))
@@ -716,9 +739,14 @@ def imex(equation, u, h):
 
 def etdrk4(equation, u, h):
     """Formulas 26 to 29 of Cox and Matthews, J. Comput. Phys. 176 (2002), with functions phi."""
-    z, n = h * equation.p["nu"] * equation.A, equation.reaction
-    half, whole, weight = phi(0, z / 2), phi(0, z), h / 2 * phi(1, z / 2)
-    p1, p2, p3 = phi(1, z), phi(2, z), phi(3, z)
+    z = h * equation.p["nu"] * equation.A
+    n = equation.reaction
+    half = phi(0, z / 2)
+    whole = phi(0, z)
+    weight = h / 2 * phi(1, z / 2)
+    p1 = phi(1, z)
+    p2 = phi(2, z)
+    p3 = phi(3, z)
     a = anp.dot(half, u) + anp.dot(weight, n(u))
     b = anp.dot(half, u) + anp.dot(weight, n(a))
     c = anp.dot(half, a) + anp.dot(weight, 2 * n(b) - n(u))
@@ -878,7 +906,8 @@ class Root(OnCells):
         eye = np.eye(len(A))
 
         def act(u, p):
-            r, b = anp.ravel(p["r"]), anp.ravel(u)
+            r = anp.ravel(p["r"])
+            b = anp.ravel(u)
 
             def residual(x, of):
                 return x - of(p["nu"]) * anp.dot(A, x) + of(r) * x**3 - of(b)
@@ -935,7 +964,8 @@ class Sum(Ingredient):
 
     def _combined(self, one, other):
         def act(u, p):
-            left, right = one(u, part_of(p, "one")), other(u, part_of(p, "other"))
+            left = one(u, part_of(p, "one"))
+            right = other(u, part_of(p, "other"))
             return anp.sin(left) * right if self.multiplied else 0.7 * (left + right)
 
         return act

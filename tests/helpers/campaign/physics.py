@@ -92,7 +92,8 @@ def water_flux(u, p, axis):
 
 
 def water_speed(u, p, axis):
-    velocity, wave = u[1 + axis] / u[0], anp.sqrt(p["a"] * u[0])
+    velocity = u[1 + axis] / u[0]
+    wave = anp.sqrt(p["a"] * u[0])
     return velocity - wave, velocity + wave
 
 
@@ -217,9 +218,11 @@ def values_at_faces(wide, axis, h, limited):
         line = [-1 if a == axis else 1 for a in range(anp.ndim(wide))]
         c = ((h[1:-1] + h[:-2]) / h[1:-1]).reshape(line)
         e = ((h[1:-1] + h[2:]) / h[1:-1]).reshape(line)
-        a, b = inner - part(wide, axis, 0, -2), part(wide, axis, 2, None) - inner
+        a = inner - part(wide, axis, 0, -2)
+        b = part(wide, axis, 2, None) - inner
         same = a * b > 0
-        a, b = anp.where(same, a, 1.0), anp.where(same, b, 1.0)
+        a = anp.where(same, a, 1.0)
+        b = anp.where(same, b, 1.0)
         top = a * b * (a * e**2 + b * c**2)
         slope = anp.where(same, top / (a**2 * e**2 + (c + e - 2) * c * e * a * b + b**2 * c**2), 0.0)
     return part(inner + slope, axis, 0, -1), part(inner - slope, axis, 1, None)
@@ -311,7 +314,8 @@ class Flow(Ingredient):
         return 1 / (self._dt() * bound(box, ("laplacian", neumann, None, "neumann")))
 
     def twin(self, box):
-        table, dt = dense(box, self.sides, self.solid), self._dt()
+        table = dense(box, self.sides, self.solid)
+        dt = self._dt()
         plain = dense(box)
         projector, pressure = table.projection()
         opened = np.diag(1.0 * table.flags((dp.inflow, dp.outflow)))
@@ -319,7 +323,8 @@ class Flow(Ingredient):
         free = np.diag(1.0 * table.flags((dp.outflow,)))
         viscous = table.viscous()
         carried, carrying, balance = convection_factors(box, self.sides, self.solid)
-        average, divergence = plain.average(), plain.divergence()
+        average = plain.average()
+        divergence = plain.divergence()
         closed = dense(box, None, self.solid)
         heat_diffusion = 0.05 * self._diffusivity(box) * divergence @ closed.gradient()
 
@@ -359,7 +364,8 @@ class Flow(Ingredient):
                     heat = changed
                 v = anp.dot(opened, ahead) + anp.dot(slope, correction)
                 q = q - correction / dt
-                a_before, r_before = a, r
+                a_before = a
+                r_before = r
             result = v + 0.1 * anp.dot(average, q)
             return result + 0.1 * anp.dot(average, heat) if self.heat else result
 
@@ -420,7 +426,8 @@ class TwoFields(OnCells):
     def twin(self, box):
         A = matrix(box, self._expression())
         size = len(A)
-        eye, zero = np.eye(size), np.zeros((size, size))
+        eye = np.eye(size)
+        zero = np.zeros((size, size))
 
         def act(u, p):
             z = anp.concatenate([anp.ravel(u), anp.ravel(p["w"])])
@@ -443,7 +450,8 @@ class TwoFields(OnCells):
                 k4 = whole(z + h * k3)
                 z = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
             elif self.method == "imex":
-                d, e = 1 - np.sqrt(0.5), -np.sqrt(0.5)
+                d = 1 - np.sqrt(0.5)
+                e = -np.sqrt(0.5)
                 top = anp.concatenate([eye - d * h * p["nu"] * A, zero], axis=1)
                 system = anp.concatenate([top, np.concatenate([zero, eye], axis=1)], axis=0)
                 first = reaction(z)
@@ -460,14 +468,20 @@ class TwoFields(OnCells):
         size = len(A)
 
         def residual(x, of):
-            k, h, nu = of(p["k"]), of(p["dt"]), of(p["nu"])
-            u, w = x[:size], x[size:]
+            k = of(p["k"])
+            h = of(p["dt"])
+            nu = of(p["nu"])
+            u = x[:size]
+            w = x[size:]
             of_u, of_w = self._react(u, w, {"k": k})
             return x - h * anp.concatenate([of_u + nu * anp.dot(A, u), of_w]) - of(z)
 
         def jacobian(x, of):
-            k, h, nu = of(p["k"]), of(p["dt"]), of(p["nu"])
-            u, w = x[:size], x[size:]
+            k = of(p["k"])
+            h = of(p["dt"])
+            nu = of(p["nu"])
+            u = x[:size]
+            w = x[size:]
             eye = np.eye(size)
             top = anp.concatenate([anp.diag(k * w - 3 * u**2) + nu * A, anp.diag(k * u)], axis=1)
             bottom = anp.concatenate([eye, -k * eye], axis=1)
@@ -496,7 +510,8 @@ class Waves(OnCells):
         return bound(box, ("laplacian", neumann, None, "neumann"))
 
     def library(self, box):
-        D, G = dp.divergence(box.grid()), dp.gradient(box.grid())
+        D = dp.divergence(box.grid())
+        G = dp.gradient(box.grid())
         damping = (0.2, 0.3) if self.damped else None
         step = dp.stepper(
             "leapfrog", (lambda v, p: -p["c"] * D(v), lambda q, p: -G(q)), lambda p: p["dt"], damping=damping
@@ -511,11 +526,14 @@ class Waves(OnCells):
 
     def twin(self, box):
         table = dense(box)
-        D, G = table.divergence(), table.gradient()
+        D = table.divergence()
+        G = table.gradient()
         a, b = (0.2, 0.3) if self.damped else (0.0, 0.0)
 
         def act(u, p):
-            q, v, h = anp.ravel(u), p["v"], p["dt"]
+            q = anp.ravel(u)
+            v = p["v"]
+            h = p["dt"]
             for _ in range(self.steps):
                 v = ((1 - b * h / 2) * v - h * anp.dot(G, q)) / (1 + b * h / 2)
                 q = ((1 - a * h / 2) * q - h * p["c"] * anp.dot(D, v)) / (1 + a * h / 2)
@@ -608,7 +626,8 @@ class Switched(OnCells):
 
     def twin(self, box):
         def act(u, p):
-            k, off = p["k"], p["off"]
+            k = p["k"]
+            off = p["off"]
             at_switch = u * anp.exp(-k * off) + p["f"] / k * (1 - anp.exp(-k * off))
             return at_switch * anp.exp(-k * (0.6 - off))
 
@@ -700,7 +719,8 @@ class Damped(OnCells):
 
     def twin(self, box):
         table = dense(box, self.sides)
-        D, G = table.divergence(), table.gradient()
+        D = table.divergence()
+        G = table.gradient()
         eye = np.eye(len(D))
 
         def act(u, p):

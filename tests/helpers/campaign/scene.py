@@ -124,7 +124,8 @@ class Scene:
 
     def _composed(self, parts, bounded=False):
         """Return loss(values by name). bounded: whether fields that grow discard the scene."""
-        measure, seed = LOSSES[self.loss], 6000 + self.seed
+        measure = LOSSES[self.loss]
+        seed = 6000 + self.seed
 
         def loss(values):
             u = values["u"]
@@ -287,10 +288,12 @@ def compare(scene):
         twice; if an argument is modified; or if the library refuses what it should accept.
     """
     outcome = Outcome()
-    values, tangents = scene.leaves(), scene.tangents()
+    values = scene.leaves()
+    tangents = scene.tangents()
     names = list(values)
     arrange, entries = TREES[scene.tree]
-    x, direction = arrange(values), arrange(order_of(tangents, values, scene.tree))
+    x = arrange(values)
+    direction = arrange(order_of(tangents, values, scene.tree))
     before = {name: np.array(value) for name, value in values.items()}
 
     with np.errstate(all="ignore"):
@@ -302,7 +305,8 @@ def compare(scene):
 
     result = attempt(scene, outcome, "gradient", lambda: dp.value_and_grad(loss)(x))
     if result is not None:
-        value, gradient = result[0], entries(result[1], names)
+        value = result[0]
+        gradient = entries(result[1], names)
         check_close(scene, "value", value, twin.value, twin.value_scale)
         outcome.compared.append("value")
         check_gradient(scene, "gradient", gradient, twin.gradient, values)

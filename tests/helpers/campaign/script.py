@@ -17,7 +17,8 @@ OWN = {path.stem for path in FILES} | {"campaign"}
 def definitions(path):
     """Return (statements that import foreign modules, text of each top-level definition by name) of a file."""
     text = path.read_text(encoding="utf-8")
-    foreign, found = [], {}
+    foreign = []
+    found = {}
     for node in ast.parse(text).body:
         if isinstance(node, (ast.Import, ast.ImportFrom)):
             module = node.module if isinstance(node, ast.ImportFrom) else node.names[0].name
@@ -57,7 +58,9 @@ def aliases(path):
 
 def bundle(start):
     """Return the source of all definitions that a text needs, in the order of the files."""
-    imported, defined, renamed = [], {}, {}
+    imported = []
+    defined = {}
+    renamed = {}
     for path in FILES:
         foreign, found = definitions(path)
         double = set(found) & set(defined)
@@ -66,7 +69,8 @@ def bundle(start):
         imported += foreign
         defined.update(found)
         renamed.update(aliases(path))
-    needed, waiting = set(), names_in(start)
+    needed = set()
+    waiting = names_in(start)
     while waiting:
         name = waiting.pop()
         if name in needed:

@@ -25,7 +25,8 @@ SOLIDS = st.one_of(st.none(), SEEDS)
 def boxes(draw, most=24, least_dim=1):
     """Small grids of one to three axes; axes of one cell, periodic and stretched ones among them."""
     dim = draw(st.integers(least_dim, 3))
-    shape, left = [], most
+    shape = []
+    left = most
     for _ in range(dim):
         cells = draw(st.integers(1, max(1, min(6 if dim > 1 else 9, left))))
         shape.append(cells)
@@ -166,7 +167,8 @@ def elliptics(draw, box):
 def transports(draw, box, of):
     scheme = draw(st.sampled_from(["upwind", "van_leer"]))
     sides = draw(sides_of(box, st.sampled_from(["neumann", "dirichlet"])))
-    velocity, form = draw(st.sampled_from(["faces", "cells"])), draw(st.sampled_from(["flux", "advective"]))
+    velocity = draw(st.sampled_from(["faces", "cells"]))
+    form = draw(st.sampled_from(["flux", "advective"]))
     solid = draw(SOLIDS) if (scheme, velocity, of) == ("upwind", "faces", "cells") else None
     return parts.Transport(scheme, sides, velocity, of, form, draw(st.booleans()), draw(SEEDS), solid)
 
@@ -197,7 +199,8 @@ def simple(draw, box, source, batched, complex_field, same=False):
     if name == "solve":
         return draw(solves(box, source))
     if name == "pointwise":
-        formula, size = draw(st.sampled_from(sorted(parts.POINTWISE))), draw(st.sampled_from(["number", "field"]))
+        formula = draw(st.sampled_from(sorted(parts.POINTWISE)))
+        size = draw(st.sampled_from(["number", "field"]))
         return parts.Pointwise(formula, source, size, draw(SEEDS))
     if name == "rule":
         return parts.Rule(source, draw(st.booleans()), draw(SEEDS))
@@ -218,7 +221,8 @@ def simple(draw, box, source, batched, complex_field, same=False):
     if name == "entries":
         return parts.Entries(draw(SEEDS), draw(st.sampled_from(["auto", "direct", "krylov"])))
     if name == "root":
-        entry, method = draw(st.sampled_from(["implicit", "steady"])), draw(st.sampled_from(["auto", "krylov"]))
+        entry = draw(st.sampled_from(["implicit", "steady"]))
+        method = draw(st.sampled_from(["auto", "krylov"]))
         return parts.Root(draw(sides_of(box)), entry, method, draw(SEEDS))
     if name == "adopted":
         return parts.BlackBox(draw(st.sampled_from(["auto", "complex", "difference"])))
@@ -228,7 +232,8 @@ def simple(draw, box, source, batched, complex_field, same=False):
 @st.composite
 def physical(draw, name, box, source):
     """One ingredient of `physics`."""
-    seed, flag = draw(SEEDS), draw(st.booleans())
+    seed = draw(SEEDS)
+    flag = draw(st.booleans())
     if name == "lagrangian":
         return physics.Lagrangian(
             draw(st.sampled_from(["semi_lagrangian", "maccormack"])),
@@ -245,7 +250,8 @@ def physical(draw, name, box, source):
         return physics.Law(draw(st.sampled_from(["upwind", "van_leer"])), sides, flag, draw(st.booleans()), seed)
     if name == "flow":
         viscosity = draw(st.sampled_from(["none", "explicit", "implicit", "params"]))
-        sides, steps = draw(flow_sides(box)), draw(st.integers(1, 3))
+        sides = draw(flow_sides(box))
+        steps = draw(st.integers(1, 3))
         return physics.Flow(sides, draw(SOLIDS), viscosity, flag, draw(st.booleans()), steps, seed)
     if name == "fields":
         return physics.TwoFields(draw(st.sampled_from(["rk4", "imex", "backward_euler"])), draw(sides_of(box)), seed)
