@@ -19,7 +19,7 @@ from sparsedp.autodiff.tape import Rule, isbox, plain
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.operators.given import from_matrix
 from sparsedp.solvers.cache import Cache
-from sparsedp.solvers.sparsity import Coloured, dense_pattern, find_pattern, pattern_like, stencil_pattern
+from sparsedp.solvers.sparsity import ColouredPattern, dense_pattern, find_pattern, pattern_like, stencil_pattern
 
 __all__ = ["Adopted", "from_blackbox"]
 
@@ -229,7 +229,7 @@ class Adopted(Remade):
             earlier = self._coloured.pattern
         elif earlier is not None:
             check_shape(f"the sparsity of {self.name}", earlier, (rows, columns))
-            yield Coloured(earlier, shapes)
+            yield ColouredPattern(earlier, shapes)
         elif not np.array_equal(self._flat(x), y):
             raise DerivativeError(f"{self.name} gives two results for one argument; fix its random state first")
         if self._sparsity is not None:
@@ -241,7 +241,7 @@ class Adopted(Remade):
         ]
 
         def coloured(pattern):
-            return Coloured(pattern if earlier is None else pattern_like(pattern + earlier), shapes)
+            return ColouredPattern(pattern if earlier is None else pattern_like(pattern + earlier), shapes)
 
         guess = None if shapes is None else stencil_pattern(products, shapes)
         if guess is not None:

@@ -17,7 +17,16 @@ from sparsedp.operators.structure.base import Matrix
 from sparsedp.parallel.cut import Columns, OwnRows, Rows, reads
 from sparsedp.parallel.fields import DistributedField
 from sparsedp.parallel.partition import lengths
-from sparsedp.solvers.sparsity import WIDEST, Coloured, entries_at, lattice, pattern_of, places, probes, steps_to
+from sparsedp.solvers.sparsity import (
+    LARGEST_STENCIL,
+    ColouredPattern,
+    field_indices,
+    find_lattice,
+    pattern_of,
+    probe_positions,
+    stencil_entries,
+    stencil_steps,
+)
 
 __all__ = ["Stencil", "stencil_of"]
 
@@ -35,26 +44,26 @@ def stencil_of(name, space, products, lacking=None):
     own, (ends, n, around) = _own(space), _sides(space)
     steps = {(one, one, *[0] * len(n)) for one in range(len(ends))}
     steps.update(lacking.steps if lacking else ())
-    for one, act, cell in probes(ends, products):
+    for one, act, cell in probe_positions(ends, products):
         here = np.all(own == [[one], *cell], axis=0)
-        row = np.flatnonzero(act(DistributedField(here.astype(float), space)).flat)[: WIDEST + 1]
-        found, _ = steps_to(one, cell, own[0, row], own[1:, row], n, around)
+        row = np.flatnonzero(act(DistributedField(here.astype(float), space)).flat)[: LARGEST_STENCIL + 1]
+        found, _ = stencil_steps(one, cell, own[0, row], own[1:, row], n, around)
         steps.update(*space.layout.agreement.gathered(found))
-    least, found = np.bincount([row for _, row, *_ in steps]).max(), None
-    if least <= WIDEST and not (lacking and steps == lacking.steps):
-        found = lattice(_differences(space, steps), least, COLOURS * least + 1)
-    if found is None:
+    least, lattice = np.bincount([row for _, row, *_ in steps]).max(), None
+    if least <= LARGEST_STENCIL and not (lacking and steps == lacking.steps):
+        lattice = find_lattice(_differences(space, steps), least, COLOURS * least + 1)
+    if lattice is None:
         raise TypeError(
             f"{name} takes, for fields on ranks, residuals in which a number meets few others, all of them near; "
             "write dp.gather(u) for what every rank solves alone"
         )
-    return Stencil(space, steps, *found)
+    return Stencil(space, steps, *lattice)
 
 
 def _own(space):
     """Of each number of the block of this rank its component, and its index there."""
     boxes = [*map(space.layout.box, space.parts)]
-    return places(map(lengths, boxes), [[start for start, _ in box] for box in boxes])
+    return field_indices([*map(lengths, boxes)], [[start for start, _ in box] for box in boxes])
 
 
 def _sides(space):
@@ -76,7 +85,7 @@ def _differences(space, steps):
     return np.unique(shifts[near & np.any(shifts, axis=1)], axis=0).T
 
 
-class Stencil(Coloured):
+class Stencil(ColouredPattern):
     """Where the rows of this rank have entries, and which columns one product serves: (vector . place) mod count.
 
     Parameters
@@ -92,14 +101,14 @@ class Stencil(Coloured):
     def __init__(self, space, steps, vector, count):
         self.space, self.steps, self.count, self.by_rows = space, steps, count, False
         own, (ends, _, around), found = _own(space), _sides(space), []
-        for row, one, there in entries_at(steps, own[0], own[1:], ends, around):
+        for row, one, there in stencil_entries(steps, own[0], own[1:], ends, around):
             column = space.offsets[one] + np.ravel_multi_index(tuple(there), space.parts[one])
             found.append((row, column, (vector[0] * one + vector[1:] @ there) % count))
         row, column, colour = map(np.concatenate, zip(*found))
         place, self.exchange = reads(column, space.layout, space.parts)
         colours = np.zeros(self.exchange.read[0], int)
         colours[place], self.seeds = colour, vector @ own % count
-        self._paint(pattern_of(row, place, (len(own[0]), colours.size)), colours)
+        self._set_pattern(pattern_of(row, place, (len(own[0]), colours.size)), colours)
 
     def operator(self, act, name):
         """The matrix that acts as ``act(v)``, as an Operator."""

@@ -24,7 +24,7 @@ from sparsedp.solvers.cache import Cache
 from sparsedp.solvers.direct import DENSE_UP_TO
 from sparsedp.solvers.inverse import Inverse, Solution, build, build_dense
 from sparsedp.solvers.records import failure
-from sparsedp.solvers.sparsity import Coloured, dense_pattern, find_pattern, pattern_like, stencil_pattern
+from sparsedp.solvers.sparsity import ColouredPattern, dense_pattern, find_pattern, pattern_like, stencil_pattern
 
 __all__ = ["Jacobians", "Linearisation"]
 
@@ -292,7 +292,7 @@ class Jacobians:
 
     def _colour(self, pattern, equation, x, leaves):
         cells, shapes = fields_met(equation, x, leaves)
-        coloured = Coloured(pattern, shapes, None if len(self.ways) > 1 else self.ways[0])
+        coloured = ColouredPattern(pattern, shapes, None if len(self.ways) > 1 else self.ways[0])
         known = self._patterns[equation.layout.space] = coloured, cells
         return known
 
