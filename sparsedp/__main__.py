@@ -80,7 +80,7 @@ def _parser():
 
 def run_check(options):
     """Options of the command `check` -> exit code."""
-    from sparsedp.check.audit import gradient
+    from sparsedp.check.gradient_check import gradient
     from sparsedp.report.scene_report import audited, load
 
     source = load(options.scene)

@@ -5,7 +5,7 @@ inconclusive), is true only when it agrees, and prints its table.
 """
 
 from sparsedp._utils.calls import describe_module
-from sparsedp.check.audit import gradient
+from sparsedp.check.gradient_check import gradient
 from sparsedp.check.operators import operator, transpose, twin
 from sparsedp.check.refinement import order
 

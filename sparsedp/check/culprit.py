@@ -14,12 +14,14 @@ from sparsedp._utils.counters import recording
 from sparsedp._utils.pytree import leaves
 from sparsedp.autodiff.derivative import grad, linearised
 from sparsedp.autodiff.tape import is_variable
+from sparsedp.check.directions import examine_directions
 from sparsedp.check.entries import DEFAULT_STEP, gaps_along_entries, largest_gaps, listed, subscript, where
-from sparsedp.check.judge import forward_mode, looked_at
+from sparsedp.check.evaluations import Evaluations
 from sparsedp.check.nodes import calls_seen, in_order
 from sparsedp.check.operators import fault_of, field
+from sparsedp.check.other_derivatives import compare_modes
+from sparsedp.check.point import Point, audit_generator
 from sparsedp.check.summary import error_text
-from sparsedp.check.sweep import Point, Trials, generator
 from sparsedp.errors import DerivativeError
 from sparsedp.operators.operator import Operator
 from sparsedp.solvers.inverse import Inverse
@@ -49,7 +51,7 @@ def culprit_of(loss, point, spaces=()):
         In the order of the calls. A call that others are made inside of (a time loop, a root) is named
         only when none of those is at fault.
     """
-    rng = generator(None)
+    rng = audit_generator(None)
     cleared: set[int] = set()  # Operators that are right
     refused: dict[str, str] = {}  # calls that cannot be examined alone, and the error
     with np.errstate(all="ignore"):
@@ -142,11 +144,11 @@ class Arguments(Point):
         self.names = [re.sub(r"^x\[(\d+)\]", argument, name) for name in self.names]
 
 
-def _entries_of_rule(node, trials, judged, worst, weights, spaces):
+def _entries_of_rule(node, evaluations, judged, worst, weights, spaces):
     """Return in words where in its arguments and results the VJP of a call is wrong."""
-    point = trials.point
-    in_arguments = gaps_along_entries(trials, judged, 1)
-    words = [f"largest gap in its {one}" for one in listed(in_arguments, point, trials.gradient, spaces, "its VJP")]
+    point = evaluations.point
+    in_arguments = gaps_along_entries(evaluations, judged, 1)
+    words = [f"largest gap in its {one}" for one in listed(in_arguments, point, evaluations.slopes, spaces, "its VJP")]
     shapes = [np.shape(weight) for weight in weights.values()]
     is_complex = point.complex or any(map(np.iscomplexobj, weights.values()))
     if not is_complex and sum(map(prod, shapes)) > 1:
@@ -227,13 +229,15 @@ def _wrong_rule(node, rng, spaces):
     weights = _weights(node, rng)
     loss = _functional(node, weights)
     # In each argument alone, and the largest entry: a loss of many entries hides single ones.
-    trials = Trials(loss, point, grad(loss))
-    judged, doubts = looked_at(trials, DIRECTIONS, rng, lambda name: name not in SKIPPED)
+    evaluations = Evaluations(loss, point, grad(loss))
+    judged, doubts = examine_directions(evaluations, DIRECTIONS, rng, lambda name: name not in SKIPPED)
     if "broken" in dict(doubts):
         return "its VJP gives NaN or infinity"
     for one in judged:
         if one.word == "disagrees":
             words = f"its VJP is {one.note}" if one.note.startswith("off") else one.note
-            return words + _entries_of_rule(node, trials, judged, one, weights, spaces)
-    gap, allowed, hidden = forward_mode(loss, judged[:DIRECTIONS]) or (0.0, 0.0, False)
-    return "" if gap <= allowed or hidden else f"its JVP differs from its VJP by {gap:.1e}, and its VJP is right"
+            return words + _entries_of_rule(node, evaluations, judged, one, weights, spaces)
+    modes = compare_modes(loss, judged[:DIRECTIONS])
+    if modes is None or modes.is_allowed or modes.is_hidden:
+        return ""
+    return f"its JVP differs from its VJP by {modes.gap:.1e}, and its VJP is right"

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sparsedp._utils.counters import recording
-from sparsedp.check.sweep import REFUSALS, SAME, Line
+from sparsedp.check.evaluations import REFUSALS, UNCHANGED, Line
 from sparsedp.grid.grid import node_axes
 
 __all__ = [
@@ -168,7 +168,7 @@ class _Search:
         return low, high, gap, beside
 
 
-def gaps_along_entries(trials, judged, most=MOST_ENTRIES):
+def gaps_along_entries(evaluations, judged, most=MOST_ENTRIES):
     """Entries where differences and gradient are far apart, by the judgement of the worst direction.
 
     Returns
@@ -176,22 +176,22 @@ def gaps_along_entries(trials, judged, most=MOST_ENTRIES):
     list of EntryGap
         Gaps are those of derivatives of the loss; empty where nothing can be told.
     """
-    point = trials.point
+    point = evaluations.point
     wrong = [one for one in judged if one.word in ("disagrees", "outside")]
     if point.entries < 2 or not wrong:
         return []
     worst = max(wrong, key=lambda one: one.share if one.share == one.share else 0.0)
     step = worst.step if worst.step > 0 else DEFAULT_STEP
     jitter = worst.jitter if worst.jitter > 0 else 0.0
-    noise = CLEAR * max(2.0, jitter) * trials.eps * abs(trials.base) / step
+    noise = CLEAR * max(2.0, jitter) * evaluations.eps * abs(evaluations.base) / step
 
     def gap_along(weights):
         parts = [w * (1 + 1j) if np.iscomplexobj(x) else w for w, x in zip(weights, point.values, strict=True)]
         direction = point.units * np.concatenate([np.ravel(part).view(float) for part in parts])
         if not np.any(direction):
             return 0.0
-        level = Line("entries", direction, trials).level(step)
-        if level.note and level.note != SAME:
+        level = Line("entries", direction, evaluations).level(step)
+        if level.note and level.note != UNCHANGED:
             raise _NotMeasured(level.note)
         return level.difference - level.slope
 

@@ -14,9 +14,9 @@ import numpy as np
 from sparsedp._utils.pytree import norm
 from sparsedp._utils.validation import EPS
 from sparsedp.autodiff.derivative import hvp, pullback, pushforward, unwarned
+from sparsedp.check.point import audit_generator
 from sparsedp.check.properties import facts_of
 from sparsedp.check.summary import Row, Summary, error_text
-from sparsedp.check.sweep import generator
 from sparsedp.errors import DerivativeError
 from sparsedp.operators.given import check_operator
 from sparsedp.operators.structure.base import Matrix
@@ -70,7 +70,7 @@ class Probe:
     """
 
     def __init__(self, op, seeds=1, rng=None):
-        self.op, self.rng, self.seeds = op.tangent, generator(rng), max(seeds, 1)
+        self.op, self.rng, self.seeds = op.tangent, audit_generator(rng), max(seeds, 1)
         self.real = op.dtype.kind != "c"
         structure, self.tolerance = self.op.structure, tolerance_of(self.op.structure)
         self.real_linear = "" if self.real or structure.has_entries else self._real_side()

@@ -9,9 +9,9 @@ from sparsedp._utils.pytree import leaves
 from sparsedp._utils.validation import check_function
 from sparsedp.autodiff.derivative import unwarned, value_and_grad, witnessed
 from sparsedp.autodiff.tape import is_variable
+from sparsedp.check.evaluations import solvers_of
 from sparsedp.check.nodes import bytes_held
 from sparsedp.check.summary import Result
-from sparsedp.check.sweep import solvers_of
 from sparsedp.check.table import table_of
 from sparsedp.operators.operator import Operator
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from sparsedp._utils.validation import check_choice, check_kind, check_type
 from sparsedp.autodiff.tape import plain
-from sparsedp.check.audit import Audit
+from sparsedp.check.gradient_check import Audit
 from sparsedp.errors import ShapeError
 from sparsedp.grid.grid import check_grid
 from sparsedp.io.atomic_files import write_file

@@ -13,8 +13,8 @@ import numpy as np
 from sparsedp._utils.counters import thread
 from sparsedp._utils.pytree import mapped, norm
 from sparsedp.autodiff.derivative import jvp
+from sparsedp.check.point import Point
 from sparsedp.check.summary import Result
-from sparsedp.check.sweep import Point
 from sparsedp.check.table import Table
 from sparsedp.errors import SparsedpError
 

@@ -14,11 +14,13 @@ from sparsedp._utils.counters import thread
 from sparsedp._utils.pytree import copied, leaves, norm
 from sparsedp._utils.validation import EPS
 from sparsedp.autodiff.derivative import value_and_grad
-from sparsedp.check.audit import look_beside
-from sparsedp.check.judge import NEGLIGIBLE, looked_at, verdict
+from sparsedp.check.audit_thresholds import THRESHOLDS
+from sparsedp.check.directions import examine_directions, excuse_kinks
+from sparsedp.check.evaluations import Evaluations, Line
 from sparsedp.check.operators import layouts
+from sparsedp.check.overall_verdict import overall_verdict
+from sparsedp.check.point import Point, audit_generator, root_mean_square
 from sparsedp.check.summary import error_text
-from sparsedp.check.sweep import Line, Point, Trials, generator, rms
 from sparsedp.errors import SparsedpError
 from sparsedp.report.certificate import distance
 from sparsedp.report.stability import SEED, STEADY, growth_of
@@ -222,27 +224,27 @@ def _against_differences(scene, other, out):
     is given, all evidence is gathered and judged as `check.gradient` does it.
     """
     point = Point(scene.at(other))
-    trials = Trials(scene.sheltered, point, out.gradient)
-    trials.base, trials.gradient = out.value, point.gradient(out.gradient)
-    lines = [Line(name, direction, trials) for name, direction in _directions(point, trials.gradient)]
+    trials = Evaluations(scene.sheltered, point, out.gradient)
+    trials.base, trials.slopes = out.value, point.gradient(out.gradient)
+    lines = [Line(name, direction, trials) for name, direction in _directions(point, trials.slopes)]
     largest = max((abs(line.slope) for line in lines), default=0.0)
     gap = max((_smallest_gap(line, largest) for line in lines), default=0.0)
     met = gap <= GOOD
     if met and other:
         return PASSED, gap, ""
-    trials = Trials(scene.sheltered, point, lambda tree: value_and_grad(scene.loss)(tree)[1])
+    trials = Evaluations(scene.sheltered, point, lambda tree: value_and_grad(scene.loss)(tree)[1])
     try:
-        judged, doubts = looked_at(trials, 1, generator(SEED), None)
-        look_beside(trials, judged)
+        judged, doubts = examine_directions(trials, 1, audit_generator(SEED), None)
+        excuse_kinks(trials, judged)
     except Exception as error:  # a scene may raise anything beside the point
         return DEGRADED, gap, f"the gradient cannot be compared with differences: {error_text(error)}"
-    word, reason = verdict(judged, doubts)
+    word, reason = overall_verdict(judged, doubts)
     if word == "disagrees" and out.flagged:
         return DEGRADED, gap, "the gradient grows without bound on its way back"
     if word == "disagrees" and _underflows(point, out.value):
         return DEGRADED, gap, "the gradient is below the smallest numbers of its precision"
     if word == "disagrees":
-        lost = not np.any(trials.gradient)
+        lost = not np.any(trials.slopes)
         return FAILED, gap, "the gradient is 0, the differences are not" if lost else f"{WRONG} {reason}"
     unseen = largest <= UNSEEN * abs(out.value)
     if unseen:
@@ -271,10 +273,10 @@ def _directions(point, gradient):
     def is_wanted(name):
         return name.startswith("random in") or name == "gradient"
 
-    directions = point.directions(gradient, 0, generator(SEED), is_wanted)
+    directions = point.directions(gradient, 0, audit_generator(SEED), is_wanted)
     if any(name != "gradient" for name, _ in directions):
         return directions
-    return [("random", point.random(generator(SEED))), *directions]
+    return [("random", point.random(audit_generator(SEED))), *directions]
 
 
 def _smallest_gap(line, largest):
@@ -282,7 +284,7 @@ def _smallest_gap(line, largest):
 
     A derivative far below the largest one is compared with that: rounding of the loss hides the rest.
     """
-    scale = max(abs(line.slope), NEGLIGIBLE * largest)
+    scale = max(abs(line.slope), THRESHOLDS.negligible_share * largest)
     gap = inf
     for step in DIFFERENCES:
         line.sweep([step])
@@ -290,7 +292,7 @@ def _smallest_gap(line, largest):
         gap = min(gaps, default=inf)
         if gap <= GOOD and scale:
             return gap
-    if line.silent and abs(line.slope) <= UNSEEN * abs(line.base):
+    if line.unchanged_steps and abs(line.slope) <= UNSEEN * abs(line.base):
         return 0.0  # rounding of the loss hides the derivative
     return gap if scale else inf
 
@@ -362,9 +364,9 @@ def constants_added(scene, name, x):
     """Incompatible data of a singular system are projected or refused, never amplified."""
     if x.size > 1 and np.any(x):
         amplified = partial(near, note="amplified by {:.0e}: is a null space left in?")
-        yield "plus 1e-14 of itself", x + 1e-14 * rms(x), partial(amplified, unit=1e-14, **DIGITS)
-        yield "plus 1e-07 of itself", x + 1e-7 * rms(x), partial(amplified, good=1e-3, bad=0.1, unit=1e-7)
-        yield "plus 1 of itself", x + rms(x), sound
+        yield "plus 1e-14 of itself", x + 1e-14 * root_mean_square(x), partial(amplified, unit=1e-14, **DIGITS)
+        yield "plus 1e-07 of itself", x + 1e-7 * root_mean_square(x), partial(amplified, good=1e-3, bad=0.1, unit=1e-7)
+        yield "plus 1 of itself", x + root_mean_square(x), sound
 
 
 def not_finite(scene, name, x):

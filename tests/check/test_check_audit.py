@@ -105,7 +105,7 @@ def test_rules_without_a_jvp_and_losses_that_write_into_their_argument():
 def test_table_and_data():
     result = AUDIT(smooth, X, directions=1)
     text = str(result)
-    assert repr(result) == f"<gradient agrees: {result.digits} digits>" and "Judgement" in str(result.lines[0])
+    assert repr(result) == f"<gradient agrees: {result.digits} digits>" and "DirectionResult" in str(result.lines[0])
     assert text.splitlines()[-1].startswith("verdict: agrees to ")
     assert "order 2" in text and "largest entry" in text
     data = json.loads(json.dumps(result.to_dict()))

@@ -1,0 +1,257 @@
+"""Examine a gradient along all directions of an audit: sweep, weigh, and take more steps where these are undecided."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from math import isfinite
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sparsedp._utils.validation import place
+from sparsedp.check.audit_thresholds import THRESHOLDS
+from sparsedp.check.direction_evidence import DirectionEvidence, weigh
+from sparsedp.check.evaluations import REFUSALS, Evaluations, Line
+from sparsedp.check.loss_noise import measure_noise
+from sparsedp.check.overall_verdict import overall_verdict
+from sparsedp.check.point import Point, audit_generator
+
+__all__ = ["RANDOM_DIRECTIONS", "examine_directions", "excuse_kinks"]
+
+RANDOM_DIRECTIONS = 3
+# Steps beyond those of the sweep.
+COARSER_STEPS = tuple(2.0**k for k in range(1, 38, 3))  # for noise of rounding: x may be small beside the loss
+FINER_STEPS = tuple(2.0**-k for k in range(33, 46, 3))  # for other noise: there may be finer features
+STEPS_BETWEEN = 2.0 ** np.arange(-9, 7)  # times the step of the plateau: more levels for an order
+RIPPLE_STEPS = 2.0 ** -np.arange(27, 46)  # that may show a ripple
+# The step to the point where a loss with kinks is examined again: its length in units of x, and its seed.
+SHIFT = 2.0**-6
+SHIFT_SEED = 7
+
+
+def examine_directions(
+    evaluations: Evaluations,
+    count: int,
+    rng: np.random.Generator,
+    is_wanted: Callable[[str], bool] | None = None,
+) -> tuple[list[DirectionEvidence], list[tuple[str, str]]]:
+    """Examine a gradient along all directions.
+
+    Parameters
+    ----------
+    evaluations : Evaluations
+    count, rng, is_wanted
+        As in `Point.directions`.
+
+    Returns
+    -------
+    directions : list of DirectionEvidence
+        Empty where loss or gradient is not finite.
+    findings : list of (str, str)
+        Word and reason of what was found before.
+
+    Notes
+    -----
+    The noise belongs to the loss, not to a direction: the larger one along the first and the last counts for all.
+    """
+    point = evaluations.point
+    evaluations.start()
+    with np.errstate(all="ignore"):
+        slopes = evaluations.gradient_at(point.fresh())
+        again = evaluations.gradient_at(point.fresh())
+    evaluations.slopes = slopes
+    findings = _find_unsound_values(evaluations, slopes, again)
+    if not (isfinite(evaluations.base) and np.all(np.isfinite(slopes))):
+        return [], findings
+    lines = [
+        Line(name, displacement, evaluations) for name, displacement in point.directions(slopes, count, rng, is_wanted)
+    ]
+    for line in lines[:1] + lines[1:][-1:]:
+        noise, deviation = measure_noise(line)
+        evaluations.noise = max(evaluations.noise, noise)
+        evaluations.deviation = max(evaluations.deviation, deviation)
+    directions = [_examine_line(line, seek_ripples=line is lines[0]) for line in lines]
+    if callable(evaluations.gradient):
+        for direction in directions:
+            if direction.word == "disagrees":
+                _excuse_hidden_ripple(direction)
+    return directions, findings
+
+
+def _find_unsound_values(evaluations: Evaluations, slopes: NDArray[Any], again: NDArray[Any]) -> list[tuple[str, str]]:
+    """Return what is wrong with the values of loss and gradient at the point."""
+    point = evaluations.point
+    base = evaluations.base
+    findings = []
+    if not isfinite(base):
+        findings.append(("unsound", f"the loss is {base} at x"))
+    elif evaluations.value(point.fresh()) != base:
+        findings.append(("unsound", "two evaluations of the loss differ: it is not deterministic"))
+    if not np.array_equal(slopes, again, equal_nan=True):
+        findings.append(("unsound", "two evaluations of the gradient differ: it is not deterministic"))
+    with np.errstate(all="ignore"):
+        change = np.max(np.abs(slopes * point.units), initial=0.0)
+    smallest = THRESHOLDS.smallest_loss_change
+    if 0 < change < smallest:
+        findings.append(("unsound", f"the loss changes by less than {smallest:g}: it underflows, scale it"))
+    for name, values in zip(point.names, point.arrays(slopes)):
+        if not np.all(np.isfinite(values)):
+            where = _first_non_finite(values)
+            findings.append(("broken", f"the gradient of {name} holds NaN or infinity{where}"))
+    return findings
+
+
+def _first_non_finite(values: NDArray[Any]) -> str:
+    """Return in words where the first NaN or infinity of an array is; empty for a single number."""
+    is_finite = np.isfinite(values)
+    if not is_finite.ndim:
+        return ""
+    return f", the first at {place(int(np.argmin(is_finite)), is_finite.shape)}"
+
+
+def _examine_line(line: Line, seek_ripples: bool) -> DirectionEvidence:
+    """Sweep and weigh a line, and go on with other steps where the derivative stays undecided.
+
+    Parameters
+    ----------
+    line : Line
+    seek_ripples : bool
+        Whether steps far below the plateau are tried where there is noise, though all agrees.
+    """
+    line.sweep(line.evaluations.steps)
+    evidence = weigh(line)
+    if not line.evaluations.may_extend:
+        return evidence
+    if evidence.word in ("few", "rough") and evidence.step > 0:
+        line.sweep(evidence.step * STEPS_BETWEEN)
+        evidence = weigh(line)
+    if evidence.word != "vanishes" and evidence.resolution > max(THRESHOLDS.extension_bar, 1e4 * line.point.eps):
+        if not evidence.jitter <= THRESHOLDS.rounding_noise:
+            line.sweep(FINER_STEPS)
+        if not evidence.jitter > THRESHOLDS.rounding_noise:
+            line.sweep(COARSER_STEPS)
+        extended = weigh(line)
+        if not evidence.resolution < extended.resolution:
+            evidence = extended
+    if seek_ripples and evidence.is_close and evidence.jitter > THRESHOLDS.smooth_noise:
+        line.sweep(RIPPLE_STEPS)
+        _note_ripple(evidence, weigh(line))
+    return evidence
+
+
+def _note_ripple(evidence: DirectionEvidence, finer: DirectionEvidence) -> None:
+    """Change the word to "ripple" where fine steps, which rounding does not hide, agree on another derivative.
+
+    The plateau of coarse steps is no proof then: the derivative at x differs from the slope of the whole.
+    """
+    run = THRESHOLDS.ripple_run
+    agreement = THRESHOLDS.ripple_agreement
+    first_finer = np.flatnonzero(finer.steps < evidence.step)[0]
+    for start in range(first_finer, finer.steps.size - run + 1):
+        levels = slice(start, start + run)
+        gap = float(np.median(finer.gaps[levels]))
+        rounding = np.max(4 * finer.rounding[levels] / finer.steps[levels])
+        visible = max(
+            THRESHOLDS.noisy_agreement_share * evidence.scale,
+            THRESHOLDS.bars_disagree * evidence.bar,
+            rounding / agreement,
+        )
+        if abs(gap) > visible and np.max(np.abs(finer.gaps[levels] - gap)) <= agreement * abs(gap):
+            evidence.word = "ripple"
+            off = abs(gap) / evidence.scale
+            evidence.note = f"a ripple: steps below {evidence.step:.0e} are off by {off:.1e}, others agree"
+
+
+@np.errstate(all="ignore")
+def _excuse_hidden_ripple(evidence: DirectionEvidence) -> None:
+    """Change the word to "ripple" where a ripple below the noise of the loss may explain a gap.
+
+    A gradient that bends by as much as the gap, within steps over which the gap does not change the loss beyond its
+    noise, belongs to a loss whose ripple no difference can see.
+    """
+    line = evidence.line
+    noise = max(2.0, evidence.jitter) * line.evaluations.eps * abs(line.base)
+    visible = THRESHOLDS.ripple_agreement * evidence.size
+    for multiple in THRESHOLDS.ripple_reaches:
+        step = multiple * (noise / evidence.size)
+        if not step < THRESHOLDS.ripple_range * evidence.step:
+            continue
+        with suppress(*REFUSALS):
+            bend = _bend_of_gradient(line, step)
+            if not bend > visible:
+                continue
+            # At a kink the gradient jumps, however near.
+            if bend > 2 * _bend_of_gradient(line, THRESHOLDS.ripple_smoothness * step):
+                evidence.word = "ripple"
+                evidence.note = (
+                    f"the gradient bends by {bend / evidence.scale:.1e} of itself within a step of {step:.0e}: "
+                    "a ripple below the noise of the loss may explain the gap"
+                )
+                return
+
+
+def _bend_of_gradient(line: Line, step: float) -> float:
+    """Return how far the slopes on both sides of x are from twice the slope at x."""
+    total = 0.0
+    for side in (step, -step):
+        end = line.point.unpack(line.point.vector + side * line.direction)
+        total += line.evaluations.gradient_at(end) @ line.direction
+    return abs(total - 2 * line.slope)
+
+
+# ------------------------------------------------------------ kinks
+
+
+def excuse_kinks(evaluations: Evaluations, directions: Sequence[DirectionEvidence]) -> None:
+    """Change the word of directions that seem wrong to "kink" where all agrees at a point beside the kinks.
+
+    Where several kinks meet, a derivative may lie outside the one-sided ones and still follow a convention. It is
+    wrong if it is wrong beside the kinks as well. Nothing is done without kinks or without a function for the gradient.
+    """
+    if not callable(evaluations.gradient) or not _may_be_kinks(directions):
+        return
+    point = evaluations.point
+    with suppress(*REFUSALS):
+        shift = SHIFT * point.random(audit_generator(SHIFT_SEED))
+        beside = Point(point.unpack(point.vector + shift))
+        evaluations_beside = Evaluations(evaluations.loss, beside, evaluations.gradient, tick=evaluations.tick)
+        found = examine_directions(evaluations_beside, RANDOM_DIRECTIONS, audit_generator(None))
+        if overall_verdict(*found)[0] == "disagrees":
+            return
+        for direction in directions:
+            if direction.word in ("outside", "disagrees"):
+                direction.word = "kink"
+                direction.note = "kinks, or parts of a direction that do not add up; beside x all agrees"
+
+
+def _may_be_kinks(directions: Sequence[DirectionEvidence]) -> bool:
+    """Return whether kinks may explain what speaks against a gradient."""
+    words = {direction.word for direction in directions}
+    if "outside" in words or {"disagrees", "kink"} <= words:
+        return True
+    return any(_is_not_additive(direction) for direction in directions if direction.word == "disagrees")
+
+
+def _is_not_additive(evidence: DirectionEvidence) -> bool:
+    """Return whether differences along two parts of a direction do not add up to those along the whole.
+
+    There is no derivative then, though every line through x is straight: x^3 / (x^2 + y^2) at 0, or a limited slope
+    where neighbours are equal.
+    """
+    line = evidence.line
+    entries = np.flatnonzero(line.direction)
+    if entries.size < 2:
+        return False
+    first = line.direction.copy()
+    first[entries[::2]] = 0.0
+    difference = 0.0
+    bar = evidence.bar
+    for part in (first, line.direction - first):
+        part_evidence = _examine_line(Line(line.name, part, line.evaluations), seek_ripples=False)
+        difference += part_evidence.difference
+        bar += part_evidence.bar
+    gap = evidence.difference - difference
+    visible = max(THRESHOLDS.ripple_agreement * evidence.size, THRESHOLDS.bars_disagree * bar)
+    return abs(gap) > visible

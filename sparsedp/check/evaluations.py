@@ -1,0 +1,264 @@
+"""Evaluations of a loss along lines through a point: the raw numbers of an audit.
+
+The loss only ever sees fresh copies of the tree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sparsedp._utils.counters import recording, thread
+from sparsedp._utils.pytree import norm
+from sparsedp._utils.validation import advise
+from sparsedp.autodiff.derivative import check_loss
+from sparsedp.autodiff.flattening import joined
+from sparsedp.check.point import Point
+from sparsedp.check.summary import error_text
+from sparsedp.errors import SparsedpError
+
+__all__ = ["REFUSALS", "UNCHANGED", "Evaluations", "Level", "Line", "default_steps", "solvers_of"]
+
+REFUSALS = (SparsedpError, ValueError, ArithmeticError)  # what a loss may raise away from x
+UNCHANGED = "the loss does not change"
+LOST_SHARE = 0.1  # of a displacement that the rounding of x may change
+
+
+def default_steps(eps: float) -> tuple[float, ...]:
+    """Return the step sizes of an audit in units of x, over at least eight decades, from coarse to fine.
+
+    Powers of two keep the rounding of x + step * d small. Single precision has fewer decades, with closer steps.
+    """
+    if eps < 1e-10:
+        exponents = range(2, 31, 3)
+    else:
+        exponents = range(-2, 27, 2)
+    return tuple(2.0**-exponent for exponent in exponents)
+
+
+def _no_tick() -> None:
+    """Ignore an evaluation."""
+
+
+class Evaluations:
+    """A loss at a point with the gradient under test.
+
+    Parameters
+    ----------
+    loss : callable
+    point : Point
+    gradient : callable or tree
+        The gradient under test.
+    steps : sequence of float
+        Step sizes; empty for the default ones, which are extended where they leave the derivative undecided.
+    tick : callable
+        Called at each evaluation.
+
+    Attributes
+    ----------
+    base : float
+        The loss at the point, after `start`.
+    slopes : ndarray
+        The gradient at the point.
+    noise : float
+        Noise of the loss in units of its rounding, from a table of differences; 0 if none was measured.
+    deviation : float
+        The same in units of the loss.
+    count : int
+        Number of evaluations.
+    solved : bool
+        Whether the loss takes a solve of this library at the point.
+    tolerance : float
+        The loosest relative tolerance of the iterative solves; 0 without any.
+    step_tolerance : float
+        The loosest tolerance of time steps with error control; 0 without any.
+    eps : float
+        Rounding of the coarsest dtype that the loss has returned.
+    """
+
+    def __init__(
+        self,
+        loss: Callable[[Any], Any],
+        point: Point,
+        gradient: Any,
+        steps: Sequence[float] = (),
+        tick: Callable[[], Any] = _no_tick,
+    ) -> None:
+        self.loss = loss
+        self.point = point
+        self.gradient = gradient
+        self.tick = tick
+        self.steps = steps or default_steps(point.eps)
+        self.may_extend = not steps
+        self.base = np.nan
+        self.slopes: Any = np.nan
+        self.count = 0
+        self.solved = False
+        self.tolerance = 0.0
+        self.step_tolerance = 0.0
+        self.noise = 0.0
+        self.deviation = 0.0
+        self.eps = float(np.finfo(float).eps)
+
+    def value(self, tree: Any) -> float:
+        """Return the loss as a float."""
+        self.count += 1
+        self.tick()
+        with np.errstate(all="ignore"):
+            value = self.loss(tree)
+        check_loss(value)
+        value = np.asarray(value)
+        if value.dtype.kind == "f":
+            self.eps = max(self.eps, float(np.finfo(value.dtype).eps))
+        return float(value)
+
+    def gradient_at(self, tree: Any) -> NDArray[Any]:
+        """Return the gradient under test as a vector."""
+        gradient = self.gradient(tree) if callable(self.gradient) else self.gradient
+        return self.point.gradient(gradient)
+
+    def start(self) -> None:
+        """Evaluate the loss at the point, and find the tolerances of its solves and time steps.
+
+        These are recorded in one more run, since recording may change how things are called.
+        """
+        solves = thread.solves
+        controlled = thread.controlled
+        try:
+            self.base = self.value(self.point.fresh())
+        except TypeError as error:
+            advise(error)
+            raise
+        self.solved = thread.solves > solves
+        if self.solved or thread.controlled > controlled:
+            with recording() as calls, np.errstate(all="ignore"):
+                self.loss(self.point.fresh())
+            tolerances = [solver.system.rtol for _, solver in solvers_of(calls) if solver.engine.iterative]
+            self.tolerance = max(tolerances, default=0.0)
+            for (_, what), values in calls.notes.items():
+                if what == "tolerance":
+                    self.step_tolerance = max(self.step_tolerance, *values)
+
+
+def solvers_of(calls: Any) -> list[tuple[str, Any]]:
+    """Return name and solver of all solves among recorded calls."""
+    return [
+        (name, actor) for name, actors in calls.actors.items() for actor in actors.values() if hasattr(actor, "engine")
+    ]
+
+
+class Level(NamedTuple):
+    """The losses on both sides of the point at one step size, and the changes that the gradient predicts.
+
+    Attributes
+    ----------
+    step : float
+    plus, minus : float
+        f(x + t d) and f(x - t d).
+    ahead, behind : float
+        g . (x+ - x) and g . (x- - x), with the displacements that the rounding of x leaves.
+    note : str
+        Why the level cannot be used; empty if it can.
+    """
+
+    step: float
+    plus: float
+    minus: float
+    ahead: float
+    behind: float
+    note: str
+
+    @property
+    def difference(self) -> float:
+        """Central difference quotient."""
+        return (self.plus - self.minus) / (2 * self.step)
+
+    @property
+    def slope(self) -> float:
+        """Difference quotient that the gradient predicts, for the realised displacements."""
+        return (self.ahead - self.behind) / (2 * self.step)
+
+
+class Line:
+    """A sweep of step sizes along one direction, which can be extended.
+
+    Parameters
+    ----------
+    name : str
+    direction : ndarray
+        Displacement for step 1.
+    evaluations : Evaluations
+
+    Attributes
+    ----------
+    slope : float
+        g . d.
+    typical : float
+        Root of the sum of squares of the terms of g . d.
+    levels : list of Level
+        From coarse to fine.
+    """
+
+    def __init__(self, name: str, direction: NDArray[Any], evaluations: Evaluations) -> None:
+        self.name = name
+        self.direction = direction
+        self.evaluations = evaluations
+        self.point = evaluations.point
+        self.base = evaluations.base
+        self.gradient = evaluations.slopes
+        self.slope = float(self.gradient @ direction)
+        self.typical = norm(self.gradient * direction)
+        self.levels: list[Level] = []
+
+    def end(self, step: float) -> tuple[float, float, str]:
+        """Evaluate one end of the line.
+
+        Returns
+        -------
+        value : float
+            The loss at x + step d, NaN if there is none.
+        change : float
+            The change of the loss that the gradient predicts.
+        note : str
+            Why there is no value.
+        """
+        arrays = self.point.arrays(self.point.vector + step * self.direction)
+        displacement = joined(arrays) - self.point.vector  # as the rounding of x realises it
+        change = float(self.gradient @ displacement)
+        if not abs(norm(displacement) / (abs(step) * norm(self.direction)) - 1) < LOST_SHARE:
+            return np.nan, change, "the step is lost in the rounding of x"
+        try:
+            value = self.evaluations.value(self.point.tree(arrays))
+        except REFUSALS as error:
+            return np.nan, change, error_text(error)
+        return value, change, "" if np.isfinite(value) else "the loss overflows"
+
+    def sweep(self, steps: Iterable[float]) -> None:
+        """Evaluate the loss at x + t d and x - t d for every new t of `steps`."""
+        earlier = {level.step: level for level in self.levels}
+        all_steps = sorted({*earlier, *steps}, reverse=True)
+        self.levels = [earlier.get(step) or self.level(step) for step in all_steps]
+
+    def level(self, step: float) -> Level:
+        """Evaluate the loss at x + t d and x - t d."""
+        plus, ahead, note_ahead = self.end(step)
+        minus, behind, note_behind = self.end(-step)
+        note = note_ahead or note_behind
+        if plus == minus == self.base:
+            note = UNCHANGED
+        return Level(step, plus, minus, ahead, behind, note)
+
+    @property
+    def usable(self) -> list[Level]:
+        """Levels with finite losses that differ from the loss at x."""
+        return [level for level in self.levels if not level.note]
+
+    @property
+    def unchanged_steps(self) -> list[float]:
+        """Steps that left the loss the same, if no level is usable: the loss is constant to rounding along the line."""
+        if self.usable:
+            return []
+        return [level.step for level in self.levels if level.note == UNCHANGED]

@@ -1,0 +1,186 @@
+"""Derivatives by other ways, beside the gradient under test: forward mode, complex steps, Hessian products."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from math import inf, isfinite, nan
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sparsedp.autodiff.derivative import NO_JVP, hvp, pushforward
+from sparsedp.check.audit_thresholds import THRESHOLDS
+from sparsedp.check.direction_evidence import PROVED, DirectionEvidence, pairwise_orders, rms_of_both_sides, weigh
+from sparsedp.check.point import Point
+
+__all__ = ["ModeComparison", "check_complex_step", "check_hessian_product", "compare_modes"]
+
+COMPLEX_STEP = 2.0**-100  # in units of x: its square is lost beside x
+SINGLE_PRECISION_EPS = 300.0  # roundings of x that the modes may differ by
+
+
+class ModeComparison(NamedTuple):
+    """How far forward mode is from reverse mode.
+
+    Attributes
+    ----------
+    gap : float
+        Largest difference of the two, as a share of the derivative.
+    allowed : float
+        What rounding explains; more behind a solve or in noise.
+    is_hidden : bool
+        Whether all larger gaps lie along directions where differences prove nothing, and below their error bars: the
+        derivative may be rounding itself, as for a loss whose terms cancel.
+    """
+
+    gap: float
+    allowed: float
+    is_hidden: bool
+
+    @property
+    def is_allowed(self) -> bool:
+        """Whether the modes agree."""
+        return self.gap <= self.allowed
+
+    def finding(self, tolerance: float) -> tuple[str, str]:
+        """Return word and reason for the verdict on the gradient.
+
+        Parameters
+        ----------
+        tolerance : float
+            Of the solves in the loss.
+        """
+        if self.is_allowed:
+            return "note", f"forward mode: agrees with reverse mode to {self.gap:.0e}"
+        reason = f"forward and reverse mode differ by {self.gap:.1e}"
+        if self.gap <= THRESHOLDS.mode_tolerances * tolerance:
+            return "open", f"{reason}, which solves to rtol {tolerance:g} may leave; tighten them"
+        if self.is_hidden:
+            hidden = "and the noise of the loss hides which is right: the derivative may be rounding"
+            return "hidden modes", f"{reason}, {hidden}"
+        return "broken", f"{reason}: the JVP or the VJP of a rule is wrong"
+
+
+def compare_modes(loss: Callable[[Any], Any], directions: Sequence[DirectionEvidence]) -> ModeComparison | None:
+    """Compare forward mode with reverse mode along some directions; return None where a rule has no JVP."""
+    largest_gap = 0.0
+    allowed = THRESHOLDS.mode_gap
+    gaps_are_hidden = []
+    for direction in directions:
+        line = direction.line
+        point = line.point
+        try:
+            with np.errstate(all="ignore"):
+                _, slope = pushforward(loss, point.fresh(), point.unpack(line.direction))
+        except NO_JVP:
+            return None
+        is_noisy = direction.jitter > THRESHOLDS.rounding_noise or line.evaluations.solved
+        allowed = max(allowed, SINGLE_PRECISION_EPS * point.eps, THRESHOLDS.noisy_mode_gap * is_noisy)
+        difference = abs(float(slope) - direction.slope)
+        if difference == 0:
+            continue
+        gap = difference / direction.scale if direction.scale else inf
+        largest_gap = float(np.maximum(largest_gap, gap))  # NaN stays NaN
+        if not gap <= allowed:
+            is_hidden = difference <= THRESHOLDS.bars_disagree * direction.bar
+            gaps_are_hidden.append(direction.word not in PROVED and is_hidden)
+    return ModeComparison(largest_gap, allowed, all(gaps_are_hidden))
+
+
+@np.errstate(all="ignore")
+def check_complex_step(
+    loss: Callable[[Any], Any], point: Point, direction: DirectionEvidence, base: float
+) -> str | None:
+    """Compare Im f(x + i t d) / t with g . d, exact to rounding where the code is analytic.
+
+    Returns
+    -------
+    str or None
+        How far they agree; None where the code is not analytic.
+
+    References
+    ----------
+    W. Squire and G. Trapp, Using complex variables to estimate derivatives of real functions, SIAM Review 40, 1998.
+    """
+    displacements = point.arrays(direction.line.direction)
+    complex_values = [x + 1j * COMPLEX_STEP * d for x, d in zip(point.values, displacements)]
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a discarded imaginary part shows in the gap
+            value = complex(loss(point.tree(complex_values)))
+    except Exception:  # a loss of real numbers may refuse complex ones in any way
+        return None
+    gap = abs(value.imag / COMPLEX_STEP - direction.slope) / direction.scale
+    same_value = abs(value.real - base) <= 1e-9 * abs(base)
+    if value.imag != 0 and same_value and gap <= THRESHOLDS.complex_step_gap:
+        return f"complex step: agrees to {gap:.0e}"
+    return None
+
+
+# ------------------------------------------------------------ Hessian products
+
+
+def check_hessian_product(
+    loss: Callable[[Any], Any], point: Point, direction: DirectionEvidence
+) -> tuple[str | None, str]:
+    """Examine d . H d by the third Taylor remainder.
+
+    The verdict on the gradient does not depend on it: a pullback that uses a value it captured has a right gradient
+    and a wrong Hessian.
+
+    Returns
+    -------
+    word : "agrees", "disagrees", "inconclusive" or None
+        None without a product.
+    note : str
+    """
+    if point.complex:
+        return None, "Hessian product: not looked at, x is complex"
+    displacement = direction.line.direction
+    try:
+        with np.errstate(all="ignore"):
+            product = point.gradient(hvp(loss, point.fresh(), point.unpack(displacement))) @ displacement
+    except Exception as error:  # a rule, ours or not, may lack a second derivative and say so in any way
+        return None, f"Hessian product: not available ({type(error).__name__})"
+    bend = float(product)
+    _measure_third_order(direction, bend)
+    word, order = _word_of_third_order(direction)
+    remainder = f"d.Hd = {bend:.9g} along {direction.direction}, third Taylor remainder {order}"
+    return word, f"Hessian product: {word}, {remainder}"
+
+
+@np.errstate(all="ignore")
+def _measure_third_order(direction: DirectionEvidence, bend: float) -> None:
+    """Measure the order of the third Taylor remainder on the finest levels clear of noise, gap and rounding of x."""
+    latest = weigh(direction.line)  # with all levels that were added since
+    steps = latest.steps
+    remainders = latest.remainders - steps**2 / 2 * bend
+    size = rms_of_both_sides(remainders)
+    hidden = latest.noise + steps * (direction.size + latest.floor)
+    is_usable = size >= THRESHOLDS.clear_of_noise * hidden
+    levels, orders = pairwise_orders(steps, size, is_usable, THRESHOLDS.fewest_orders)
+    finest = np.max(np.flatnonzero(is_usable), initial=0)
+    ahead, behind = remainders[:, finest]
+    direction.bend = bend
+    direction.third_levels = levels
+    direction.third_order = min(orders, default=nan if levels else inf)
+    direction.hessian_gap = abs(ahead + behind) / steps[finest] ** 2 / abs(bend)
+    direction.hessian_jumps = bool(abs(ahead - behind) > THRESHOLDS.odd_share * abs(ahead + behind))
+
+
+def _word_of_third_order(direction: DirectionEvidence) -> tuple[str, str]:
+    """Return the word for a Hessian product, and the order of its remainder in words."""
+    order = direction.third_order
+    fewest = THRESHOLDS.fewest_orders
+    if not isfinite(direction.bend):
+        return "disagrees", "cannot be told: it is not finite"
+    if not direction.third_levels:
+        return "agrees", "is noise"
+    if direction.third_levels < fewest:
+        return "inconclusive", f"stands out of the noise on {direction.third_levels} steps, {fewest} are needed"
+    if order >= THRESHOLDS.third_order:
+        return "agrees", f"of order {order:.2f}"
+    if order > THRESHOLDS.wrong_hessian_order or direction.hessian_jumps:
+        return "inconclusive", f"of order {order:.2f}: not three times differentiable"
+    return "disagrees", f"of order {order:.2f}: it is off by {direction.hessian_gap:.1e}"

@@ -1,0 +1,144 @@
+"""The point where a loss is audited, as one real vector, and the directions along which it is left.
+
+Complex leaves are pairs of real numbers, and so are gradients and directions: the derivative along a direction is a
+plain dot product.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sparsedp._utils.pytree import copied, mapped, norm
+from sparsedp._utils.validation import check_finite
+from sparsedp.autodiff.fast_derivatives import whole
+from sparsedp.autodiff.flattening import Packing, joined
+
+__all__ = ["QUICK_DIRECTIONS", "Point", "audit_generator", "root_mean_square"]
+
+MOST_LEAVES = 8  # a tree with more leaves gets no direction for each of them
+LARGEST_SHARE = 4.0  # an entry moves by at most this many units along the gradient
+QUICK_DIRECTIONS = ("random 1", "gradient")  # for a loss that takes minutes
+SEED = 20240229
+
+
+def audit_generator(rng: int | np.random.Generator | None) -> np.random.Generator:
+    """Return a generator of its own for an audit; None stands for a fixed seed."""
+    return np.random.default_rng(SEED if rng is None else rng)
+
+
+def root_mean_square(vector: NDArray[Any]) -> float:
+    """Return the root mean square of the entries, 0 without entries."""
+    return norm(vector) / np.sqrt(max(vector.size, 1))
+
+
+def _as_numpy(leaf: Any) -> Any:
+    """Return a leaf as a number or array of NumPy; of a field on ranks all of it.
+
+    Python's numbers refuse to divide by 0 and do not take complex steps.
+    """
+    if isinstance(leaf, (float, complex)):
+        return np.asarray(leaf)[()]
+    return whole(leaf)
+
+
+class Point(Packing):
+    """The point where a loss is audited, as a vector.
+
+    Each leaf has a unit: the root mean square of its values, 1 if they are all 0. A step of size t moves every leaf
+    by t times its unit, so that leaves of different physical size are all examined.
+
+    Parameters
+    ----------
+    x : tree of arrays
+
+    Attributes
+    ----------
+    vector : ndarray
+    units : ndarray
+        The unit of each entry of the vector.
+    entries : int
+        Number of entries of all floating leaves; a complex one counts once.
+    """
+
+    def __init__(self, x: Any) -> None:
+        super().__init__(mapped(_as_numpy, x))
+        for name, values in zip(self.names, self.values):
+            check_finite(name, values, "must be finite where a gradient is checked")
+        self.vector = joined(self.values)
+        self.values = self.arrays(self.vector)  # copies: the caller may write into the arrays of x
+        self.units = self._leaf_sizes(self.vector)
+        self.entries = sum(map(np.size, self.values))
+
+    def tree(self, arrays: list[Any]) -> Any:
+        """Return the tree with these arrays, and copies of the other leaves."""
+        return copied(super().tree(arrays))
+
+    def fresh(self) -> Any:
+        """Return a copy of the tree."""
+        return self.unpack(self.vector)
+
+    def gradient(self, tree: Any) -> NDArray[Any]:
+        """Return a gradient, a tree like x, as a vector."""
+        return joined(self.slopes(tree))
+
+    def directions(
+        self,
+        gradient: NDArray[Any],
+        count: int,
+        rng: np.random.Generator,
+        is_wanted: Callable[[str], bool] | None = None,
+    ) -> list[tuple[str, NDArray[Any]]]:
+        """Return names and displacements of the directions of an audit.
+
+        Parameters
+        ----------
+        gradient : ndarray
+            The gradient under test.
+        count : int
+            Number of random directions of all leaves.
+        rng : Generator
+        is_wanted : callable, optional
+            ``is_wanted(name)`` selects directions; default: all.
+
+        Returns
+        -------
+        list of (str, ndarray)
+            Random directions; and those that see errors which random ones average out: each leaf alone, all entries
+            by the same, along the gradient, and its largest entry.
+        """
+        displacements = {f"random {number + 1}": self.random(rng) for number in range(count)}
+        if 1 < len(self.names) <= MOST_LEAVES:
+            leaf_number = self._for_each_entry(range(len(self.values)))
+            for number, name in enumerate(self.names):
+                displacements[f"random in {name}"] = self.random(rng) * (leaf_number == number)
+        if self.entries > 1:
+            displacements["constant"] = self.units
+            slopes = self.units * gradient
+            largest = np.max(np.abs(slopes), initial=0.0)
+            if largest:
+                shares = slopes / largest
+                displacements["gradient"] = self.units * shares / max(root_mean_square(shares), 1 / LARGEST_SHARE)
+                is_largest = np.arange(slopes.size) == np.argmax(np.abs(slopes))
+                displacements["largest entry"] = self.units * is_largest
+        return [
+            (name, displacement)
+            for name, displacement in displacements.items()
+            if np.any(displacement) and (is_wanted is None or is_wanted(name))
+        ]
+
+    def random(self, rng: np.random.Generator) -> NDArray[Any]:
+        """Return a random displacement with a root mean square of one unit in each leaf."""
+        values = rng.standard_normal(self.vector.size)
+        return self.units * (values / self._leaf_sizes(values))
+
+    def _leaf_sizes(self, vector: NDArray[Any]) -> NDArray[Any]:
+        """Return for each entry the root mean square of its leaf, 1 for a leaf of zeros."""
+        return self._for_each_entry([root_mean_square(part) or 1.0 for part in self.split(vector)])
+
+    def _for_each_entry(self, leaf_values: Sequence[float]) -> NDArray[Any]:
+        """Repeat a value of each leaf for each of its entries."""
+        return np.repeat(leaf_values, [part.size for part in self.split(self.vector)])
