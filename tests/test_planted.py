@@ -208,8 +208,8 @@ BUGS = {
     ),
     "1 as the derivative at a kink": Bug(
         "advection",
-        "np.heaviside(plain(c), 0.5)",
-        "np.heaviside(plain(c), 1.0)",
+        "np.heaviside(plain(courant), 0.5)",
+        "np.heaviside(plain(courant), 1.0)",
         "tests/advection/test_transport_rules.py::test_kinks_get_the_mean_of_both_sides",
     ),
     "a stale set-up after a change of the coefficient": Bug(
@@ -262,8 +262,8 @@ BUGS = {
     ),
     "a wall value without a derivative": Bug(
         "advection",
-        "anp.concatenate([u, inflow])",
-        "anp.concatenate([u, plain(inflow)])",
+        "values = anp.concatenate([u, inflow])",
+        "values = anp.concatenate([u, plain(inflow)])",
         "tests/advection/test_transport_rules.py",
     ),
     "a checkpoint that misses a vector of the optimizer": Bug(
@@ -407,14 +407,14 @@ BUGS = {
     ),
     "a departure point as far as the whole step at half of it": Bug(
         "advection",
-        "Trajectory(component.half_way, w, 0.5 * step)",
-        "Trajectory(component.half_way, w, step)",
+        "Trajectory(interpolant.half_way, w, 0.5 * step)",
+        "Trajectory(interpolant.half_way, w, step)",
         "tests/advection/test_transport_lagrange.py",
     ),
     "a MacCormack step that adds all that it misses": Bug(
         "advection",
-        "        self.new *= 0.5\n",
-        "        self.new *= 1.0\n",
+        "        self.unclamped *= 0.5\n",
+        "        self.unclamped *= 1.0\n",
         "tests/advection/test_transport_lagrange.py",
     ),
     # ---- flow, integrators, trajectory

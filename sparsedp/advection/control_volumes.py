@@ -1,128 +1,226 @@
-"""Points that carry a field, and what is beyond their sides, as the numbers that the loops over sides take.
+"""The control volumes of an Eulerian transport scheme, as the tables that the loops over their sides read.
 
-A component of the moved field lives on a lattice of points, one control volume each: the cells of the grid, or the
-faces across one axis (half a cell at a wall). Along each axis, side f lies between the points f - 1 and f; a bounded
-axis has one more side than points, the two walls included, a periodic one as many. Points and sides of all components
-and axes are numbered one after the other, like the inflow values of all walls.
+A component of the field lives on a lattice of points with one control volume each: the cells of the grid, or the faces
+across one axis (half a cell at a wall). Along each axis, side f lies between the points f - 1 and f. A bounded axis has
+one side more than points, including both walls; a periodic axis has as many sides as points. Points, velocities on
+sides and inflow values at walls are numbered one after the other, for all axes and components.
 """
 
+from __future__ import annotations
+
 from math import prod
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from sparsedp import kernels
-from sparsedp._utils.validation import place
 from sparsedp.grid.boundary_conditions import neumann
-from sparsedp.kernels.fluxes import ITSELF, ROUND, TILE, UNEVEN
+from sparsedp.kernels.fluxes import (
+    COLUMN,
+    EXTRA,
+    ITSELF,
+    ON_SIDES,
+    PROPERTIES,
+    ROUND,
+    SPEED,
+    STRIDE,
+    TILE,
+    UNEVEN,
+    VARIES,
+    WALL,
+    N,
+)
 
-__all__ = ["Component", "Sides", "components", "place_words"]
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from sparsedp.advection.settings import TransportSettings
+    from sparsedp.grid.grid import Grid
+    from sparsedp.kernels.team import Kernel
+
+__all__ = ["Component", "Sides", "components"]
 
 
 class Sides(NamedTuple):
-    """The lower and the upper sides (rows) of the points of a component along an axis."""
+    """The sides of all points of a component along an axis: lower sides in row 0, upper sides in row 1.
 
-    beyond: Any  # the point on the other side, at a wall the point itself
-    speed: Any  # which of the velocities
-    wall: Any  # which of the inflow values; -1 where none is given
-    at_wall: Any
-    column: Any  # of each point in the table
+    Attributes
+    ----------
+    beyond : int array
+        The point on the other side; at a wall the point itself.
+    speed : int array
+        Index of the velocity.
+    wall : int array
+        Index of the inflow value; -1 where none is given.
+    at_wall : bool array
+        Whether the side is a wall.
+    column : int array, one entry for each point
+        Its column in the table of lengths.
+    """
+
+    beyond: NDArray[np.int64]
+    speed: NDArray[np.int64]
+    wall: NDArray[np.int64]
+    at_wall: NDArray[np.bool_]
+    column: NDArray[np.int64]
 
 
 class Component(NamedTuple):
-    """One component of the field; for the arrays see `sparsedp.kernels.fluxes`."""
+    """One component of the field.
 
-    field: slice  # its numbers in the field, in the inflow, in the velocity
+    Attributes
+    ----------
+    field, inflow, speed : slice
+        Its entries in the flat field, in the inflow values and in the velocity.
+    free : bool array, shape (2 dim, points) or (2 dim, 0)
+        For each side (lower and upper, axis by axis) whether it is open at the points; no columns if all are.
+    table : array
+        Inverse lengths and distances; see `sparsedp.kernels.fluxes`.
+    axes : int array
+        One row of properties for each axis; see `sparsedp.kernels.fluxes`.
+    tiles : int
+        Number of tiles that the loops run over.
+    """
+
+    field: slice
     inflow: slice
     speed: slice
-    free: Any
-    table: Any
-    axes: Any
+    free: NDArray[np.bool_]
+    table: NDArray[np.float64]
+    axes: NDArray[np.int64]
     tiles: int
 
-    def run(self, loop, *args):
-        """A loop over the tiles."""
-        work = (self.field.stop - self.field.start) * len(self.axes)  # each axis is a pass: 512^2 pays for two threads
+    @property
+    def points(self) -> int:
+        """Number of points."""
+        return self.field.stop - self.field.start
+
+    def run(self, loop: Kernel, *args: Any) -> None:
+        """Run a compiled loop over all tiles."""
+        work = self.points * len(self.axes)  # each axis is a pass: 512^2 cells pay for two threads
         loop.run(self.tiles, work, kernels.threads(), *args)
 
-    def sides(self, a):
-        """Axis -> Sides."""
-        return _sides(self.axes[a], np.arange(self.field.stop - self.field.start))
+    def sides(self, axis: int) -> Sides:
+        """Return the sides of all points along an axis."""
+        return _sides(self.axes[axis], np.arange(self.points))
 
 
-def components(setting, limited):
-    """All components of the moved field. limited: the scheme has slopes."""
-    found, starts, at_points, in_solid = [], [0, 0, 0], setting.at_points, setting.solid_points
-    for own, shape in enumerate(setting.space.parts):
-        rows, cells, speed, wall = [], prod(shape), 0, 0
+def components(settings: TransportSettings, limited: bool) -> list[Component]:
+    """Return all components of the transported field; `limited`: whether the scheme has limited slopes."""
+    result: list[Component] = []
+    field_start = inflow_start = speed_start = 0
+    solid_points = settings.solid_points
+    for number, shape in enumerate(settings.space.parts):
+        points = prod(shape)
+        axes = np.zeros((len(shape), PROPERTIES), np.int64)
         tables: list = []
-        for a, n in enumerate(shape):
-            stride, ends, extra, many = prod(shape[a + 1 :]), [ROUND] * 2, 0, cells // n
-            if setting.sides[a]:
-                pair = zip(setting.sides[a], (wall, wall + many), strict=True)
-                ends = [ITSELF if side == neumann else at for side, at in pair]
-                wall, extra = wall + 2 * many, 0 if at_points else stride
-            lines = _lines(setting.grid, a, setting.of == "faces" and a == own, at_points, limited)
-            rows.append([n, stride, not at_points, speed, extra, *ends, sum(map(len, tables)), len(lines) > 1, False])
-            tables.append(lines)
-            speed += cells + extra * (many // stride)
-        axes, free = np.array(rows, np.int64), np.zeros((2 * len(shape), 0), bool)
-        if in_solid is not None:
-            solid, cell = in_solid[starts[0] :][:cells], np.arange(cells)
-            free = np.concatenate([~(solid | solid[_sides(row, cell).beyond]) for row in axes])
-        axes[:, UNEVEN] = free.size or any(np.any(x[:, :4] != x[0, 0]) for x in tables)
-        stops = [starts[0] + cells, starts[1] + wall, starts[2] + speed]
-        tiles = cells // shape[-1] * -(-shape[-1] // TILE)
-        field, inflow, speeds = map(slice, starts, stops)
-        found.append(Component(field, inflow, speeds, free, np.concatenate(tables).T.copy(), axes, tiles))
-        starts = stops
-    return found
+        speeds = 0
+        wall_values = 0
+        for axis, n in enumerate(shape):
+            row = axes[axis]
+            lines = points // n
+            row[N] = n
+            row[STRIDE] = prod(shape[axis + 1 :])
+            row[ON_SIDES] = not settings.at_points
+            row[SPEED] = speeds
+            row[WALL : WALL + 2] = ROUND
+            if settings.sides[axis]:
+                for side, condition in enumerate(settings.sides[axis]):
+                    if condition == neumann:
+                        row[WALL + side] = ITSELF
+                    else:
+                        row[WALL + side] = wall_values + side * lines
+                wall_values += 2 * lines
+                if row[ON_SIDES]:
+                    row[EXTRA] = row[STRIDE]
+            staggered = settings.of == "faces" and axis == number
+            table = _lengths(settings.grid, axis, staggered, settings.at_points, limited)
+            row[COLUMN] = sum(map(len, tables))
+            row[VARIES] = len(table) > 1
+            tables.append(table)
+            speeds += points + row[EXTRA] * (lines // row[STRIDE])
+        free = np.zeros((2 * len(shape), 0), bool)
+        if solid_points is not None:
+            solid = solid_points[field_start:][:points]
+            free = np.concatenate([~(solid | solid[_sides(row, np.arange(points)).beyond]) for row in axes])
+        axes[:, UNEVEN] = free.size or any(np.any(table[:, :4] != table[0, 0]) for table in tables)
+        result.append(
+            Component(
+                field=slice(field_start, field_start + points),
+                inflow=slice(inflow_start, inflow_start + wall_values),
+                speed=slice(speed_start, speed_start + int(speeds)),
+                free=free,
+                table=np.concatenate(tables).T.copy(),
+                axes=axes,
+                tiles=points // shape[-1] * -(-shape[-1] // TILE),
+            )
+        )
+        field_start = result[-1].field.stop
+        inflow_start = result[-1].inflow.stop
+        speed_start = result[-1].speed.stop
+    return result
 
 
-def _sides(row, cell):
-    """A row of `axes`, the numbers of all points -> Sides."""
-    n, stride, on_sides, speed, extra = row[:5]
-    through, sign, walls = cell // stride, np.array([[-1], [1]]), row[5:7, None]
-    place, block = through % n, through // n
-    ends, bounded = place == [[0], [n - 1]], walls != ROUND
-    step = np.where(ends, 1 - n, 1) * sign * stride
+def _sides(row: NDArray[np.int64], points: NDArray[np.int64]) -> Sides:
+    """Return the sides along an axis, from its row of properties and the numbers of all points."""
+    n = row[N]
+    stride = row[STRIDE]
+    sign = np.array([[-1], [1]])  # lower and upper
+    walls = row[WALL : WALL + 2, None]
+    bounded = walls != ROUND
+    line = points // stride
+    position = line % n  # along the axis
+    block = line // n
+    at_end = position == [[0], [n - 1]]
+    step = np.where(at_end, 1 - n, 1) * sign * stride
+    to_next_side = np.where(bounded, stride, step)
     return Sides(
-        cell + np.where(ends & bounded, 0, step),
-        speed + cell + block * extra + (sign > 0) * on_sides * np.where(bounded, stride, step),
-        np.where(ends & (walls >= 0), walls + block * stride + cell % stride, -1),
-        ends & bounded,
-        row[7] + row[8] * place,
+        beyond=points + np.where(at_end & bounded, 0, step),
+        speed=row[SPEED] + points + block * row[EXTRA] + (sign > 0) * row[ON_SIDES] * to_next_side,
+        wall=np.where(at_end & (walls >= 0), walls + block * stride + points % stride, -1),
+        at_wall=at_end & bounded,
+        column=row[COLUMN] + row[VARIES] * position,
     )
 
 
-def _lines(grid, axis, staggered, at_points, limited):
-    """The columns of an axis in the table: one for each place along it, or one for all.
+def _lengths(grid: Grid, axis: int, staggered: bool, at_points: bool, limited: bool) -> NDArray[np.float64]:
+    """Return the table of an axis, one row for each position along it, or a single row if all are equal.
 
-    Lengths are the widths of control volumes, infinite where there is none; or (at_points and not limited) those
-    between points, at a wall the width of the control volume.
+    The columns are the inverse lengths of `sparsedp.kernels.fluxes` (OWN, THEIRS) and, if `limited`, the distances.
+    Lengths are the widths of control volumes, infinite where there is none. With a velocity at points and without
+    slopes they are the distances between points, and at a wall the width of the control volume.
     """
-    cells, between, periodic = grid.widths[axis], grid.spacings(axis), grid.periodic[axis]
-    widths, inner = (between, cells) if staggered else (cells, between[1:-1])
+    cells = grid.widths[axis]
+    spacings = grid.spacings(axis)
+    periodic = grid.periodic[axis]
+    if staggered:
+        widths = spacings
+    else:
+        widths = cells
+    if staggered:
+        inner_gaps = cells
+    else:
+        inner_gaps = spacings[1:-1]
     with np.errstate(divide="ignore"):
         widths = np.where(widths > 0, widths, np.inf)
-    gaps = np.concatenate([widths[:1], inner, widths[-1:]])
-    if periodic:
-        gaps = np.append(cells[-1:], cells) if staggered else np.append(between, between[:1])
-    around = gaps[:-1], gaps[1:]
-    lengths = [widths, widths, np.roll(widths, 1), np.roll(widths, -1)]
+    if not periodic:
+        gaps = np.concatenate([widths[:1], inner_gaps, widths[-1:]])
+    elif staggered:
+        gaps = np.append(cells[-1:], cells)
+    else:
+        gaps = np.append(spacings, spacings[:1])
+    below = gaps[:-1]
+    above = gaps[1:]
     if at_points and not limited:
-        lengths = [*around, *around]
-    lines = [1.0 / length for length in lengths]
-    if limited:  # the distances to both neighbours, or to walls, over half a width
-        gaps[[0, -1]] /= 1 if periodic else 2
-        lines += [2 * gaps[:-1] / widths, 2 * gaps[1:] / widths]
-    table = np.transpose(lines)
-    return table if np.any(table != table[0]) else table[:1]
-
-
-def place_words(setting, index):
-    """Words for the place of a number of the field."""
-    space = setting.space
-    own = int(np.searchsorted(space.offsets, index, "right")) - 1
-    label = f" of the {setting.grid.axes[own]}-faces" if setting.of == "faces" else ""
-    return f"{place(index - space.offsets[own], space.parts[own])}{label}"
+        lengths = [below, above, below, above]
+    else:
+        lengths = [widths, widths, np.roll(widths, 1), np.roll(widths, -1)]
+    columns = [1.0 / length for length in lengths]
+    if limited:  # the distances to both neighbours, or to the walls, over half a width
+        if not periodic:
+            gaps[[0, -1]] /= 2  # `below` and `above` are views
+        columns += [2 * below / widths, 2 * above / widths]
+    table = np.transpose(columns)
+    if np.any(table != table[0]):
+        return table
+    return table[:1]

@@ -1,59 +1,80 @@
-"""From the velocity at the points to their departure points.
+"""Departure points: where the content of each point comes from in a step along the velocity.
 
-With s = dt / spacing the departure point of point i is, in index coordinates,
+With s = dt / spacing, the departure point of point i is, in index coordinates,
 
     euler:     i - s w(i)
     midpoint:  i - s m,    m = w at i - (s / 2) w(i), linear between points.
 
-For euler the cotangent of m is that of w. For midpoint, with I the interpolation at i - (s / 2) w,
+For euler the velocity used along the step is w itself. For midpoint, with the interpolation I at i - (s / 2) w, the
+cotangent of w is
 
     g_w = I^T g_m + (gradient of I w in w) g_m.
 
-Everything depends on s w alone: the derivative in dt is that in w along w / dt.
+Everything depends on s w alone: the derivative in dt is the derivative in w along w / dt.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sparsedp.advection.interpolant import Pass
+from sparsedp.advection.interpolant import InterpolatedComponent
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from sparsedp.advection.interpolant import Interpolant
 
 __all__ = ["Trajectory"]
 
-NONE = np.empty(0)
+EMPTY = np.empty(0)  # no inflow values
 
 
 class Trajectory:
-    """Where the points of a component come from in a signed step along w, their velocities (axis, point).
+    """The paths of the points of a component in a signed step along their velocities.
 
     Parameters
     ----------
-    component : Interpolant
-    w : array
+    interpolant : Interpolant
+    w : array, shape (axes, points)
+        Velocities at the points.
     step : float
+        Signed time step.
 
     Attributes
     ----------
-    displacement, scale, sides
-        The departure point is point - scale * displacement; see `index_coordinates`.
+    displacement : Displacement
+        Displacements of the departure points.
     """
 
-    def __init__(self, component, w, step):
-        self.component, self.rows = component, []
-        if component.half_way is not None:
-            half_way = Trajectory(component.half_way, w, 0.5 * step)
-            self.rows = [Pass(half_way, row, NONE) for row in w]
-            w = np.stack([row.value() for row in self.rows])
-        self.displacement, self.scale, self.sides = component.coordinates.displacement(w, step)
+    def __init__(self, interpolant: Interpolant, w: NDArray, step: float) -> None:
+        self.interpolant = interpolant
+        self._half_way: list[InterpolatedComponent] = []  # for midpoint: each velocity component half way
+        if interpolant.half_way is not None:
+            first_half = Trajectory(interpolant.half_way, w, 0.5 * step)
+            self._half_way = [first_half.at_departure_points(row, EMPTY) for row in w]
+            w = np.stack([row.value() for row in self._half_way])
+        self.displacement = interpolant.coordinates.displacement(w, step)
 
-    def vjp(self, g):
-        """Cotangent of the velocity used all along the step -> that of w, in its place."""
-        if not self.rows:
+    def at_departure_points(self, u: NDArray, inflow: NDArray) -> InterpolatedComponent:
+        """Return a field at the departure points."""
+        return InterpolatedComponent(self.interpolant, self.displacement, u, inflow)
+
+    def vjp(self, g: NDArray) -> None:
+        """Replace the cotangent of the velocity used along the step by the cotangent of w, in place."""
+        if not self._half_way:
             return
-        given, bent, change = g.copy(), np.zeros_like(g), np.empty_like(g)
-        for row, part, target in zip(self.rows, given, g, strict=True):
-            row.vjp(part, (target, NONE), change)
-            bent += change
-        g += bent
+        given = g.copy()
+        through_points = np.zeros_like(g)
+        slopes = np.empty_like(g)
+        for row, part, target in zip(self._half_way, given, g, strict=True):
+            row.vjp(part, target, EMPTY)
+            through_points += row.velocity_slopes(part, slopes)
+        g += through_points
 
-    def jvp(self, dw):
-        """Tangent of w -> that of the velocity used all along the step."""
-        return np.stack([row.jvp(dv, NONE, dw) for row, dv in zip(self.rows, dw, strict=True)]) if self.rows else dw
+    def jvp(self, dw: NDArray) -> NDArray:
+        """Return the tangent of the velocity used along the step for the tangent of w."""
+        if not self._half_way:
+            return dw
+        return np.stack([row.jvp(dv, EMPTY, dw) for row, dv in zip(self._half_way, dw, strict=True)])

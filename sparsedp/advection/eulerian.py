@@ -1,120 +1,348 @@
-"""The schemes that look at the sides of cells: donor cell, van Leer and others of `sparsedp.kernels.fluxes.SCHEMES`.
+r"""Eulerian schemes, which sum fluxes through the sides of cells: upwind, van Leer, and others of `SCHEMES`.
 
-Donor cell, first order: the value at a side is that of the cell it comes from.
-Van Leer, second order where the field is smooth: with A and B the differences of u to the point below and above, of the
-same sign, q = A / (A + B), widths h, distances d, c = 2 d_below / h and e = 2 d_above / h, the value at a side differs
-from that at its point by
+Upwind (donor cell), first order: the value at a side is the value of the cell that the flow comes from.
+
+Van Leer, second order where the field is smooth: let A and B be the differences of u to the points below and above,
+q = A / (A + B), h the width, d the distances to both neighbours, c = 2 d_below / h and e = 2 d_above / h. If A and B
+have the same sign, the value at a side differs from the value at its point by
 
     s = (A + B) R(q),   R = q (1 - q) (q e^2 + (1 - q) c^2) / (q^2 e^2 + (c + e - 2) c e q (1 - q) + (1 - q)^2 c^2)
 
-(equal cells: A B / (A + B), the harmonic mean), and s = 0 where A and B differ in sign. A step is the mean of the field
-and of what two steps of Euler make of it. The sum of the Courant numbers of all sides of a point must not exceed 1/2:
-then no new extrema appear (TVD in 1-D). Where one of A, B is 0 the derivative is the mean of both sides, as it is at
-rest; where both are 0 it is 0.
+(equal cells: A B / (A + B), half the harmonic mean); otherwise s = 0. A step is the mean of the field and the result of
+two Euler steps (SSP-RK2). The Courant numbers of all sides of a point must not sum to more than 1/2: then there are no
+new extrema (TVD in 1-D). If one of A and B is 0, the derivative of s is the mean of both one-sided derivatives, as it
+is for a velocity of 0; if both are 0, it is 0.
 
-Sources: R. Courant, E. Isaacson, M. Rees, Comm. Pure Appl. Math. 5 (1952) 243-255. B. van Leer, J. Comput. Phys. 32
-(1979) 101-136; stretched grids: A. Mignone, J. Comput. Phys. 270 (2014) 784-814; stages: S. Gottlieb, C.-W. Shu, Math.
-Comp. 67 (1998) 73-85.
+The compiled loops of `sparsedp.kernels.fluxes` compute a step and its cotangents. `SparseReference` replaces them where
+numba is missing or a value is traced, and computes tangents and matrices.
+
+References
+----------
+R. Courant, E. Isaacson, M. Rees, Comm. Pure Appl. Math. 5 (1952) 243-255 (upwind).
+B. van Leer, J. Comput. Phys. 32 (1979) 101-136 (limiter and slopes).
+A. Mignone, J. Comput. Phys. 270 (2014) 784-814 (stretched grids).
+S. Gottlieb, C.-W. Shu, Math. Comp. 67 (1998) 73-85 (stages).
 """
+
+from __future__ import annotations
 
 from functools import cached_property
 from math import isfinite
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import scipy.sparse as sp
 
+from sparsedp import kernels
 from sparsedp._utils import buffers
 from sparsedp._utils.validation import check_finite
-from sparsedp.advection.law import FIELD, INFLOW, VELOCITY, Law
-from sparsedp.advection.loops import Loops, able
-from sparsedp.advection.reference import Reference
-from sparsedp.advection.stability import check_numbers, check_weights
-from sparsedp.advection.values import NOTHING
+from sparsedp.advection.arguments import ROUNDING, check_numbers, check_stability
+from sparsedp.advection.method import TransportMethod
+from sparsedp.advection.settings import FIELD, INFLOW, VELOCITY
+from sparsedp.advection.sparse_reference import SparseReference
 from sparsedp.autodiff.tape import isbox
+from sparsedp.kernels import fluxes
 from sparsedp.kernels.fluxes import SCHEMES
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from sparsedp.advection.control_volumes import Component
+    from sparsedp.advection.settings import TransportSettings
 
 __all__ = ["Eulerian"]
 
+EMPTY = np.zeros(0)  # in place of an array that is not wanted
 
-class Eulerian(Law):
-    """See the head of the file: compiled loops, and `Reference` where they do not work or a value is traced."""
 
-    def __init__(self, setting):
-        super().__init__(setting)
-        self.scheme = SCHEMES[setting.scheme]
-        self.reference = Reference(self)
-        self.linear = self.twice = self.scheme.limiter is None
-        self.adds = self.between is None and able()
+class Eulerian(TransportMethod):
+    """A scheme of `SCHEMES`: a limiter for the values at the sides of cells, and the stages of a step."""
+
+    def __init__(self, settings: TransportSettings) -> None:
+        super().__init__(settings)
+        self.scheme = SCHEMES[settings.scheme]
+        first_order = self.scheme.limiter is None
+        self.linear = first_order
+        self.any_order = first_order
+        self.accumulates = self.interpolation is None and _has_compiled_loops()
 
     @cached_property
-    def loops(self):
-        return Loops(self.reference)
+    def reference(self) -> SparseReference:
+        """The same scheme by sparse matrices."""
+        return SparseReference(self.settings, self.scheme, self.walls.size, self.interpolation)
 
-    def forward(self, u, v, dt, inflow):
-        out, wrong = u, 0.0
-        if able():
-            w = self.velocity(v)
+    @cached_property
+    def _loops(self) -> CompiledLoops:
+        return CompiledLoops(self.reference)
+
+    def forward(self, u: NDArray, v: NDArray, dt: float, inflow: NDArray) -> NDArray:
+        """Return the field after one step."""
+        if _has_compiled_loops():
+            w = self.interpolate_velocity(v)
+            out = u
+            invalid = 0.0
             for keep in self.scheme.stages:
-                x, out = out, buffers.empty(u.shape, float)
-                wrong += self.loops.stage(x, self.loops.slopes(x, inflow, False), w, dt, inflow, u, keep, out)
+                x = out
+                out = buffers.empty(u.shape, float)
+                slopes = self._loops.slopes(x, inflow, partials=False)
+                invalid += self._loops.stage(x, slopes, w, dt, inflow, u, keep, out)
+            must_check = invalid or not isfinite(self._unread_sum(v, inflow))
         else:
             with np.errstate(all="ignore"):
-                out, wrong = self.reference.step(u, v, dt, inflow), True
-        if wrong or not isfinite(self._unseen(v, inflow)):
-            self._check(u, v, dt, inflow, out)
+                out = self.reference.step(u, v, dt, inflow)
+            must_check = True
+        if must_check:
+            check_numbers(self.settings, u, v, inflow)
+            check_stability(self.settings, dt, self.reference.rate(v), self.scheme.max_courant)
+            check_finite(self.name, out.reshape(self.settings.space.shape), "cannot represent the result")
         return out
 
-    def _check(self, u, v, dt, inflow, out):
-        """Name what a step has found wrong, and what it has not met."""
-        check_numbers(self.setting, u, v, inflow)
-        check_weights(self.setting, dt, self.reference.rate(v), self.scheme.most)
-        check_finite(self.name, out.reshape(self.setting.space.shape), "cannot represent the result")
+    def _unread_sum(self, v: NDArray, inflow: NDArray) -> float:
+        """Return the sum of the values that the loops may skip: inflow at closed walls, velocities inside the solid."""
+        if inflow.size:
+            total = inflow.sum()
+        else:
+            total = 0.0
+        if self.settings.solid is None:
+            return total
+        return total + v.sum()
 
-    def _unseen(self, v, inflow):
-        """Sum over what a step may leave out: inflow values at closed walls, velocities inside solids."""
-        unseen = inflow.sum() if inflow.size else 0.0
-        return unseen if self.setting.solid is None else unseen + v.sum()
-
-    def vjp(self, nums, g, u, v, dt, inflow, into=None):
-        if not able() or any(map(isbox, (g, u, v, dt, inflow))):
+    def vjp(
+        self,
+        nums: Sequence[int],
+        g: Any,
+        u: Any,
+        v: Any,
+        dt: Any,
+        inflow: Any,
+        velocity_sum: NDArray | None = None,
+    ) -> tuple[tuple[Any, ...], bool]:
+        """Return the cotangents of the arguments `nums`; see `TransportMethod`."""
+        if not _has_compiled_loops() or any(map(isbox, (g, u, v, dt, inflow))):
             return self.reference.vjp(nums, g, u, v, dt, inflow), False
-        w, field = self.velocity(v), FIELD in nums or INFLOW in nums
-        gw, fresh = NOTHING if VELOCITY not in nums else into, into is None
-        if gw is None:
-            gw = buffers.empty(w.shape, float)
-        of_field, of_inflow, wrong = self._stages_vjp(np.ascontiguousarray(g), u, w, dt, inflow, gw, field, fresh)
-        found = {FIELD: of_field, INFLOW: of_inflow, VELOCITY: self.velocity_vjp(gw) if gw.size else None}
-        seen = self.adds and not (self.scheme.limiter and field) and isfinite(of_inflow.sum())
-        return tuple(found[num] for num in nums), seen and not wrong
+        w = self.interpolate_velocity(v)
+        of_field_wanted = FIELD in nums or INFLOW in nums
+        of_velocity_is_set = velocity_sum is None
+        of_velocity = EMPTY
+        if VELOCITY in nums:
+            if velocity_sum is None:
+                of_velocity = buffers.empty(w.shape, float)
+            else:
+                of_velocity = velocity_sum
+        of_field, of_inflow, invalid = self._vjp_of_stages(
+            np.ascontiguousarray(g), u, w, dt, inflow, of_velocity, of_field_wanted, of_velocity_is_set
+        )
+        cotangents: dict[int, Any] = {FIELD: of_field, INFLOW: of_inflow, VELOCITY: None}
+        if of_velocity.size:
+            cotangents[VELOCITY] = self.interpolate_velocity_vjp(of_velocity)
+        # The loops do not count what interpolation and slopes add.
+        counted = self.accumulates and not (self.scheme.limiter and of_field_wanted)
+        finite = counted and isfinite(of_inflow.sum()) and not invalid
+        return tuple(cotangents[num] for num in nums), finite
 
-    def _stages_vjp(self, g, u, w, dt, inflow, gw, field, fresh):
-        """Cotangents of u (field: where it is wanted) and inflow; that of w goes into gw (fresh: nothing is there).
+    def _vjp_of_stages(
+        self,
+        g: NDArray,
+        u: NDArray,
+        w: NDArray,
+        dt: float,
+        inflow: NDArray,
+        of_velocity: NDArray,
+        of_field_wanted: bool,
+        of_velocity_is_set: bool,
+    ) -> tuple[NDArray, NDArray, float]:
+        """Return the cotangents of u and inflow, and how many computed cotangents are not finite.
 
-        Also how many of w in the end, and of u in each stage, are not finite.
+        The cotangent of w is set in `of_velocity` if `of_velocity_is_set`, else added to it.
         """
-        known: list = []
+        stages: list[_Stage] = []
         for keep in self.scheme.stages:
             x = u
-            if known:
+            if stages:
+                last = stages[-1]
                 x = buffers.empty(u.shape, float)
-                self.loops.stage(*known[-1][:2], w, dt, inflow, u, known[-1][2], x)
-            known.append((x, self.loops.slopes(x, inflow, True), keep))
-        ginflow, rest = np.zeros(inflow.size), None
-        while known:
-            x, slopes, keep = known.pop()
-            if keep:  # a share of the cotangent goes to the first field
-                rest, g = (keep * g if rest is None else rest + keep * g), (1.0 - keep) * g
-            gu = buffers.empty(u.shape, float) if known or field else NOTHING
-            wrong = self.loops.vjp(g, x, slopes, w, dt, inflow, gu, ginflow, gw, fresh)
-            g, fresh = gu, False
-        if rest is not None and field:
-            g += rest
-        return g, ginflow, wrong
+                self._loops.stage(last.x, last.slopes, w, dt, inflow, u, last.keep, x)
+            stages.append(_Stage(x, self._loops.slopes(x, inflow, partials=True), keep))
+        of_inflow = np.zeros(inflow.size)
+        of_first_field = None  # the share that the means of later stages give to u directly
+        invalid = 0.0
+        while stages:
+            x, slopes, keep = stages.pop()
+            if keep:
+                share = keep * g
+                if of_first_field is None:
+                    of_first_field = share
+                else:
+                    of_first_field = of_first_field + share
+                g = (1.0 - keep) * g
+            if stages or of_field_wanted:
+                of_x = buffers.empty(u.shape, float)
+            else:
+                of_x = EMPTY
+            invalid = self._loops.vjp(g, x, slopes, w, dt, inflow, of_x, of_inflow, of_velocity, of_velocity_is_set)
+            g = of_x
+            of_velocity_is_set = False
+        if of_first_field is not None and of_field_wanted:
+            g += of_first_field
+        return g, of_inflow, invalid
 
-    def jvp(self, tangents, u, v, dt, inflow):
+    def jvp(self, tangents: Mapping[int, Any], u: Any, v: Any, dt: Any, inflow: Any) -> Any:
+        """Return the tangent of the result; see `TransportMethod`."""
         return self.reference.jvp(tangents, u, v, dt, inflow)
 
-    def matrix(self, v, dt):
-        nothing = np.zeros(self.setting.space.size), v, np.zeros(self.walls.size)
-        check_numbers(self.setting, *nothing)
-        check_weights(self.setting, dt, self.reference.rate(v), self.scheme.most)
+    def matrix(self, v: NDArray, dt: float) -> sp.csr_array:
+        """Return the step as a matrix on u."""
+        check_numbers(self.settings, np.zeros(self.settings.space.size), v, np.zeros(self.walls.size))
+        check_stability(self.settings, dt, self.reference.rate(v), self.scheme.max_courant)
         return self.reference.matrix(v, dt)
+
+
+class _Stage(NamedTuple):
+    """A stage of a step: the field before it, its slopes, and the share of the first field in the mean after it."""
+
+    x: NDArray
+    slopes: list
+    keep: float
+
+
+def _has_compiled_loops() -> bool:
+    """Return whether the compiled loops work on this machine."""
+    return kernels.compiled() and fluxes.stage.compiled is not None
+
+
+class CompiledLoops:
+    """The loops of `sparsedp.kernels.fluxes` on all components of a field, for velocities on their sides or in cells.
+
+    Parameters
+    ----------
+    reference : SparseReference
+        The same scheme by sparse matrices; it holds the tables of the components.
+    """
+
+    def __init__(self, reference: SparseReference) -> None:
+        self.scheme = reference.scheme
+        self.flux_form = reference.flux_form
+        self.components = reference.components
+        self.slope_loop = fluxes.slope_loops.get(reference.settings.scheme)
+        if self.scheme.symmetric:
+            self.slopes_per_axis = 1
+        else:
+            self.slopes_per_axis = 2
+        self.least_weight = 1.0 - self.scheme.max_courant - ROUNDING
+        self._no_slopes = [self._empty_slopes(component, 0, 0) for component in self.components]
+
+    def slopes(self, u: NDArray, inflow: NDArray, partials: bool) -> list:
+        """Return for each component its limited slopes and their derivatives in a and b.
+
+        The derivatives are empty without `partials`; a first-order scheme has no slopes either.
+        """
+        if self.slope_loop is None:
+            return self._no_slopes
+        result = []
+        for part in self.components:
+            slopes, derivatives = self._empty_slopes(part, part.points, part.points if partials else 0)
+            part.run(
+                self.slope_loop,
+                u[part.field],
+                inflow[part.inflow],
+                part.free,
+                part.table,
+                part.axes,
+                slopes,
+                derivatives,
+            )
+            result.append((slopes, derivatives))
+        return result
+
+    def _empty_slopes(self, part: Component, points: int, points_of_derivatives: int) -> tuple[NDArray, NDArray]:
+        shape = (len(part.axes), self.slopes_per_axis)
+        slopes = buffers.empty((*shape, points), float)
+        return slopes, buffers.empty((*shape, 2, points_of_derivatives), float)
+
+    def _inputs(self, part: Component, u: NDArray, inflow: NDArray, w: NDArray, slopes: NDArray, dt: float) -> tuple:
+        """Return the arguments that the loops `stage` and `vjp` share."""
+        return (
+            u[part.field],
+            inflow[part.inflow],
+            w[part.speed],
+            part.free,
+            slopes,
+            dt,
+            part.table,
+            part.axes,
+            self.flux_form,
+        )
+
+    def stage(
+        self,
+        u: NDArray,
+        slopes: list,
+        w: NDArray,
+        dt: float,
+        inflow: NDArray,
+        first_field: NDArray,
+        keep: float,
+        out: NDArray,
+    ) -> float:
+        """Set out = keep first_field + (1 - keep) (u + dt du/dt).
+
+        Returns
+        -------
+        float
+            Number of points with a weight below the stable limit or a result that is not finite.
+        """
+        total = 0.0
+        for part, (values, _) in zip(self.components, slopes, strict=True):
+            invalid = np.empty(part.tiles)
+            inputs = self._inputs(part, u, inflow, w, values, dt)
+            part.run(fluxes.stage, *inputs, self.least_weight, first_field[part.field], keep, out[part.field], invalid)
+            total += invalid.sum()
+        return total
+
+    def vjp(
+        self,
+        g: NDArray,
+        u: NDArray,
+        slopes: list,
+        w: NDArray,
+        dt: float,
+        inflow: NDArray,
+        of_u: NDArray,
+        of_inflow: NDArray,
+        of_w: NDArray,
+        of_w_is_set: bool,
+    ) -> float:
+        """Pull the cotangent of u + dt du/dt back.
+
+        `of_u` is set to the cotangent of u. The cotangent of the inflow is added to `of_inflow`. `of_w` is set to the
+        cotangent of w if `of_w_is_set`; otherwise the cotangent is added. An empty array leaves a part out. The
+        derivatives in `slopes` are overwritten.
+
+        Returns
+        -------
+        float
+            Number of values of `of_u` (without what the slopes add) and `of_w` that are not finite.
+        """
+        total = 0.0
+        for part, (values, partials) in zip(self.components, slopes, strict=True):
+            inputs = self._inputs(part, u, inflow, w, values, dt)
+            part_of_u = of_u[part.field]
+            part_of_inflow = of_inflow[part.inflow]
+            invalid = np.empty(part.tiles)
+            part.run(
+                fluxes.vjp,
+                g[part.field],
+                *inputs,
+                part_of_u,
+                part_of_inflow,
+                of_w[part.speed],
+                of_w_is_set,
+                partials,
+                invalid,
+            )
+            total += invalid.sum()
+            if partials.size and of_u.size:
+                part.run(fluxes.slope_vjp, partials, part.free, part.axes, part_of_u, part_of_inflow)
+        return total

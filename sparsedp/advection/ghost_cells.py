@@ -1,65 +1,95 @@
-"""Ghost cells around a component of a field, and a solid filled from the fluid around it.
+"""Ghost cells around a component of a field, and solid cells that are filled from the fluid around them.
 
-Beyond a wall the field goes on with the value of the nearest point (neumann) or with the inflow value (dirichlet), as
-if that stood one spacing away from the last point; a periodic axis wraps. Where two axes meet, the later one decides.
+Beyond a wall the field continues with the value of the nearest point (neumann) or with the inflow value (dirichlet),
+which applies from one spacing beyond the last point. A periodic axis wraps. Where two axes meet, the later one decides.
 """
 
+from __future__ import annotations
+
 from functools import reduce
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.advection.law import wall_space
+from sparsedp.advection.settings import wall_space
 from sparsedp.grid.boundary_conditions import dirichlet
 from sparsedp.kernels.departure_samples import PAD
 from sparsedp.operators.stencils import cell_beside
 
-__all__ = ["filling", "ghost_origins"]
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from sparsedp.advection.settings import TransportSettings
+    from sparsedp.grid.grid import Grid
+    from sparsedp.kernels.departure_samples import Points
+
+__all__ = ["ghost_sources", "solid_filling"]
 
 
-def ghost_origins(setting, number, points, closed):
-    """The ghost cells of component `number`, and the sample that each repeats, as numbers of samples.
+def ghost_sources(
+    settings: TransportSettings, number: int, points: Points, closed: bool
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the ghost cells of a component and, for each of them, the sample whose value it repeats.
 
-    After the samples of the field with its ghost cells stand the inflow values. `closed`: none of them is used.
+    Parameters
+    ----------
+    settings : TransportSettings
+    number : int
+        Number of the component.
+    points : Points
+    closed : bool
+        Whether no inflow value is used.
+
+    Returns
+    -------
+    ghosts, sources : int arrays
+        Numbers of samples: first the field with its ghost cells, then the inflow values.
     """
-    sides, walls, samples = setting.sides, wall_space(setting), np.arange(points.samples).reshape(points.padded)
-    nearest = []
+    sides = settings.sides
+    samples = np.arange(points.samples).reshape(points.padded)
+    nearest = []  # for each axis the point nearest to each sample
     for n, pair in zip(points.shape, sides, strict=True):
-        place = np.arange(-PAD, n + PAD)
-        nearest.append(place.clip(0, n - 1) if pair else place % n)
-    origins = samples[np.ix_(*(PAD + p for p in nearest))]
+        position = np.arange(-PAD, n + PAD)
+        nearest.append(position.clip(0, n - 1) if pair else position % n)
+    sources = samples[np.ix_(*(PAD + position for position in nearest))]
+    walls = wall_space(settings)
     wall = number * sum(2 for pair in sides if pair)
     for axis, pair in enumerate(sides):
         for beyond, condition in zip((slice(PAD), slice(-PAD, None)), pair or ()):
             if condition == dirichlet and not closed:
                 values = samples.size + np.arange(*walls.offsets[wall : wall + 2]).reshape(walls.parts[wall])
-                along = [*nearest[:axis], [0], *nearest[axis + 1 :]]
-                origins[(slice(None),) * axis + (beyond,)] = values[np.ix_(*along)]
+                along_wall = [*nearest[:axis], [0], *nearest[axis + 1 :]]
+                sources[(slice(None),) * axis + (beyond,)] = values[np.ix_(*along_wall)]
             wall += 1
-    ghosts = np.flatnonzero(origins != samples)
-    return ghosts, origins.ravel()[ghosts]
+    ghosts = np.flatnonzero(sources != samples)
+    return ghosts, sources.ravel()[ghosts]
 
 
-def filling(grid, solid):
-    """Solid cells -> csr_array that leaves fluid cells alone and fills the others from them.
+def solid_filling(grid: Grid, solid: NDArray[np.bool_]) -> sp.csr_array:
+    """Return the matrix on cell fields that keeps fluid cells and fills the solid cells from them.
 
-    A solid cell gets the mean of the cells next to it that are fluid or filled already, layer by layer inwards: what
-    a neumann wall does too.
+    A solid cell gets the mean of its neighbours that are fluid or already filled, layer by layer inwards. A neumann
+    wall has the same effect.
     """
-    lines = [_beside(grid, axis) for axis in range(grid.dim)]
-    beside = reduce(lambda first, second: sp.kronsum(second, first, "csr"), lines)
-    known, total = ~solid.ravel(), sp.eye_array(solid.size, format="csr")
+    adjacency = reduce(
+        lambda first, second: sp.kronsum(second, first, "csr"), [_neighbours(grid, axis) for axis in range(grid.dim)]
+    )
+    filled = ~solid.ravel()
+    total = sp.eye_array(solid.size, format="csr")
     while True:
-        layer = sp.diags_array(1.0 * ~known) @ beside @ sp.diags_array(1.0 * known)
+        layer = sp.diags_array(1.0 * ~filled) @ adjacency @ sp.diags_array(1.0 * filled)
         count = layer.sum(axis=1)
-        if not count.any():  # all is filled, or there is no fluid to fill it from
+        if not count.any():  # all cells are filled, or there is no fluid
             return total
-        mean, rest = sp.diags_array(1 / np.maximum(count, 1)) @ layer, sp.diags_array(1.0 * (count == 0))
-        total = sp.csr_array((mean + rest) @ total)
-        known |= count > 0
+        mean = sp.diags_array(1 / np.maximum(count, 1)) @ layer
+        unchanged = sp.diags_array(1.0 * (count == 0))
+        total = sp.csr_array((mean + unchanged) @ total)
+        filled |= count > 0
 
 
-def _beside(grid, axis):
-    """Cells along an axis -> the sum of the cells beside each of them; a link to itself, at a wall, does no harm."""
-    below, above = (cell_beside(grid, axis, upper).matrix for upper in (False, True))
+def _neighbours(grid: Grid, axis: int) -> sp.csr_array:
+    """Return the adjacency matrix of the cells along an axis; at a wall a cell is also its own neighbour."""
+    below = cell_beside(grid, axis, False).matrix
+    above = cell_beside(grid, axis, True).matrix
     return below.T @ above + above.T @ below

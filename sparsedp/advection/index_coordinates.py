@@ -1,96 +1,152 @@
-"""Index coordinates: from a velocity and a step to the displacement of the departure point, counted in points.
+"""Index coordinates: the displacement of a departure point, counted in points, from a velocity and a step.
 
-The departure point of point i is i - scale d in index coordinates. On cells of equal width d is the velocity and
-scale = step / spacing. On others let x(q) be the interpolant of the positions of the points, the same that the field
-gets (linear or Catmull-Rom), and q(x) its inverse. Then scale = 1 and
+The departure point of point i is i - scale d in index coordinates. On cells of equal width, d is the velocity and
+scale = step / spacing. On other cells let x(q) be the interpolant of the positions of the points (linear or
+Catmull-Rom, as for the field), and q(x) its inverse. Then scale = 1 and
 
     d_i = i - q(x_i - step m_i),    derivative of d_i in m_i = step q',
 
-so that a field linear in x is carried exactly. q is piecewise linear for linear interpolation, and its slope jumps
-at the points: there the derivative is the mean of both sides, each the slope of the field times that of q. For cubic
-interpolation q is smooth, and monotone as long as neighbouring distances differ by no more than a factor of 5.
-Beyond a wall the points go on at the distance of the width of the last cell.
+so that a field linear in x is transported exactly. For linear interpolation q is piecewise linear, and its slope jumps
+at the points: the derivative there is the mean of both sides, each the slope of the field times the slope of q. For
+cubic interpolation q is smooth, and monotone if neighbouring distances differ by at most a factor of 5.
+Beyond a wall the points continue at a distance of the width of the last cell.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from sparsedp._utils import buffers
 from sparsedp._utils.validation import EPS, number_beside
 
-__all__ = ["Coordinates"]
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from sparsedp.advection.settings import TransportSettings
+
+__all__ = ["Displacement", "IndexCoordinates"]
 
 LAYERS = 4  # points beyond each end
 STEEPEST = 5.0  # ratio of neighbouring distances up to which a Catmull-Rom curve is monotone
-NEWTON = 50  # steps at most; about five are needed
-BLOCK = 1 << 13  # points at a time: what is made on the way stays in the cache
+NEWTON_STEPS = 50  # at most; about five are needed
+BLOCK = 1 << 13  # points at a time: intermediate arrays stay in the cache
 
 
-class Coordinates:
-    """Index coordinates of component `number` of a field."""
+class Displacement(NamedTuple):
+    """Displacements of departure points in index coordinates.
 
-    def __init__(self, setting, number, interpolation):
-        grid, self.shape, self.lines = setting.grid, setting.space.parts[number], []
-        self.rates = np.array([1.0 / float(h[0]) for h in grid.widths])
-        for axis, h in enumerate(() if all(grid.uniform) else grid.widths):
-            on_faces, periodic = setting.of == "faces" and number == axis, grid.periodic[axis]
-            gaps = h if on_faces else 0.5 * (h + np.roll(h, -1))[: h.size - (not periodic)]
-            ends = dict(mode="wrap") if periodic else dict(constant_values=(h[0], h[-1]))
-            gaps = np.pad(gaps, LAYERS, **ends)
-            if interpolation == "cubic":
-                _check_monotone(setting.scheme, gaps)
-            self.lines.append(Line(gaps, h.size if periodic else None, interpolation == "cubic"))
+    Attributes
+    ----------
+    values : array, shape (axes, points)
+    scale : array, shape (axes,)
+        The departure point of a point is point - scale * values.
+    slopes : array, shape (0, 1 or 2, axes, points)
+        Derivatives of `values` in the velocity. Empty where they are 1 (cells of equal width); two if they may jump:
+        above and below the departure point.
+    """
 
-    def displacement(self, m, step):
-        """Velocities (axis, point), signed step -> d, its scale, the derivative of d in m.
+    values: NDArray
+    scale: NDArray
+    slopes: NDArray | tuple
 
-        On cells of equal width that is 1: (). Else one, or two where it may jump: above and below.
-        """
-        if not self.lines:
-            return m, self.rates * step, ()
-        found = buffers.empty((2 if self.lines[0].cubic else 3, *m.shape), float)
+
+class IndexCoordinates:
+    """Index coordinates of a component of the field.
+
+    Parameters
+    ----------
+    settings : TransportSettings
+    number : int
+        Number of the component.
+    interpolation : "linear" or "cubic"
+    """
+
+    def __init__(self, settings: TransportSettings, number: int, interpolation: str) -> None:
+        grid = settings.grid
+        self.shape = settings.space.parts[number]
+        self.inverse_widths = np.array([1.0 / float(widths[0]) for widths in grid.widths])
+        self.axes: list[PointsOfAxis] = []
+        if all(grid.uniform):
+            return
+        cubic = interpolation == "cubic"
+        for axis, widths in enumerate(grid.widths):
+            periodic = grid.periodic[axis]
+            if settings.of == "faces" and number == axis:
+                gaps = widths
+            else:
+                gaps = 0.5 * (widths + np.roll(widths, -1))[: widths.size - (not periodic)]
+            if periodic:
+                gaps = np.pad(gaps, LAYERS, mode="wrap")
+            else:
+                gaps = np.pad(gaps, LAYERS, constant_values=(widths[0], widths[-1]))
+            if cubic:
+                _check_monotone(settings.scheme, gaps)
+            self.axes.append(PointsOfAxis(gaps, widths.size if periodic else None, cubic))
+
+    def displacement(self, m: NDArray, step: float) -> Displacement:
+        """Return the displacements for velocities m (axis, point) and a signed time step."""
+        if not self.axes:
+            return Displacement(m, self.inverse_widths * step, ())
+        if self.axes[0].cubic:
+            slopes_per_point = 1
+        else:
+            slopes_per_point = 2
+        result = buffers.empty((1 + slopes_per_point, *m.shape), float)
         for start in range(0, m.shape[1], BLOCK):
-            some = np.arange(start, min(start + BLOCK, m.shape[1]))
-            for axis, (line, points) in enumerate(zip(self.lines, np.unravel_index(some, self.shape), strict=True)):
-                q, *slopes = line.index(line.knots[LAYERS + points] - step * m[axis, some])
-                found[:, axis, some] = points - q, *(step * slope for slope in slopes)
-        return found[0], np.ones(len(m)), found[1:]
+            block = np.arange(start, min(start + BLOCK, m.shape[1]))
+            positions = np.unravel_index(block, self.shape)
+            for number, (axis, points) in enumerate(zip(self.axes, positions, strict=True)):
+                q, *slopes = axis.index_of(axis.knots[LAYERS + points] - step * m[number, block])
+                result[0, number, block] = points - q
+                for row, slope in enumerate(slopes, 1):
+                    result[row, number, block] = step * slope
+        return Displacement(result[0], np.ones(len(m)), result[1:])
 
 
-class Line:
-    """Points along an axis, and the index coordinate of a place among them.
+class PointsOfAxis:
+    """The points along an axis, and the index coordinate of a position among them.
 
     Parameters
     ----------
     gaps : array
-        Distances between the points, LAYERS beyond each end included.
-    turn : int or None
-        Points in a period.
+        Distances between the points, including LAYERS points beyond each end.
+    period : int or None
+        Number of points in a period.
     cubic : bool
-        Whether the position between the points is the curve of Catmull and Rom; else straight lines.
+        Whether the position between the points is a Catmull-Rom curve, else piecewise linear.
     """
 
-    def __init__(self, gaps, turn, cubic):
-        self.knots, self.gaps, self.turn, self.cubic = np.concatenate([[0.0], np.cumsum(gaps)]), gaps, turn, cubic
+    def __init__(self, gaps: NDArray, period: int | None, cubic: bool) -> None:
+        self.gaps = gaps
+        self.period = period
+        self.cubic = cubic
+        self.knots = np.concatenate([[0.0], np.cumsum(gaps)])
         self.tangents = np.gradient(self.knots)  # slopes of the cubic at the points
 
-    def index(self, x):
-        """Places -> index coordinates, and their slopes in x: one, or two where it may jump, above and below."""
-        if self.turn is None:
-            x, turns = np.clip(x, self.knots[0], self.knots[-1]), 0
+    def index_of(self, x: NDArray) -> tuple[NDArray, ...]:
+        """Return the index coordinates of positions and their slopes in x: one, or two where it may jump."""
+        turns: NDArray | int = 0
+        if self.period is None:
+            x = np.clip(x, self.knots[0], self.knots[-1])
         else:
-            start, end = self.knots[[LAYERS, LAYERS + self.turn]]
-            turns = np.floor((x - start) / (end - start))
-            x, turns = x - turns * (end - start), turns * self.turn
+            start, end = self.knots[[LAYERS, LAYERS + self.period]]
+            periods = np.floor((x - start) / (end - start))
+            x = x - periods * (end - start)
+            turns = periods * self.period
         gap = np.minimum(np.searchsorted(self.knots, x, "right") - 1, self.gaps.size - 1)
-        aim, width, number = x - self.knots[gap], self.gaps[gap], gap - LAYERS + turns
+        offset = x - self.knots[gap]
+        width = self.gaps[gap]
+        number = gap - LAYERS + turns
         if self.cubic:
-            part, slope = _inverse(aim, width, self.tangents[gap], self.tangents[gap + 1])
-            return number + part, slope
-        below = np.where(aim == 0, self.gaps[np.maximum(gap - 1, 0)], width)
-        return number + aim / width, 1.0 / width, 1.0 / below
+            fraction, slope = _inverse_of_cubic(offset, width, self.tangents[gap], self.tangents[gap + 1])
+            return number + fraction, slope
+        width_below = np.where(offset == 0, self.gaps[np.maximum(gap - 1, 0)], width)
+        return number + offset / width, 1.0 / width, 1.0 / width_below
 
 
-def _check_monotone(scheme, gaps):
+def _check_monotone(scheme: str, gaps: NDArray) -> None:
     ratio = np.maximum(gaps[1:] / gaps[:-1], gaps[:-1] / gaps[1:]).max()
     if ratio > STEEPEST * (1 + 1e-9):
         raise ValueError(
@@ -100,19 +156,24 @@ def _check_monotone(scheme, gaps):
         )
 
 
-def _inverse(aim, gap, first, last):
-    """t where the cubic with the ends 0, gap and the slopes first, last is aim, and the slope of t there.
+def _inverse_of_cubic(target: NDArray, gap: NDArray, first: NDArray, last: NDArray) -> tuple[NDArray, NDArray]:
+    """Return t where a cubic has the value `target`, and the slope of t there.
 
-    Newton's method on a cubic that grows with t. It starts where the cubic is straight, and from there on it is bent to
-    one side only: the steps overshoot once at most, so that the ends of the gap are all the bounds they need.
+    The cubic increases from 0 at t = 0 to `gap` at t = 1, with the slopes `first` and `last`. Newton's method starts
+    at the inflection point. From there the curvature has one sign, so the steps overshoot at most once, and the ends of
+    the gap are the only bounds that they need.
     """
-    square, cube = 3 * gap - 2 * first - last, first + last - 2 * gap
-    slope = lambda t: np.maximum((3 * cube * t + 2 * square) * t + first, EPS * gap)
+    square = 3 * gap - 2 * first - last
+    cube = first + last - 2 * gap
+
+    def slope(t):
+        return np.maximum((3 * cube * t + 2 * square) * t + first, EPS * gap)
+
     with np.errstate(divide="ignore", invalid="ignore"):
         t = np.fmin(np.fmax(-square / (3 * cube), 0.0), 1.0)  # 0 also where the cubic is a straight line
-    for _ in range(NEWTON):
-        before = t
-        t = np.clip(t - (((cube * t + square) * t + first) * t - aim) / slope(t), 0.0, 1.0)
-        if np.all(np.abs(t - before) <= 4 * EPS):
+    for _ in range(NEWTON_STEPS):
+        previous = t
+        t = np.clip(t - (((cube * t + square) * t + first) * t - target) / slope(t), 0.0, 1.0)
+        if np.all(np.abs(t - previous) <= 4 * EPS):
             break
     return t, 1.0 / slope(t)

@@ -1,122 +1,189 @@
-"""One component of a field between its points: padded, interpolated at departure points, and back."""
+"""A component of a field between its points: padded with ghost cells, interpolated at departure points, transposed."""
+
+from __future__ import annotations
 
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sp
 
 from sparsedp._utils import buffers
 from sparsedp._utils.validation import EPS
-from sparsedp.advection.ghost_cells import filling, ghost_origins
-from sparsedp.advection.index_coordinates import Coordinates
+from sparsedp.advection.ghost_cells import ghost_sources, solid_filling
+from sparsedp.advection.index_coordinates import IndexCoordinates
 from sparsedp.kernels import departure_samples
 from sparsedp.kernels.departure_samples import PAD
 
-__all__ = ["Interpolant", "Pass"]
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from sparsedp.advection.index_coordinates import Displacement
+    from sparsedp.advection.settings import TransportSettings
+
+__all__ = ["InterpolatedComponent", "Interpolant"]
 
 
 class Interpolant:
-    """Component `number` of a field: linear or cubic; `closed`: linear, and walls repeat the nearest value.
+    """The interpolation of a component of the field, linear or cubic.
+
+    Parameters
+    ----------
+    settings : TransportSettings
+    number : int
+        Number of the component.
+    closed : bool
+        Use linear interpolation, and repeat the nearest value beyond walls. The velocity is interpolated like this.
 
     Attributes
     ----------
     span : slice
-        Where the component stands in the flat field.
+        Entries of the component in the flat field.
     half_way : Interpolant or None
-        Of the velocity half way to a departure point; None: points keep their own velocity (euler).
+        Interpolant of the velocity half way to a departure point; None if points keep their own velocity (euler).
     """
 
-    def __init__(self, setting, number, closed=False):
-        interpolation = "linear" if closed else setting.interpolation
-        self.setting, self.span = setting, slice(*setting.space.offsets[number : number + 2])
-        self.points = departure_samples.Points.of(setting.space.parts[number], setting.grid.periodic, interpolation)
-        self.inside = tuple(slice(PAD, PAD + n) for n in self.points.shape)
-        self.ghosts, self.origins = ghost_origins(setting, number, self.points, closed)
-        self.coordinates = Coordinates(setting, number, interpolation)
-        midpoint = setting.backtrace == "midpoint" and not closed
-        self.half_way = Interpolant(setting, number, closed=True) if midpoint else None
-        self.fill = None  # the map that fills solid cells, and its transpose
-        if setting.of == "cells" and setting.solid is not None and not closed:  # faces lend their value to others
-            forward = filling(setting.grid, setting.solid)
-            self.fill = forward, sp.csr_array(forward.T)
+    def __init__(self, settings: TransportSettings, number: int, closed: bool = False) -> None:
+        if closed:
+            interpolation = "linear"
+        else:
+            interpolation = settings.interpolation
+        self.settings = settings
+        self.span = slice(*settings.space.offsets[number : number + 2])
+        self.points = departure_samples.Points.of(settings.space.parts[number], settings.grid.periodic, interpolation)
+        self.coordinates = IndexCoordinates(settings, number, interpolation)
+        self.half_way: Interpolant | None = None
+        if settings.backtrace == "midpoint" and not closed:
+            self.half_way = Interpolant(settings, number, closed=True)
+        self._inside = tuple(slice(PAD, PAD + n) for n in self.points.shape)
+        self._ghosts, self._sources = ghost_sources(settings, number, self.points, closed)
+        self._filling: sp.csr_array | None = None
+        if settings.of == "cells" and settings.solid is not None and not closed:  # faces keep their value
+            self._filling = solid_filling(settings.grid, settings.solid)
+            self._filling_transpose = sp.csr_array(self._filling.T)
 
-    def pad(self, u, inflow):
-        """Component, inflow values -> samples: the field with its ghost cells, and after them the inflow values."""
+    def fill_solid(self, u: NDArray) -> NDArray:
+        """Return the component with solid cells filled from the fluid."""
+        if self._filling is None:
+            return u
+        return self._filling @ u
+
+    def fill_solid_vjp(self, of_u: NDArray) -> None:
+        """Apply the transpose of `fill_solid` to a cotangent, in place."""
+        if self._filling is not None:
+            of_u[:] = self._filling_transpose @ of_u
+
+    def filled_matrix(self, matrix: sp.csr_array) -> sp.csr_array:
+        """Return the product of a matrix with the matrix of `fill_solid`."""
+        if self._filling is None:
+            return matrix
+        return matrix @ self._filling
+
+    def pad(self, u: NDArray, inflow: NDArray) -> NDArray:
+        """Return the samples: the component with its ghost cells, followed by the inflow values."""
         cells = self.points.samples
         samples = buffers.empty((cells + inflow.size,), float)
-        samples[:cells].reshape(self.points.padded)[self.inside] = u.reshape(self.points.shape)
+        samples[:cells].reshape(self.points.padded)[self._inside] = u.reshape(self.points.shape)
         samples[cells:] = inflow
-        samples[self.ghosts] = samples[self.origins]
+        samples[self._ghosts] = samples[self._sources]
         return samples
 
-    def pad_vjp(self, samples, of_u, of_inflow):
-        """Cotangent of samples, which is used up -> written to of_u, added to of_inflow."""
+    def pad_vjp(self, samples: NDArray, of_u: NDArray, of_inflow: NDArray) -> None:
+        """Pull a cotangent of the samples back: set `of_u` and add to `of_inflow`. The cotangent is overwritten."""
         cells = self.points.samples
-        np.add.at(samples, self.origins, samples[self.ghosts])
-        of_u.reshape(self.points.shape)[...] = samples[:cells].reshape(self.points.padded)[self.inside]
+        np.add.at(samples, self._sources, samples[self._ghosts])
+        of_u.reshape(self.points.shape)[...] = samples[:cells].reshape(self.points.padded)[self._inside]
         of_inflow += samples[cells:]
 
 
-class Pass:
-    """A component of a field at the departure points of a trajectory, and the derivatives of that."""
+class InterpolatedComponent:
+    """A component of a field at departure points, with its derivatives.
 
-    def __init__(self, trajectory, u, inflow):
-        self.trajectory, self.component, self.u, self.inflow = trajectory, trajectory.component, u, inflow
-        self.points, self.departure = self.component.points, (trajectory.displacement, trajectory.scale)
+    Parameters
+    ----------
+    interpolant : Interpolant
+    displacement : Displacement
+    u : array
+        The component, flat.
+    inflow : array
+        All inflow values.
+    """
+
+    def __init__(self, interpolant: Interpolant, displacement: Displacement, u: NDArray, inflow: NDArray) -> None:
+        self.interpolant = interpolant
+        self.displacement = displacement
+        self.u = u
+        self.inflow = inflow
+        self.points = interpolant.points
 
     @cached_property
-    def samples(self):
-        """The component with its ghost cells."""
-        fill = self.component.fill
-        return self.component.pad(self.u if fill is None else fill[0] @ self.u, self.inflow)
+    def samples(self) -> NDArray:
+        """The component with its ghost cells, and the inflow values."""
+        return self.interpolant.pad(self.interpolant.fill_solid(self.u), self.inflow)
 
-    def value(self, out=None, bounds=departure_samples.NO_BOUNDS):
-        """Values at the departure points; least and greatest sample of the cells around them -> bounds."""
-        out = buffers.empty((self.points.size,), float) if out is None else out
-        return departure_samples.interpolate(self.points, self.samples, *self.departure, out, bounds=bounds)
+    def with_field(self, u: NDArray, inflow: NDArray) -> InterpolatedComponent:
+        """Return another field at the same departure points."""
+        return InterpolatedComponent(self.interpolant, self.displacement, u, inflow)
 
-    def vjp(self, g, into, of_w, clamped=None):
-        """Cotangent of the values -> that of u is written, that of inflow added to the pair `into`.
+    def value(self, out: NDArray | None = None, bounds: NDArray = departure_samples.NO_BOUNDS) -> NDArray:
+        """Return the values at the departure points.
 
-        That of the velocity is written to `of_w`; None leaves a part out. `clamped`: samples, and their cotangents.
+        `bounds` is filled with the least and the greatest sample of the cells around them, if it has room.
         """
-        if into is not None:
-            samples = buffers.empty((self.points.samples + self.inflow.size,), float)
-            samples[:] = 0.0
-            if clamped is not None:
-                np.add.at(samples, *clamped)
-            self.component.pad_vjp(departure_samples.scatter(self.points, *self.departure, g, samples), *into)
-            if self.component.fill is not None:
-                into[0][:] = self.component.fill[1] @ into[0]
-        if of_w is not None:
-            self.trajectory.vjp(self.slopes(g, of_w))
+        if out is None:
+            out = buffers.empty((self.points.size,), float)
+        values, scale, _ = self.displacement
+        return departure_samples.interpolate(self.points, self.samples, values, scale, out, bounds=bounds)
 
-    def slopes(self, g, out):
-        """g times the derivative of the values in the velocity all along the trajectory -> out (axis, point)."""
-        (displacement, scale), sides = self.departure, self.trajectory.sides
-        if not len(sides):
-            return departure_samples.interpolate(self.points, self.samples, displacement, scale, out, g)
-        nudge = 32 * EPS * max(self.points.shape) * (sides[0] != sides[-1])  # to the side that is meant
+    def vjp(
+        self,
+        g: NDArray,
+        of_u: NDArray,
+        of_inflow: NDArray,
+        of_samples: tuple[NDArray, NDArray] | None = None,
+    ) -> None:
+        """Pull a cotangent of the values back: set `of_u` and add to `of_inflow`.
+
+        `of_samples` is a pair (numbers of samples, their cotangents), which are pulled back too.
+        """
+        samples = buffers.empty((self.points.samples + self.inflow.size,), float)
+        samples[:] = 0.0
+        if of_samples is not None:
+            np.add.at(samples, *of_samples)
+        values, scale, _ = self.displacement
+        departure_samples.scatter(self.points, values, scale, g, samples)
+        self.interpolant.pad_vjp(samples, of_u, of_inflow)
+        self.interpolant.fill_solid_vjp(of_u)
+
+    def velocity_slopes(self, g: NDArray, out: NDArray) -> NDArray:
+        """Set `out` (axis, point) to g times the derivative of the values in the velocity used along the step."""
+        values, scale, slopes = self.displacement
+        if not len(slopes):
+            return departure_samples.interpolate(self.points, self.samples, values, scale, out, g)
+        # Move a point at which the slope jumps to the side that the slope belongs to.
+        nudge = 32 * EPS * max(self.points.shape) * (slopes[0] != slopes[-1])
         total = 0.0
-        for slope, shift in zip(sides, (-nudge, nudge)):
-            found = buffers.empty(out.shape, float)
-            total += slope * departure_samples.interpolate(
-                self.points, self.samples, displacement + shift, scale, found, g
-            )
-        return np.divide(total, len(sides), out=out)
+        for slope, shift in zip(slopes, (-nudge, nudge)):
+            field_slope = buffers.empty(out.shape, float)
+            departure_samples.interpolate(self.points, self.samples, values + shift, scale, field_slope, g)
+            total += slope * field_slope
+        return np.divide(total, len(slopes), out=out)
 
-    def jvp(self, du, dinflow, dw):
-        """Tangents of u, of inflow and of the velocity (or None) -> that of the values."""
-        total = Pass(self.trajectory, du, dinflow).value()
+    def jvp(self, du: NDArray, dinflow: NDArray, dw: NDArray | None) -> NDArray:
+        """Return the tangent of the values for tangents of u, inflow and the velocity used along the step."""
+        total = self.with_field(du, dinflow).value()
         if dw is None:
             return total
-        return total + np.sum(self.slopes(np.ones(total.size), np.empty(dw.shape)) * self.trajectory.jvp(dw), axis=0)
+        return total + np.sum(self.velocity_slopes(np.ones(total.size), np.empty(dw.shape)) * dw, axis=0)
 
-    def matrix(self):
-        """The values as a csr_array in u, without what flows in."""
-        n, fill = self.points.size, self.component.fill
-        sources = self.component.pad(np.arange(n), np.full(self.inflow.size, n)).astype(int)  # n: inflow
-        entries = departure_samples.entries(self.points, *self.departure)
-        columns = (sp.csr_array((weight, sources[index], np.arange(n + 1)), (n, n + 1)) for index, weight in entries)
-        moved = sum(columns)[:, :n]
-        return moved if fill is None else moved @ fill[0]
+    def matrix(self) -> sp.csr_array:
+        """Return the matrix on u whose product is the values for inflow 0."""
+        n = self.points.size
+        # The field of the numbers of points gives for each sample its source; n stands for inflow.
+        sources = self.interpolant.pad(np.arange(n), np.full(self.inflow.size, n)).astype(int)
+        values, scale, _ = self.displacement
+        total = sum(
+            sp.csr_array((weight, sources[index], np.arange(n + 1)), (n, n + 1))
+            for index, weight in departure_samples.entries(self.points, values, scale)
+        )
+        return self.interpolant.filled_matrix(total[:, :n])

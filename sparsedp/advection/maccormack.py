@@ -1,4 +1,4 @@
-"""MacCormack transport: a semi-Lagrangian step, one back again, and half of what that misses added.
+"""MacCormack transport: a semi-Lagrangian step, a step back, and half of the error between them added.
 
 With f = W u (looking back along the velocity) and b = V f (looking ahead along it),
 
@@ -6,79 +6,131 @@ With f = W u (looking back along the velocity) and b = V f (looking ahead along 
 
     g_f = c g - V^T (c g) / 2,    g_u = c g / 2 + W^T g_f + (cotangents of the bounds),    c = 1 where not clamped.
 
-Clamped values pass their cotangent on to the samples that equal the bound, in equal parts. Where the
-value equals a bound the derivative is the mean of both sides: c = 1/2 and half goes to the bound.
-Second order in space and time for smooth data; clamping lowers that at extrema.
-Source: A. Selle, R. Fedkiw, B. Kim, Y. Liu, J. Rossignac, J. Scientific Computing 35 (2008) 350-371.
+A clamped value passes its cotangent on to the samples that equal the bound, in equal parts. Where the value equals a
+bound, the derivative is the mean of both sides: c = 1/2, and the other half goes to the bound. The scheme is of second
+order in space and time for smooth data; clamping lowers the order at extrema.
+
+References
+----------
+A. Selle, R. Fedkiw, B. Kim, Y. Liu, J. Rossignac, J. Scientific Computing 35 (2008) 350-371.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from sparsedp._utils import buffers
-from sparsedp.advection.interpolant import Pass
+from sparsedp.advection.departure_points import Trajectory
 from sparsedp.advection.semi_lagrangian import SemiLagrangian
 from sparsedp.kernels import departure_samples
 
-__all__ = ["MacCormack"]
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from sparsedp.advection.interpolant import Interpolant
+
+__all__ = ["CorrectedStep", "MacCormack"]
 
 
-class Corrected:
-    """Two passes of a component, back in time and ahead again, and what becomes of them; used like a `Pass`, once."""
+class _Clamped(NamedTuple):
+    """The points where the clamp acts."""
 
-    def __init__(self, back, ahead, u, inflow):
-        self.first, self.clamp = Pass(back, u, inflow), back.component.setting.clamp
-        self.bounds = buffers.empty((2, u.size), float) if self.clamp else departure_samples.NO_BOUNDS
+    points: NDArray
+    free_share: NDArray  # derivative of the result in the value before the clamp
+    samples: NDArray  # numbers of the samples of the cells around the departure points, a row for each corner
+    sample_shares: NDArray  # derivatives of the result in these samples
+
+
+class CorrectedStep:
+    """The MacCormack step of one component of the field, with the methods of `ComponentStep`. `vjp` may run once.
+
+    Parameters
+    ----------
+    interpolant : Interpolant
+    w : array, shape (axes, points)
+        Velocities at the points.
+    dt : float
+    u : array
+        The component, flat.
+    inflow : array
+        All inflow values.
+    """
+
+    def __init__(self, interpolant: Interpolant, w: NDArray, dt: float, u: NDArray, inflow: NDArray) -> None:
+        self.clamp = interpolant.settings.clamp
+        self.back = Trajectory(interpolant, w, dt)
+        self.ahead = Trajectory(interpolant, w, -dt)
+        if self.clamp:
+            self.bounds = buffers.empty((2, u.size), float)
+        else:
+            self.bounds = departure_samples.NO_BOUNDS
+        self.first = self.back.at_departure_points(u, inflow)
         f = self.first.value(bounds=self.bounds)
-        self.second = Pass(ahead, f, inflow)
-        self.new = self.second.value()  # what comes back, and then the new value before it is clamped
-        np.subtract(u, self.new, out=self.new)
-        self.new *= 0.5
-        self.new += f
+        self.second = self.ahead.at_departure_points(f, inflow)
+        self.unclamped = self.second.value()
+        np.subtract(u, self.unclamped, out=self.unclamped)
+        self.unclamped *= 0.5
+        self.unclamped += f
 
-    def _clamps(self):
-        """Points where the clamp acts: which, the share of the value that stays, samples and shares of the bounds."""
-        first, new = self.first, self.new
-        some = np.flatnonzero((new <= self.bounds[0]) | (new >= self.bounds[1]))
-        (low, high), value = self.bounds[:, some], new[some]
-        below, above = np.heaviside(low - value, 0.5), np.heaviside(value - high, 0.5)
-        index, least, greatest = departure_samples.bound_shares(first.points, first.samples, *first.departure, some)
-        return some, 1.0 - below - above, index, least * below + greatest * above
+    def _clamped(self) -> _Clamped:
+        points = np.flatnonzero((self.unclamped <= self.bounds[0]) | (self.unclamped >= self.bounds[1]))
+        value = self.unclamped[points]
+        below = np.heaviside(self.bounds[0, points] - value, 0.5)
+        above = np.heaviside(value - self.bounds[1, points], 0.5)
+        values, scale, _ = self.first.displacement
+        samples, least, greatest = departure_samples.bound_shares(
+            self.first.points, self.first.samples, values, scale, points
+        )
+        return _Clamped(points, 1.0 - below - above, samples, least * below + greatest * above)
 
-    def value(self, out):
-        """See `Pass`."""
-        np.clip(self.new, *(self.bounds if self.clamp else (-np.inf, np.inf)), out=out)
-
-    def vjp(self, g, into, of_w):
-        """See `Pass`."""
-        own, of_f, clamped = buffers.empty(g.shape, float), buffers.empty(g.shape, float), None
-        own[:] = g
+    def value(self, out: NDArray) -> None:
+        """Set `out` to the component after the step."""
         if self.clamp:
-            some, free, index, shares = self._clamps()
-            own[some] *= free
-            clamped = index, shares * g[some]
-        of_b, ahead = np.multiply(-0.5, own, out=self.new), None if of_w is None else buffers.empty(of_w.shape, float)
-        self.second.vjp(of_b, (of_f, into[1] if into else np.zeros_like(self.first.inflow)), ahead)
-        of_f += own
-        self.first.vjp(of_f, into, of_w, clamped)
-        if into is not None:
-            np.subtract(into[0], of_b, out=into[0])
-        if ahead is not None:
-            of_w += ahead
+            np.clip(self.unclamped, self.bounds[0], self.bounds[1], out=out)
+        else:
+            out[:] = self.unclamped
 
-    def jvp(self, du, dinflow, dw):
-        """See `Pass`."""
-        df = self.first.jvp(du, dinflow, dw)
-        total = df + 0.5 * (du - self.second.jvp(df, dinflow, dw))
+    def vjp(self, g: NDArray, of_u: NDArray | None, of_inflow: NDArray, of_w: NDArray | None) -> None:
+        """Pull a cotangent back; see `ComponentStep.vjp`."""
+        of_unclamped = buffers.empty(g.shape, float)
+        of_unclamped[:] = g
+        of_samples = None
         if self.clamp:
-            some, free, index, shares = self._clamps()
-            samples = Pass(self.first.trajectory, du, dinflow).samples
-            total[some] = free * total[some] + np.sum(shares * samples[index], axis=0)
+            clamped = self._clamped()
+            of_unclamped[clamped.points] *= clamped.free_share
+            of_samples = (clamped.samples, clamped.sample_shares * g[clamped.points])
+        of_b = np.multiply(-0.5, of_unclamped, out=self.unclamped)
+        of_f = buffers.empty(g.shape, float)
+        self.second.vjp(of_b, of_f, of_inflow if of_u is not None else np.zeros_like(of_inflow))
+        if of_w is not None:
+            of_w_ahead = buffers.empty(of_w.shape, float)
+            self.ahead.vjp(self.second.velocity_slopes(of_b, of_w_ahead))
+        of_f += of_unclamped
+        if of_u is not None:
+            self.first.vjp(of_f, of_u, of_inflow, of_samples)
+            np.subtract(of_u, of_b, out=of_u)
+        if of_w is not None:
+            self.back.vjp(self.first.velocity_slopes(of_f, of_w))
+            of_w += of_w_ahead
+
+    def jvp(self, du: NDArray, dinflow: NDArray, dw: NDArray | None) -> NDArray:
+        """Return the tangent; see `ComponentStep.jvp`."""
+        df = self.first.jvp(du, dinflow, None if dw is None else self.back.jvp(dw))
+        db = self.second.jvp(df, dinflow, None if dw is None else self.ahead.jvp(dw))
+        total = df + 0.5 * (du - db)
+        if self.clamp:
+            clamped = self._clamped()
+            samples = self.first.with_field(du, dinflow).samples
+            through_bounds = np.sum(clamped.sample_shares * samples[clamped.samples], axis=0)
+            total[clamped.points] = clamped.free_share * total[clamped.points] + through_bounds
         return total
 
 
 class MacCormack(SemiLagrangian):
-    """See the head of the file."""
+    """The MacCormack scheme; see the head of this module for its formulas."""
 
     options = ("interpolation", "backtrace", "clamp")
     linear = False
-    signs, passage = (1, -1), Corrected
+    component_step = CorrectedStep

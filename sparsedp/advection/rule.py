@@ -1,100 +1,197 @@
-"""A law -> one rule of the tape: cotangents of all requested arguments in one pass, tangents, second order."""
+"""The rule of a transport method on the tape: forward, all requested cotangents in one pass, tangents, second order."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 import autograd.numpy as anp
 import numpy as np
 
 from sparsedp._utils.validation import check_finite, surely_finite
-from sparsedp.advection.law import FIELD, INFLOW, STEP, VELOCITY
-from sparsedp.advection.values import FLOAT, LETTERS, prepare, raised, result_like, unflatten
-from sparsedp.autodiff.tape import Rule, dtype_of, isbox, linear, plain
+from sparsedp.advection.arguments import FLOAT, check_step, flatten_array
+from sparsedp.advection.settings import FIELD, INFLOW, STEP, VELOCITY
+from sparsedp.autodiff.tape import Rule, cast, dtype_of, isbox, linear, plain
 from sparsedp.errors import DerivativeError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from sparsedp.advection.method import TransportMethod
+    from sparsedp.grid.space import Space
 
 __all__ = ["rule_of"]
 
+ARGUMENTS = ("u", "v", "dt", "inflow")
 
-def rule_of(law):
-    """Law -> Rule of (u, v, dt, inflow)."""
+
+def rule_of(method: TransportMethod) -> Rule:
+    """Return the differentiable rule of (u, v, dt, inflow) of a transport method."""
 
     def forward(u, v, dt, inflow):
-        return result_like(u, law.forward(*prepare(law, u, v, dt, inflow)), law.setting.space.shape)
+        return _unflatten_result(u, method.forward(*_flatten(method, u, v, dt, inflow)), method.settings.space.shape)
 
     def vjp(nums, ans, *args):
         def pull(g, *sums):
-            flat = prepare(law, *args)
-            g = raised(FIELD, law, g)
-            traced = type(g) is not np.ndarray or any(map(isbox, flat))
-            into = None if traced or STEP in nums or not sums else _sum_of(law, args, dict(zip(nums, sums)))
-            if traced and not law.twice:
-                found, fine = tuple(back(g) for back, _ in _turned(law, nums, flat)), False
-            else:
-                found, fine = _vjp(law, nums, g, flat, into)
-                if not fine and into is not None and not surely_finite(into):  # what was there may not have been
-                    _check_slope(law, "the gradient in v", law.vjp((VELOCITY,), g, *flat)[0][0], (g,))
-            for num, back in zip(nums, found, strict=True):
-                if not fine and back is not into:
-                    _check_slope(law, "the gradient in " + LETTERS[num], back, (g,))
-            shaped = [unflatten(args[num], back) for num, back in zip(nums, found, strict=True)]
-            return [sums[k] if found[k] is into is not None else back for k, back in enumerate(shaped)]
+            return _pull(method, nums, args, g, sums)
 
         return pull
 
     def jvp(nums, tangents, ans, *args):
-        flat = prepare(law, *args)
-        along = {num: raised(num, law, tangent) for num, tangent in zip(nums, tangents, strict=True)}
-        if any(map(isbox, (*args, *tangents))) and not law.twice:
-            rules = zip(_turned(law, nums, flat), along.values(), strict=True)
-            found = sum(ahead(tangent) for (_, ahead), tangent in rules)
+        flat = _flatten(method, *args)
+        flat_tangents = {
+            num: _flatten_tangent(num, method, tangent) for num, tangent in zip(nums, tangents, strict=True)
+        }
+        if any(map(isbox, (*args, *tangents))) and not method.any_order:
+            rules = zip(_linear_rules(method, nums, flat), flat_tangents.values(), strict=True)
+            tangent = sum(pushforward(along) for (_, pushforward), along in rules)
         else:
-            if STEP in along:
-                along[VELOCITY] = along.get(VELOCITY, 0.0) + along.pop(STEP) / flat[STEP] * flat[VELOCITY]
-            found = law.jvp(along, *flat)
-        _check_slope(law, "the tangent", found, tangents)
-        return unflatten(ans, found)
+            if STEP in flat_tangents:  # a step depends on v dt alone
+                along_velocity = flat_tangents.pop(STEP) / flat[STEP] * flat[VELOCITY]
+                flat_tangents[VELOCITY] = flat_tangents.get(VELOCITY, 0.0) + along_velocity
+            tangent = method.jvp(flat_tangents, *flat)
+        _check_derivative(method, "the tangent", tangent, tangents)
+        return _unflatten(ans, tangent)
 
-    rule = Rule(law.name, forward, vjp, jvp)
-    rule.adds = law.adds
+    rule = Rule(method.name, forward, vjp, jvp)
+    rule.adds = method.accumulates
     return rule
 
 
-def _sum_of(law, args, sums):
-    """The sum of the cotangents of the velocity so far, flat, where that of a step can be added to it; else None."""
+def _pull(method: TransportMethod, nums: Sequence[int], args: tuple, g: Any, sums: tuple) -> list:
+    """Return the cotangents of the arguments `nums` in their shapes; see `Rule` for `sums`."""
+    flat = _flatten(method, *args)
+    g = _flatten_tangent(FIELD, method, g)
+    traced = type(g) is not np.ndarray or any(map(isbox, flat))
+    velocity_sum = None
+    if sums and not traced and STEP not in nums:
+        velocity_sum = _velocity_sum(args, dict(zip(nums, sums)))
+    if traced and not method.any_order:
+        cotangents = [pullback(g) for pullback, _ in _linear_rules(method, nums, flat)]
+        finite = False
+    else:
+        cotangents, finite = _cotangents(method, nums, g, flat, velocity_sum)
+        if velocity_sum is not None and not finite and not surely_finite(velocity_sum):
+            # The sum may have been infinite before: check the cotangent of this step alone.
+            of_velocity = method.vjp((VELOCITY,), g, *flat)[0][0]
+            _check_derivative(method, "the gradient in v", of_velocity, (g,))
+    results = []
+    for position, (num, cotangent) in enumerate(zip(nums, cotangents, strict=True)):
+        accumulated = velocity_sum is not None and cotangent is velocity_sum
+        if not finite and not accumulated:
+            _check_derivative(method, f"the gradient in {ARGUMENTS[num]}", cotangent, (g,))
+        results.append(sums[position] if accumulated else _unflatten(args[num], cotangent))
+    return results
+
+
+def _velocity_sum(args: tuple, sums: Mapping[int, NDArray | None]) -> NDArray | None:
+    """Return the sum of the cotangents of the velocity so far as a flat array; None if a step cannot add to it."""
     total = sums.get(VELOCITY)
-    fits = total is not None and total.dtype == FLOAT == dtype_of(args[VELOCITY]) and total.flags.c_contiguous
-    return total.reshape(-1) if fits else None
+    if total is None or total.dtype != FLOAT or dtype_of(args[VELOCITY]) != FLOAT or not total.flags.c_contiguous:
+        return None
+    return total.reshape(-1)
 
 
-def _vjp(law, nums, g, flat, into=None):
-    """Cotangents of the arguments `nums`, and whether all are finite for sure.
+def _cotangents(
+    method: TransportMethod, nums: Sequence[int], g: Any, flat: tuple, velocity_sum: NDArray | None
+) -> tuple[list, bool]:
+    """Return the cotangents of the arguments `nums`, and whether they are known to be finite.
 
-    A step depends on the velocity times dt: the cotangent of dt follows from that of v.
+    A step depends on v dt alone, so the cotangent of dt follows from the cotangent of the velocity.
     """
-    asked = tuple({VELOCITY if num == STEP else num for num in nums})
-    cotangents, fine = law.vjp(asked, g, *flat, *(() if into is None else (into,)))
-    found = dict(zip(asked, cotangents, strict=True))
+    requested = tuple({VELOCITY if num == STEP else num for num in nums})
+    if velocity_sum is None:
+        values, finite = method.vjp(requested, g, *flat)
+    else:
+        values, finite = method.vjp(requested, g, *flat, velocity_sum)
+    cotangents = dict(zip(requested, values, strict=True))
     if STEP in nums:
-        found[STEP] = anp.dot(flat[VELOCITY], found[VELOCITY]) / flat[STEP]
-    return [found[num] for num in nums], fine and STEP not in nums
+        cotangents[STEP] = anp.dot(flat[VELOCITY], cotangents[VELOCITY]) / flat[STEP]
+        finite = False
+    return [cotangents[num] for num in nums], finite
 
 
-def _check_slope(law, what, slope, given):
-    """Refuse a derivative that overflows; NaN and infinity that were handed in are no fault of the step."""
-    slope = plain(slope)
-    if surely_finite(slope) or not all(np.all(np.isfinite(plain(value))) for value in given):
+def _check_derivative(method: TransportMethod, description: str, derivative: Any, given: Iterable) -> None:
+    """Raise if a derivative overflows, unless the cotangent or the tangents given to the step are not finite."""
+    derivative = plain(derivative)
+    if surely_finite(derivative) or not all(np.all(np.isfinite(plain(value))) for value in given):
         return
-    check_finite(law.name, np.asarray(slope), f"cannot represent {what}")
+    check_finite(method.name, np.asarray(derivative), f"cannot represent {description}")
 
 
-def _turned(law, nums, flat):
-    """For each argument the rules from g to its cotangent, and back: linear, and free of u and inflow.
+def _linear_rules(method: TransportMethod, nums: Sequence[int], flat: tuple) -> list:
+    """Return for each argument the rules of its pullback and its pushforward, which do not depend on u and inflow.
 
-    A linear scheme has every derivative in u and inflow as long as v and dt are constant.
+    A scheme that is linear in (u, inflow) has every derivative in these two as long as v and dt are constant.
     """
-    plain_flat = tuple(map(plain, flat))
-    if not (law.linear and set(nums) <= {FIELD, INFLOW}) or isbox(flat[1]) or isbox(flat[2]):
-        raise DerivativeError(f"{law.name} has first derivatives only; for second ones write scheme='upwind'")
+    constant = not isbox(flat[VELOCITY]) and not isbox(flat[STEP])
+    if not (method.linear and constant and set(nums) <= {FIELD, INFLOW}):
+        raise DerivativeError(f"{method.name} has first derivatives only; for second ones write scheme='upwind'")
+    args = tuple(map(plain, flat))
 
     def rules(num):
-        pull = lambda g: law.vjp((num,), np.asarray(g), *plain_flat)[0][0]
-        return linear(f"{law.name}.T", pull, lambda tangent: law.jvp({num: tangent}, *plain_flat))
+        def pullback(g):
+            return method.vjp((num,), np.asarray(g), *args)[0][0]
 
-    return map(rules, nums)
+        def pushforward(tangent):
+            return method.jvp({num: tangent}, *args)
+
+        return linear(f"{method.name}.T", pullback, pushforward)
+
+    return [rules(num) for num in nums]
+
+
+# ---- between the arguments of the user and flat float64 arrays -------------------------------------------------------
+
+
+def _flatten(method: TransportMethod, u: Any, v: Any, dt: Any, inflow: Any) -> tuple[Any, Any, Any, Any]:
+    """Check the arguments of a step and return them as the method takes them."""
+    if type(dt) is not float or not 0 < dt < np.inf:
+        number = check_step(method.name, plain(dt))
+        if isbox(dt):
+            dt = dt
+        else:
+            dt = number
+    u = flatten_array(method.name, "u", u, method.field_shapes)
+    v = flatten_array(method.name, "v", v, method.velocity_shapes)
+    return u, v, dt, _flatten_inflow(method.name, inflow, method.walls)
+
+
+def _flatten_inflow(name: str, inflow: Any, walls: Space) -> Any:
+    """Return one inflow value for each place of the walls."""
+    if type(inflow) is float:
+        return np.full(walls.size, inflow)
+    if np.shape(inflow) == ():
+        return flatten_array(name, "inflow", inflow, ((),)) * np.ones(walls.size)
+    return flatten_array(name, "inflow", inflow, (walls.shape,))
+
+
+def _unflatten_result(u: Any, flat: NDArray, shape: tuple[int, ...]) -> NDArray:
+    """Return a flat float64 result in the shape of the field and the dtype of u (float64 for bool and int)."""
+    dtype = dtype_of(u)
+    if dtype.char == "f":
+        flat = flat.astype(dtype.newbyteorder("="))
+    return flat.reshape(shape)
+
+
+def _flatten_tangent(num: int, method: TransportMethod, tangent: Any) -> Any:
+    """Return the tangent of an argument, or a cotangent of the result, as a flat float64 array."""
+    if num == STEP:
+        return tangent
+    if type(tangent) is np.ndarray and tangent.dtype == FLOAT and tangent.ndim:
+        return tangent.reshape(-1)
+    tangent = anp.reshape(cast(tangent, FLOAT), (-1,))
+    if num == INFLOW and tangent.size == 1:
+        return tangent * np.ones(method.walls.size)
+    return tangent
+
+
+def _unflatten(value: Any, derivative: Any) -> Any:
+    """Return a flat derivative in the shape of a value; the sum over all walls if the value is one number."""
+    shape = np.shape(value)
+    if shape:
+        return derivative.reshape(shape)
+    if type(derivative) is float:
+        return derivative
+    return anp.sum(derivative)

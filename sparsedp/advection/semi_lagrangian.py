@@ -1,105 +1,182 @@
 """Semi-Lagrangian transport: every point takes the value at its departure point.
 
-With E the field with ghost cells, m the velocity with which point i looks back and s = dt / spacing,
+Let E be the field with ghost cells, m the velocity along which point i looks back and s = dt / spacing. Then
 
     u'_i     = sum over k of W_ik E_k,     W_ik = product over the axes of weights at i - s m_i
     g_E      = W^T g,                      folded back onto u and inflow
     g_m      = -s g_i (gradient of the interpolant at i - s m_i)
     tangent  = W dE + g_m(g = 1) . dm,
 
-then on to the velocity v as it is given, see `departure_points`. A step depends on v dt alone: g_dt = g_v . v / dt, and
-ddt counts as the tangent v ddt / dt of v. Linear weights have kinks at the points: there the
-slope is the mean of both sides. Cubic ones are those of Catmull and Rom (cubic convolution, Keys 1981): order 3
-a step, so order 2 and more at a fixed ratio of dt to spacing, exact for quadratics away from walls.
-Source: A. Staniforth, J. Cote, Monthly Weather Review 119 (1991) 2206-2223;
+and `departure_points` leads from m on to the given velocity v. A step depends on v dt alone: g_dt = g_v . v / dt, and
+ddt acts like the tangent v ddt / dt of v. Linear weights have kinks at the points: the slope there is the mean of both
+sides. Cubic weights are those of Catmull and Rom (cubic convolution): third order in a step, hence at least second
+order at a fixed ratio of dt to spacing, and exact for quadratic fields away from walls.
+
+References
+----------
+A. Staniforth, J. Cote, Monthly Weather Review 119 (1991) 2206-2223.
 R. Keys, IEEE Trans. Acoustics, Speech and Signal Processing 29 (1981) 1153-1160.
 """
 
-from typing import Any
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from sparsedp._utils import buffers
 from sparsedp._utils.validation import surely_finite
+from sparsedp.advection.arguments import check_numbers
 from sparsedp.advection.departure_points import Trajectory
-from sparsedp.advection.interpolant import Interpolant, Pass
-from sparsedp.advection.law import FIELD, INFLOW, VELOCITY, Law
-from sparsedp.advection.stability import check_numbers
+from sparsedp.advection.interpolant import Interpolant
+from sparsedp.advection.method import TransportMethod
+from sparsedp.advection.settings import FIELD, INFLOW, VELOCITY
 
-__all__ = ["SemiLagrangian"]
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from sparsedp.advection.settings import TransportSettings
+
+__all__ = ["ComponentStep", "SemiLagrangian"]
 
 
-class SemiLagrangian(Law):
-    """See the head of the file."""
+class ComponentStep:
+    """The step of one component of the field: its values at the departure points.
+
+    Parameters
+    ----------
+    interpolant : Interpolant
+    w : array, shape (axes, points)
+        Velocities at the points.
+    dt : float
+    u : array
+        The component, flat.
+    inflow : array
+        All inflow values.
+    """
+
+    def __init__(self, interpolant: Interpolant, w: NDArray, dt: float, u: NDArray, inflow: NDArray) -> None:
+        self.back = Trajectory(interpolant, w, dt)
+        self.values = self.back.at_departure_points(u, inflow)
+
+    def value(self, out: NDArray) -> None:
+        """Set `out` to the component after the step."""
+        self.values.value(out)
+
+    def vjp(self, g: NDArray, of_u: NDArray | None, of_inflow: NDArray, of_w: NDArray | None) -> None:
+        """Pull a cotangent back: set `of_u` and `of_w` and add to `of_inflow`.
+
+        None for `of_u` leaves out both field and inflow; None for `of_w` leaves out the velocity.
+        """
+        if of_u is not None:
+            self.values.vjp(g, of_u, of_inflow)
+        if of_w is not None:
+            self.back.vjp(self.values.velocity_slopes(g, of_w))
+
+    def jvp(self, du: NDArray, dinflow: NDArray, dw: NDArray | None) -> NDArray:
+        """Return the tangent for tangents of u, inflow and w; None for `dw` stands for 0."""
+        return self.values.jvp(du, dinflow, None if dw is None else self.back.jvp(dw))
+
+    def matrix(self) -> sp.csr_array:
+        """Return the step as a matrix on u for inflow 0."""
+        return self.values.matrix()
+
+
+class SemiLagrangian(TransportMethod):
+    """The semi-Lagrangian scheme; see the head of this module for its formulas."""
 
     options: tuple[str, ...] = ("interpolation", "backtrace")
     linear = True
-    signs: tuple[int, ...] = (1,)  # of the steps along which points look: backwards in time
-    passage: Any = Pass  # made of the trajectories of a component, one for each sign, the component, inflow values
+    component_step: Any = ComponentStep
 
-    def __init__(self, setting):
-        super().__init__(setting)
-        self.components = [Interpolant(setting, number) for number in range(len(setting.space.parts))]
-        self.solid = setting.solid_points  # they keep their value
+    def __init__(self, settings: TransportSettings) -> None:
+        super().__init__(settings)
+        self.components = [Interpolant(settings, number) for number in range(len(settings.space.parts))]
+        self.solid = settings.solid_points  # these points keep their value
 
-    def _velocities(self, v):
-        """Velocity as it is given -> for each component an array (axis, point)."""
-        return self._by_component(self.velocity(v))
+    def _split_velocity(self, w: NDArray) -> list[NDArray]:
+        """Return for each component the velocities at its points, an array (axis, point)."""
+        dim = self.settings.grid.dim
+        return [w[dim * c.span.start : dim * c.span.stop].reshape(dim, -1) for c in self.components]
 
-    def _by_component(self, v):
-        dim = self.setting.grid.dim
-        return [v[dim * c.span.start : dim * c.span.stop].reshape(dim, -1) for c in self.components]
+    def _steps(self, u: NDArray, v: NDArray, dt: float, inflow: NDArray) -> Iterator[tuple[slice, Any]]:
+        """Yield for each component its entries in the field and its step."""
+        velocities = self._split_velocity(self.interpolate_velocity(v))
+        for component, w in zip(self.components, velocities, strict=True):
+            yield component.span, self.component_step(component, w, dt, u[component.span], inflow)
 
-    def _passes(self, u, v, dt, inflow):
-        """For each component where it stands in the field, and its pass to the departure points."""
-        for component, w in zip(self.components, self._velocities(v), strict=True):
-            trajectories = [Trajectory(component, w, dt * sign) for sign in self.signs]
-            yield component.span, self.passage(*trajectories, u[component.span], inflow)
-
-    def _keep_solid(self, moved, u):
-        """What is in a solid stays: written to the moved field."""
+    def _keep_solid(self, result: NDArray, u: NDArray) -> NDArray:
+        """Return a result in which the points inside the solid have the values of u."""
         if self.solid is not None:
-            np.copyto(moved, u, where=self.solid)
-        return moved
+            np.copyto(result, u, where=self.solid)
+        return result
 
-    def forward(self, u, v, dt, inflow):
-        """The advected field."""
+    def forward(self, u: NDArray, v: NDArray, dt: float, inflow: NDArray) -> NDArray:
+        """Return the field after one step."""
         if not all(map(surely_finite, (u, v, inflow))):
-            check_numbers(self.setting, u, v, inflow)  # names the first one; the trajectories would hide it
+            check_numbers(self.settings, u, v, inflow)  # interpolation could hide them
         out = buffers.empty(u.shape, float)
-        for span, passage in self._passes(u, v, dt, inflow):
-            passage.value(out[span])
+        for span, step in self._steps(u, v, dt, inflow):
+            step.value(out[span])
         return self._keep_solid(out, u)
 
-    def vjp(self, nums, g, u, v, dt, inflow):
-        """Cotangent of the advected field -> those of the arguments `nums`."""
-        field, speed, g = FIELD in nums or INFLOW in nums, VELOCITY in nums, np.ascontiguousarray(g)
-        moved = g if self.solid is None else np.where(self.solid, 0.0, g)
-        of_u, of_inflow = buffers.empty((u.size if field else 0,), float), np.zeros(inflow.size)
-        of_w = buffers.empty((u.size * self.setting.grid.dim if speed else 0,), float)
-        for (span, passage), change in zip(self._passes(u, v, dt, inflow), self._by_component(of_w), strict=True):
-            passage.vjp(moved[span], (of_u[span], of_inflow) if field else None, change if speed else None)
-        if field and self.solid is not None:
-            of_u += g - moved
-        found = {FIELD: of_u, INFLOW: of_inflow}
-        if speed:
-            found[VELOCITY] = self.velocity_vjp(of_w)
-        return tuple(found[num] for num in nums), False
+    def vjp(
+        self,
+        nums: Sequence[int],
+        g: NDArray,
+        u: NDArray,
+        v: NDArray,
+        dt: float,
+        inflow: NDArray,
+        velocity_sum: NDArray | None = None,
+    ) -> tuple[tuple[Any, ...], bool]:
+        """Return the cotangents of the arguments `nums`; see `TransportMethod`."""
+        of_field_wanted = FIELD in nums or INFLOW in nums
+        of_velocity_wanted = VELOCITY in nums
+        g = np.ascontiguousarray(g)
+        if self.solid is None:
+            of_moved = g
+        else:
+            of_moved = np.where(self.solid, 0.0, g)
+        of_u = buffers.empty((u.size if of_field_wanted else 0,), float)
+        of_inflow = np.zeros(inflow.size)
+        of_w = buffers.empty((u.size * self.settings.grid.dim if of_velocity_wanted else 0,), float)
+        steps = self._steps(u, v, dt, inflow)
+        for (span, step), of_component_w in zip(steps, self._split_velocity(of_w), strict=True):
+            step.vjp(
+                of_moved[span],
+                of_u[span] if of_field_wanted else None,
+                of_inflow,
+                of_component_w if of_velocity_wanted else None,
+            )
+        if of_field_wanted and self.solid is not None:
+            of_u += g - of_moved
+        cotangents = {FIELD: of_u, INFLOW: of_inflow}
+        if of_velocity_wanted:
+            cotangents[VELOCITY] = self.interpolate_velocity_vjp(of_w)
+        return tuple(cotangents[num] for num in nums), False
 
-    def jvp(self, tangents, u, v, dt, inflow):
-        """{argument: tangent} -> tangent of the advected field."""
-        given = {FIELD: u, VELOCITY: v, INFLOW: inflow}
-        du, dv, dinflow = (np.ascontiguousarray(tangents.get(num, np.zeros(x.size))) for num, x in given.items())
+    def jvp(self, tangents: Mapping[int, Any], u: NDArray, v: NDArray, dt: float, inflow: NDArray) -> NDArray:
+        """Return the tangent of the result; see `TransportMethod`."""
+        du = np.ascontiguousarray(tangents.get(FIELD, np.zeros(u.size)))
+        dv = np.ascontiguousarray(tangents.get(VELOCITY, np.zeros(v.size)))
+        dinflow = np.ascontiguousarray(tangents.get(INFLOW, np.zeros(inflow.size)))
+        velocity_moves = VELOCITY in tangents
+        velocities = self._split_velocity(self.interpolate_velocity(dv))
         out = np.empty(u.size)
-        for (span, passage), dw in zip(self._passes(u, v, dt, inflow), self._velocities(dv), strict=True):
-            out[span] = passage.jvp(du[span], dinflow, dw if VELOCITY in tangents else None)
+        for (span, step), dw in zip(self._steps(u, v, dt, inflow), velocities, strict=True):
+            out[span] = step.jvp(du[span], dinflow, dw if velocity_moves else None)
         return self._keep_solid(out, du)
 
-    def matrix(self, v, dt):
-        """The step as a csr_array in u."""
-        nothing = np.zeros(self.setting.space.size), v, dt, np.zeros(self.walls.size)
-        moved = sp.csr_array(sp.block_diag([passage.matrix() for _, passage in self._passes(*nothing)], format="csr"))
+    def matrix(self, v: NDArray, dt: float) -> sp.csr_array:
+        """Return the step as a matrix on u."""
+        no_field = np.zeros(self.settings.space.size)
+        no_inflow = np.zeros(self.walls.size)
+        blocks = [step.matrix() for _, step in self._steps(no_field, v, dt, no_inflow)]
+        moved = sp.csr_array(sp.block_diag(blocks, format="csr"))
         if self.solid is None:
             return moved
         return sp.csr_array(sp.diags_array(1.0 * ~self.solid) @ moved + sp.diags_array(1.0 * self.solid))

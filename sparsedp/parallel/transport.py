@@ -8,16 +8,16 @@ order follow. A step is one node of the tape, which sees fields on ranks alone, 
 ends at another one the widened grid has a wall that is not there; what that changes C leaves out.
 """
 
+from dataclasses import replace
 from functools import cache, partial
 from math import floor, isfinite, prod
 
 import numpy as np
 from scipy.ndimage import distance_transform_cdt
 
-from sparsedp.advection.law import wall_space
-from sparsedp.advection.stability import check_numbers, check_weights
+from sparsedp.advection.arguments import check_array, check_numbers, check_stability, check_step
+from sparsedp.advection.settings import wall_space
 from sparsedp.advection.transport import Transport
-from sparsedp.advection.values import check_given, check_step
 from sparsedp.autodiff.tape import Rule, isbox, linear, plain
 from sparsedp.errors import NonFiniteError, UnstableStepError
 from sparsedp.grid.boundary_conditions import neumann
@@ -45,9 +45,9 @@ class Carry:
         setting, given, name = self.setting, tuple(map(plain, (u, v, dt, inflow))), f"transport {self.setting.scheme}"
         inflows = self.walls.shape if np.shape(given[3]) else ()
         check_step(name, given[2])
-        check_given(name, "u", given[0], (setting.space.shape,))
-        check_given(name, "v", given[1], setting.velocity_shapes)
-        check_given(name, "inflow", given[3], (inflows,))
+        check_array(name, "u", given[0], (setting.space.shape,))
+        check_array(name, "v", given[1], setting.velocity_shapes)
+        check_array(name, "inflow", given[3], (inflows,))
         made = partial(self.block, self._width(*given[1:3]), np.shape(given[1]), inflows)
         try:
             return made(setting.unstable).rule(u, v, dt, inflow)
@@ -79,12 +79,12 @@ class Carry:
 
     def _check(self, wide, u, v, dt, inflow):
         """Refuse, in the words of one process, a step that is not finite, or too large in some block."""
-        setting, law = self.setting, wide.move.law
+        setting, method = self.setting, wide.move.method
         check_numbers(setting, block(u, setting.space), block(v, wide.velocity), block(inflow, self.walls))
         if setting.scheme in SCHEMES:
             v = wide.ins[1][0].forward(v).reshape(-1)
-            rate = self.layout.agreement.agreed("transport", law.reference.rate, v)
-            check_weights(setting, dt, wide.crop[0].forward(rate), law.scheme.most)
+            rate = self.layout.agreement.agreed("transport", method.reference.rate, v)
+            check_stability(setting, dt, wide.crop[0].forward(rate), method.scheme.max_courant)
 
 
 def velocity_space(setting, shape):
@@ -112,7 +112,7 @@ class Block:
         widths, around = [h[i] for h, i in zip(grid.widths, index)], [side is None for side in sides]
         local = Grid([i.size for i in index], spacing=widths, periodic=around)
         solid = None if setting.solid is None else setting.solid[np.ix_(*index)]
-        here = setting._replace(grid=local, sides=tuple(sides), solid=solid, unstable=unstable)
+        here = replace(setting, grid=local, sides=tuple(sides), solid=solid, unstable=unstable)
         self.move, self.velocity = layout.agreement.agreed("transport", Transport, here), velocity_space(setting, shape)
 
         def wider(space, wide):
@@ -135,7 +135,7 @@ def _inflow(setting, move, spans):
     boxes, places = [], [np.zeros(0, int)]
     numbers = iter(components(np.arange(move.walls.size), move.walls.parts))
     for part in move.space.parts:
-        for axis, (pair, local) in enumerate(zip(setting.sides, move.setting.sides)):
+        for axis, (pair, local) in enumerate(zip(setting.sides, move.settings.sides)):
             for end in (0, setting.grid.shape[axis]) if local else ():
                 place, there = next(numbers), pair is not None and end in spans[axis]
                 if pair:

@@ -50,7 +50,7 @@ CASES = [
     (
         lambda: dp.transport(GRID, "semi_lagrangian")(U, V, 0.0),
         ValueError,
-        "dt of transport semi_lagrangian must be > 0, got 0; write dt=0.01, or turn the velocity round",
+        "dt of transport semi_lagrangian must be > 0, got 0; write dt=0.01, or -v for a step backwards in time",
     ),
 ]
 

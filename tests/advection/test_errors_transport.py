@@ -30,7 +30,7 @@ def traced_solid(x):
 
 
 def frozen():
-    dp.transport(GRID).law = None
+    dp.transport(GRID).method = None
 
 
 def call(u=U, v=V, dt=0.1, inflow=0.0, **options):
@@ -47,13 +47,13 @@ CASES = [
     (
         lambda: dp.transport(GRID, boundary=dp.robin(1, 1)),
         ValueError,
-        "transport takes dirichlet (inflow values) or neumann (outflow), got robin(1, 1)",
+        "transport takes dirichlet (inflow values) or neumann (outflow), got robin(1, 1); write boundary=dp.dirichlet",
     ),
-    (frozen, AttributeError, "Transport is frozen; make a new one instead of setting law"),
+    (frozen, AttributeError, "Transport is frozen; make a new one instead of setting method"),
     (
         call(dt=0.0),
         ValueError,
-        "dt of transport upwind must be > 0, got 0; write dt=0.01, or turn the velocity round",
+        "dt of transport upwind must be > 0, got 0; write dt=0.01, or -v for a step backwards in time",
     ),
     (
         call(dt="soon"),
@@ -148,7 +148,7 @@ def test_message(case):
 def test_messages_of_other_schemes(monkeypatch):
     """What a scheme says that is not linear and has no second derivatives."""
     move = dp.transport(GRID)
-    move.law.linear = move.law.twice = False
+    move.method.linear = move.method.any_order = False
     message = "transport upwind is not linear in u and has no matrix; write scheme='upwind', or call move(u, v, dt)"
     with pytest.raises(ValueError, match=re.escape(message)):
         move.operator(V, 0.1)

@@ -248,7 +248,7 @@ def test_solids_stay_and_let_nothing_through():
     for scheme in ("upwind", "van_leer"):
         for velocity, form in (("faces", "flux"), ("faces", "advective"), ("cells", "advective"), ("cells", "flux")):
             move = dp.transport(grid, scheme, dp.dirichlet, velocity, form=form, solid=solid)
-            v = rng.normal(size=move.setting.velocity_shapes[0])
+            v = rng.normal(size=move.settings.velocity_shapes[0])
             u = rng.random(grid.shape)
             other = np.where(solid, rng.random(grid.shape), u)
             new = move(u, v, 0.005)

@@ -18,7 +18,7 @@ def scene(scheme, shape=(6, 5), velocity="faces", form=None, of="cells", **optio
     grid = dp.Grid(shape, size=1.0, periodic=options.pop("periodic", False))
     move = dp.transport(grid, scheme, dp.dirichlet, velocity, of, form=form, **options)
     rng = np.random.default_rng(0)
-    v = rng.normal(size=move.setting.velocity_shapes[0])
+    v = rng.normal(size=move.settings.velocity_shapes[0])
     return move, rng.normal(size=move.space.shape), v, rng.normal(size=move.walls.shape)
 
 

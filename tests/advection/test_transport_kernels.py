@@ -27,14 +27,14 @@ def scenes():
         of = "faces" if turn % 5 == 0 else "cells"
         move = dp.transport(grid, scheme, dp.dirichlet, velocity, of, form=form, solid=solid)
         v = np.where(
-            rng.random(move.setting.velocity_shapes[0]) < 0.1, 0.0, rng.normal(size=move.setting.velocity_shapes[0])
+            rng.random(move.settings.velocity_shapes[0]) < 0.1, 0.0, rng.normal(size=move.settings.velocity_shapes[0])
         )
         yield move, rng.normal(size=move.space.shape), v, rng.normal(size=move.walls.shape)
 
 
 def results(move, u, v, q):
     """Step and all cotangents, through the plain forms."""
-    law = move.law
+    law = move.method
     args = (u.ravel(), v.ravel(), 0.01, q)
     new = law.forward(*args)
     g = np.cos(np.arange(new.size))
@@ -115,7 +115,7 @@ def parabola(a, b, c, e):
 @cache
 def loop_of(limiter):
     """Compiled once for all tests."""
-    return fluxes.slopes_of("other", limiter, cache=False)
+    return fluxes.slope_loop("other", limiter, cache=False)
 
 
 @pytest.mark.parametrize("limiter", [minmod, pytest.param(parabola, marks=pytest.mark.whole)])
@@ -124,16 +124,16 @@ def test_other_limiters(limiter, velocity, form, monkeypatch):
     """A scheme is a function and a line: its loops, its tangent and its cotangents are there."""
     scheme = fluxes.Scheme(limiter, (0.0, 0.75, 1 / 3), 1.0, limiter is minmod)
     monkeypatch.setitem(fluxes.SCHEMES, "van_leer", scheme)
-    monkeypatch.setitem(fluxes.slopes, "van_leer", loop_of(limiter))
+    monkeypatch.setitem(fluxes.slope_loops, "van_leer", loop_of(limiter))
     rng = np.random.default_rng(5)
     solid = np.zeros((7, 6), bool)
     solid[3, 3] = True
     for grid, obstacle in ((dp.Grid((7, 6), size=2.0, periodic=(True, False)), solid), (dp.Grid(9, spacing=0.3), None)):
         move = dp.transport(grid, "van_leer", dp.dirichlet, velocity, form=form, solid=obstacle)
-        v = rng.normal(size=move.setting.velocity_shapes[0])
+        v = rng.normal(size=move.settings.velocity_shapes[0])
         scene = move, rng.normal(size=move.space.shape), v, rng.normal(size=move.walls.shape)
         found = results(*scene)
-        law = move.law
+        law = move.method
         with monkeypatch.context() as patch:
             patch.setattr(kernels, "compiled", lambda: False)
             for one, other in zip(found, results(*scene)):

@@ -25,7 +25,7 @@ def scene(scheme, grid, velocity, form, of="cells", **options):
     """A move, its arguments and a loss of all four."""
     rng = np.random.default_rng(1)
     move = dp.transport(grid, scheme, dp.dirichlet, velocity, of, form=form, **options)
-    shape = move.setting.velocity_shapes[0]
+    shape = move.settings.velocity_shapes[0]
     # Means of cells of both signs could be close to 0, where there is a kink.
     signs = (
         rng.choice([-1, 1], shape)
@@ -219,7 +219,7 @@ def test_kinks_get_the_mean_of_both_sides(velocity, kink):
     move = dp.transport(grid, boundary=dp.dirichlet, velocity=velocity)
     rng = np.random.default_rng(3)
     u = rng.normal(size=grid.shape)
-    shape = move.setting.velocity_shapes[0]
+    shape = move.settings.velocity_shapes[0]
     q = rng.normal(size=18)
     v = np.zeros(shape) if kink == "rest" else np.where(rng.random(shape) < 0.5, 0.0, rng.normal(size=shape))
     g = rng.normal(size=grid.shape)

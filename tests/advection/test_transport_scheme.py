@@ -7,7 +7,7 @@ import numpy as np
 from sources import ROOT
 
 import sparsedp as dp
-from sparsedp.advection import transport as front
+from sparsedp.advection import transport
 from sparsedp.kernels import fluxes
 
 
@@ -17,10 +17,10 @@ def test_the_page(monkeypatch):
     page = {"SCHEMES": {}, "Scheme": fluxes.Scheme, "dp": dp, "np": np}
     exec(scheme, page)
     (line,) = page["SCHEMES"].values()
-    loop = fluxes.slopes_of("third_order", line.limiter, cache=False)
+    loop = fluxes.slope_loop("third_order", line.limiter, cache=False)
     monkeypatch.setitem(fluxes.SCHEMES, "third_order", line)
-    monkeypatch.setitem(fluxes.slopes, "third_order", loop)
-    monkeypatch.setitem(front.LAWS, "third_order", front.Eulerian)
+    monkeypatch.setitem(fluxes.slope_loops, "third_order", loop)
+    monkeypatch.setitem(transport.METHODS, "third_order", transport.Eulerian)
     exec(order, page)
     grid = dp.Grid((6, 5), size=1.0, periodic=(True, False))
     rng = np.random.default_rng(0)

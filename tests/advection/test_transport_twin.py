@@ -35,7 +35,7 @@ def boundaries(grid):
 
 
 def arguments(move, rng):
-    shape = move.setting.velocity_shapes[0]
+    shape = move.settings.velocity_shapes[0]
     return rng.normal(size=move.space.shape), rng.normal(size=shape), 0.015, rng.normal(size=move.walls.shape)
 
 

@@ -86,7 +86,7 @@ def _cut(part, axis, start, stop):
 
 def speeds(move, v):
     """For each component of the field the velocity at its points, one array for each axis."""
-    setting = move.setting
+    setting = move.settings
     grid = setting.grid
     parts = grid.split(v) if setting.velocity == "faces" else [v[a] for a in range(grid.dim)]
     if setting.of == "cells":
@@ -107,7 +107,7 @@ def speeds(move, v):
 
 def moved(move, u, v, dt, inflow):
     """The whole step; inflow a number."""
-    setting = move.setting
+    setting = move.settings
     grid = setting.grid
     parts = [u] if setting.of == "cells" else grid.split(u)
     letters = ["wrap" if pair is None else "edge" if repr(pair[0]) == "neumann" else "in" for pair in setting.sides]
@@ -159,7 +159,7 @@ def number(line, x, cubic, period):
 
 
 def _component(move, u, w, lines, dt, sides, inflow):
-    setting = move.setting
+    setting = move.settings
     cubic = setting.interpolation == "cubic"
     midpoint = setting.backtrace == "midpoint"
     at = np.meshgrid(*(line[3 : 3 + n] for line, n in zip(lines, u.shape)), indexing="ij")

@@ -29,7 +29,7 @@ def scene(name):
     grid, options, inflow = SCENES[name]
     move = dp.transport(grid, **options)
     u = RNG.standard_normal(move.space.shape)
-    v = 0.4 * RNG.standard_normal(move.setting.velocity_shapes[0])
+    v = 0.4 * RNG.standard_normal(move.settings.velocity_shapes[0])
     return (lambda u, v: move(u, v, 0.15, inflow)), u, v, RNG.standard_normal(u.shape)
 
 

@@ -1,0 +1,131 @@
+"""What a transport scheme defines: plain functions of flat arrays, from which `rule` builds one differentiable rule."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from sparsedp.advection.arguments import check_numbers
+from sparsedp.advection.settings import FIELD, INFLOW, VELOCITY, TransportSettings, wall_space
+from sparsedp.advection.velocity_interpolation import velocity_interpolation
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from sparsedp.operators.operator import Operator
+
+__all__ = ["Identity", "TransportMethod"]
+
+
+class TransportMethod:
+    """Base class of the transport schemes: plain functions of flat arrays.
+
+    A subclass sets the flags and defines
+
+    ``forward(u, v, dt, inflow)``
+        Return the field after one step.
+    ``vjp(nums, g, u, v, dt, inflow)``
+        Return a tuple of the cotangents of the arguments `nums`, for the cotangent g of the result, and whether they
+        are known to be finite. Nothing else is computed.
+    ``jvp(tangents, u, v, dt, inflow)``
+        Return the tangent of the result; `tangents` is a dict {number of the argument: tangent}.
+    ``matrix(v, dt)``
+        Return the step as a csr_array on `u` with inflow 0; only if `linear`.
+
+    All arrays are flat, contiguous and of float64. They may contain NaN and infinity: the methods themselves detect
+    them. `u` has ``settings.space.size`` entries, `v` is the velocity as the user gives it, ``dt > 0`` is a float
+    and `inflow` has ``walls.size`` entries.
+
+    A step depends on the product of velocity and dt only. `vjp` and `jvp` are therefore never asked for a derivative
+    in dt; `rule` computes it from the derivative in the velocity.
+
+    Parameters
+    ----------
+    settings : TransportSettings
+
+    Attributes
+    ----------
+    walls : Space
+        Space of the inflow values; see `wall_space`.
+    options : tuple of str
+        Options of `transport` that the scheme uses.
+    linear : bool
+        Whether the step is linear in (u, inflow).
+    accumulates : bool
+        Whether `vjp` takes a further argument `velocity_sum`, an array or None: it adds the cotangent of the velocity
+        to this array and returns the array.
+    any_order : bool
+        Whether `vjp` and `jvp` take traced values, which gives derivatives of every order.
+    """
+
+    options: tuple[str, ...] = ("form", "unstable")
+    linear: bool = False
+    any_order: bool = False
+    accumulates: bool = False
+    forward: Any
+    vjp: Any
+    jvp: Any
+    matrix: Any
+
+    def __init__(self, settings: TransportSettings) -> None:
+        self.settings = settings
+        self.name = f"transport {settings.scheme}"
+        self.field_shapes = (settings.space.shape,)
+        self.velocity_shapes = settings.velocity_shapes
+        self.walls = wall_space(settings)
+
+    @cached_property
+    def interpolation(self) -> Operator | None:
+        """Operator from the given velocity to the points or sides that the scheme needs; None if they are the same."""
+        return velocity_interpolation(self.settings)
+
+    def interpolate_velocity(self, v: NDArray) -> NDArray:
+        """Return the velocity where the scheme needs it, axis by axis for each component of the field."""
+        if self.interpolation is None:
+            return v
+        return self.interpolation.apply(v)
+
+    def interpolate_velocity_vjp(self, g: NDArray) -> NDArray:
+        """Return the product of the transpose of `interpolate_velocity` with a cotangent."""
+        if self.interpolation is None:
+            return g
+        return self.interpolation.T.apply(g)
+
+
+class Identity(TransportMethod):
+    """The step on a grid without cells: it returns the field, for every scheme."""
+
+    linear = True
+    any_order = True
+
+    def forward(self, u: NDArray, v: NDArray, dt: float, inflow: NDArray) -> NDArray:
+        """Return a copy of the field."""
+        check_numbers(self.settings, u, v, inflow)
+        return u + 0.0
+
+    def vjp(
+        self,
+        nums: Sequence[int],
+        g: Any,
+        u: Any,
+        v: Any,
+        dt: Any,
+        inflow: Any,
+        velocity_sum: NDArray | None = None,
+    ) -> tuple[tuple[Any, ...], bool]:
+        """Return the cotangents: a copy of g for the field, zeros for the others."""
+        cotangents = {FIELD: g + 0.0, VELOCITY: np.zeros(np.shape(v)), INFLOW: np.zeros(np.shape(inflow))}
+        return tuple(cotangents[num] for num in nums), True
+
+    def jvp(self, tangents: Mapping[int, Any], u: Any, v: Any, dt: Any, inflow: Any) -> Any:
+        """Return the tangent of the field."""
+        return tangents.get(FIELD, np.zeros(np.shape(u))) + 0.0
+
+    def matrix(self, v: NDArray, dt: float) -> sp.csr_array:
+        """Return the identity matrix."""
+        return sp.csr_array(sp.eye_array(self.settings.space.size, format="csr"))

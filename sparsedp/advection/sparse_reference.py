@@ -1,0 +1,265 @@
+"""The Eulerian schemes as products with sparse matrices.
+
+These formulas run without numba and on traced values, give the matrix of a step, and are the reference for the tests of
+the compiled loops. They take about ten times as long, so both implementations stay.
+
+All quantities stand on the lower or upper side of a point along an axis. Let C be the velocity times dt over the
+length there, H = 1, 1/2, 0 for C > 0, = 0, < 0, p = H C and m = (1 - H) C. Then
+
+    u'     = (1 - sum of leaves) u + sum of enters
+    leaves = p_lower - m_upper  [+ C_upper - C_lower in flux form]
+    enters = p_lower (u_below + ahead_below) - m_upper (u_above - behind_above) - p_upper ahead - m_lower behind
+
+over the axes, where `ahead` and `behind` are what the limiter of a second-order scheme adds at the sides of a point.
+On the tape, H and the slopes of the limiter are constants. This is exact away from kinks, and gives the mean of both
+one-sided derivatives at rest. In a scheme with several stages each stage is averaged with the first field.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import autograd.numpy as anp
+import numpy as np
+import scipy.sparse as sp
+
+from sparsedp._utils.pytree import placed
+from sparsedp.advection.control_volumes import Component, components
+from sparsedp.autodiff.derivative import pullback, pushforward
+from sparsedp.autodiff.tape import isbox, linear, plain
+from sparsedp.kernels.fluxes import OWN
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from sparsedp.advection.settings import TransportSettings
+    from sparsedp.kernels.fluxes import Scheme
+    from sparsedp.operators.operator import Operator
+
+__all__ = ["SparseReference"]
+
+
+class SparseReference:
+    """The formulas of this module, for plain and for traced flat arguments.
+
+    Parameters
+    ----------
+    settings : TransportSettings
+    scheme : Scheme
+    inflow_size : int
+        Number of inflow values.
+    interpolation : Operator or None
+        From the given velocity to the sides or points.
+    """
+
+    def __init__(
+        self, settings: TransportSettings, scheme: Scheme, inflow_size: int, interpolation: Operator | None
+    ) -> None:
+        self.settings = settings
+        self.scheme = scheme
+        if settings.form == "flux":
+            self.flux_form = 1.0
+        else:
+            self.flux_form = 0.0
+        self._inflow_size = inflow_size
+        self._interpolation = interpolation
+
+    @cached_property
+    def components(self) -> list[Component]:
+        """The components of the field."""
+        return components(self.settings, self.scheme.limiter is not None)
+
+    @cached_property
+    def _sides(self) -> _SideTable:
+        """The sides of all points, axis by axis and component by component."""
+        tables = []
+        rows = 0
+        for component in self.components:
+            start = component.field.start
+            points = np.arange(start, component.field.stop)
+            for axis in range(len(component.axes)):
+                sides = component.sides(axis)
+                lengths = component.table[:, sides.column]
+                is_open = np.ones((2, points.size), bool)
+                if component.free.size:
+                    is_open = component.free[2 * axis : 2 * axis + 2]
+                beyond = np.where(is_open, start + sides.beyond, points)
+                inflow = self.settings.space.size + component.inflow.start + sides.wall
+                beyond = np.where(is_open & (sides.wall >= 0), inflow, beyond)
+                slope = np.where(is_open & ~sides.at_wall, rows + sides.beyond, -1)
+                speed = component.speed.start + sides.speed
+                tables.append((points[None], beyond, slope, speed, is_open * lengths[OWN : OWN + 2], lengths[-2:]))
+                rows += points.size
+        return _SideTable(*(np.concatenate(parts, 1) for parts in zip(*tables, strict=True)))
+
+    @cached_property
+    def _matrices(self) -> _Matrices:
+        sides = self._sides
+        points = sides.points[0]
+        size = self.settings.space.size
+        ones = np.ones(points.size)
+        speeds = [_selection(sides.speed[side], 1 + sides.speed.max(), sides.weight[side]) for side in range(2)]
+        if self._interpolation is not None:
+            speeds = [sp.csr_array(matrix @ self._interpolation.matrix) for matrix in speeds]
+        return _Matrices(
+            points=_selection(points, size, ones),
+            beyond=[_selection(side, size + self._inflow_size, ones) for side in sides.beyond],
+            slope=[_selection(side, points.size, ones) for side in sides.slope],
+            speed=speeds,
+        )
+
+    @cached_property
+    def _maps(self) -> _Maps:
+        matrices = self._matrices
+        return _Maps(
+            points=_product(matrices.points),
+            total=_product(sp.csr_array(matrices.points.T)),
+            beyond=[_product(matrix) for matrix in matrices.beyond],
+            slope=[_product(matrix) for matrix in matrices.slope],
+            speed=[_product(matrix) for matrix in matrices.speed],
+        )
+
+    def _courant_numbers(self, v: Any, dt: Any) -> tuple[Any, Any]:
+        """Return the velocity times dt over length, on the lower and the upper sides."""
+        lower, upper = self._maps.speed
+        return dt * lower(v), dt * upper(v)
+
+    def _leaves(self, lower: Any, upper: Any, p_lower: Any, m_upper: Any) -> Any:
+        """Return the share of its value that leaves each point along each axis."""
+        leaves = p_lower - m_upper
+        if self.flux_form:
+            return leaves + upper - lower
+        return leaves
+
+    def _stage(self, u: Any, lower: Any, upper: Any, inflow: Any) -> Any:
+        """Return u + dt du/dt for Courant numbers on the lower and the upper sides."""
+        maps = self._maps
+        p_lower, m_lower = _by_direction(lower)
+        p_upper, m_upper = _by_direction(upper)
+        values = anp.concatenate([u, inflow])
+        below, above = (beyond(values) for beyond in maps.beyond)
+        enters = p_lower * below - m_upper * above
+        if self.scheme.limiter is not None:
+            at_points = maps.points(u)
+            ahead, behind = self._slopes(self.scheme.limiter, at_points - below, above - at_points)
+            enters = enters + p_lower * maps.slope[0](ahead) + m_upper * maps.slope[1](behind)
+            enters = enters - p_upper * ahead - m_lower * behind
+        leaves = self._leaves(lower, upper, p_lower, m_upper)
+        return (1.0 - maps.total(leaves)) * u + maps.total(enters)
+
+    def _slopes(self, limiter: Callable, a: Any, b: Any) -> tuple[Any, Any]:
+        """Return `ahead` and `behind` for the differences to the points below and above."""
+        a_value = plain(a)
+        b_value = plain(b)
+        with np.errstate(all="ignore"):
+            ahead, behind, *derivatives = limiter(a_value, b_value, *self._sides.distances)
+        if isbox(a) or isbox(b):
+            da = a - a_value
+            db = b - b_value
+            ahead = ahead + derivatives[0] * da + derivatives[1] * db
+            behind = behind + derivatives[2] * da + derivatives[3] * db
+        return ahead, behind
+
+    def step(self, u: Any, v: Any, dt: Any, inflow: Any) -> Any:
+        """Return the field after one step."""
+        lower, upper = self._courant_numbers(v, dt)
+        result = u
+        for keep in self.scheme.stages:
+            stage = self._stage(result, lower, upper, inflow)
+            if keep:
+                result = keep * u + (1.0 - keep) * stage
+            else:
+                result = stage
+        return result
+
+    def vjp(self, nums: Sequence[int], g: Any, *args: Any) -> tuple[Any, ...]:
+        """Return the cotangents of the arguments `nums` for the cotangent of the result."""
+
+        def step(some):
+            return self.step(*placed(args, nums, some))
+
+        return pullback(step, tuple(args[num] for num in nums))[1](g)
+
+    def jvp(self, tangents: Mapping[int, Any], *args: Any) -> Any:
+        """Return the tangent of the result; `tangents` is a dict {number of the argument: tangent}."""
+
+        def step(some):
+            return self.step(*placed(args, tangents, some))
+
+        return pushforward(step, tuple(args[num] for num in tangents), tuple(tangents.values()))[1]
+
+    def rate(self, v: NDArray) -> NDArray:
+        """Return the sum of the Courant numbers of each point, divided by dt."""
+        lower, upper = self._courant_numbers(v, 1.0)
+        p_lower, _ = _by_direction(lower)
+        _, m_upper = _by_direction(upper)
+        return self._maps.total(self._leaves(lower, upper, p_lower, m_upper))
+
+    def matrix(self, v: NDArray, dt: float) -> sp.csr_array:
+        """Return the step as a matrix on u, for a scheme of first order."""
+        lower, upper = self._courant_numbers(v, dt)
+        p_lower, _ = _by_direction(lower)
+        _, m_upper = _by_direction(upper)
+        size = self.settings.space.size
+        below, above = (matrix[:, :size] for matrix in self._matrices.beyond)
+        enters = sp.diags_array(p_lower) @ below - sp.diags_array(m_upper) @ above
+        keeps = sp.diags_array(1.0 - dt * self.rate(v))
+        return sp.csr_array(keeps + self._matrices.points.T @ enters)
+
+
+class _SideTable(NamedTuple):
+    """Arrays with a column for each point along each axis; their rows stand for the lower and the upper side."""
+
+    points: NDArray  # index of the point itself, one row
+    beyond: NDArray  # index of the value beyond the side, in (field, inflow)
+    slope: NDArray  # column whose slope acts at the side; -1 where there is none
+    speed: NDArray  # index of the velocity
+    weight: NDArray  # 1 / length, 0 on closed sides
+    distances: NDArray  # c and e of the limiter
+
+
+class _Matrices(NamedTuple):
+    """Matrices to the sides of points, from the field, (field, inflow), slopes and the velocity; pairs: by side."""
+
+    points: Any
+    beyond: list
+    slope: list
+    speed: list
+
+
+class _Maps(NamedTuple):
+    """The same as functions of plain and traced arrays; `total` sums over the sides of each point."""
+
+    points: Callable[[Any], Any]
+    total: Callable[[Any], Any]
+    beyond: list[Callable[[Any], Any]]
+    slope: list[Callable[[Any], Any]]
+    speed: list[Callable[[Any], Any]]
+
+
+def _by_direction(courant: Any) -> tuple[Any, Any]:
+    """Return p, the part of Courant numbers that is > 0, and m, the part that is < 0."""
+    share = np.heaviside(plain(courant), 0.5)
+    return courant * share, courant * (1.0 - share)
+
+
+def _selection(columns: NDArray, size: int, values: NDArray) -> sp.csr_array:
+    """Return the matrix with one entry in each row, none where the column is -1 or the value is 0."""
+    keep = (columns >= 0) & (values != 0)
+    places = np.flatnonzero(keep), columns[keep].astype(np.int32)
+    return sp.csr_array((values[keep], places), (columns.size, size))
+
+
+def _product(matrix: sp.csr_array) -> Callable[[Any], Any]:
+    """Return the product with a matrix as a function of plain and traced arrays."""
+    rule = linear("transport", matrix.__matmul__, sp.csr_array(matrix.T).__matmul__)[0]
+
+    def product(x):
+        if isbox(x):
+            return rule(x)
+        return matrix @ x
+
+    return product

@@ -1,0 +1,125 @@
+"""Interpolation of the given velocity to where a transport scheme needs it: one sparse matrix for each block.
+
+Between cell centres the interpolation is linear; at a wall it takes the value of the only cell. Inside a cell it is the
+mean of both faces. The control volume of a face covers half of two cells: the velocity through its sides is the mean of
+both cells weighted with their widths. A flow without divergence then preserves constants, on stretched grids too.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.sparse as sp
+
+from sparsedp.grid.boundary_conditions import neumann
+from sparsedp.grid.space import Space
+from sparsedp.operators.operator import Operator
+from sparsedp.operators.stencils import cell_beside, mean_of_faces, means, with_ends
+from sparsedp.operators.structure.factor import Factor
+from sparsedp.operators.structure.kronecker import Kronecker, Term
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from sparsedp.advection.settings import TransportSettings
+    from sparsedp.grid.grid import Grid
+
+__all__ = ["velocity_interpolation"]
+
+
+def velocity_interpolation(settings: TransportSettings) -> Operator | None:
+    """Return the operator from the given velocity to all its components at each component of the field.
+
+    Parameters
+    ----------
+    settings : TransportSettings
+
+    Returns
+    -------
+    Operator or None
+        The result is ordered by component of the field, then by axis. None where the given velocity is already at
+        the points or sides that the scheme needs.
+    """
+    grid = settings.grid
+    one_component = settings.of == "cells" or (settings.at_points and grid.dim == 1)
+    if settings.at_points:
+        needed = settings.of
+    else:
+        needed = "faces"
+    if one_component and settings.velocity == needed:
+        return None
+    if settings.at_points:
+        factor_along = _factor_to_points
+    else:
+        factor_along = _factor_to_sides
+    components: Sequence[int | None] = [None] if settings.of == "cells" else range(grid.dim)
+    if settings.velocity == "faces":
+        given_parts = grid.faces.parts
+    else:
+        given_parts = (grid.shape,) * grid.dim
+    blocks: dict = {}
+    parts: list = []
+    for component in components:
+        for axis in range(grid.dim):
+            factors = tuple(factor_along(settings, component, axis, along) for along in range(grid.dim))
+            blocks[len(parts), axis] = (Term(1.0, factors),)
+            sizes = zip(given_parts[axis], factors, strict=True)
+            parts.append(tuple(n if factor is None else factor.shape[0] for n, factor in sizes))
+    structure = Kronecker(parts, given_parts, blocks)
+    rows, columns = structure.shape
+    return Operator(structure, Space(columns), Space(rows), "velocity at the points")
+
+
+def _factor_to_points(settings: TransportSettings, component: int | None, axis: int, along: int) -> Factor | None:
+    """Return the factor along one axis from velocity component `axis` to the points of a component of the field.
+
+    `component` is None for cells; the result is None where nothing is interpolated along this axis.
+    """
+    on_faces = settings.velocity == "faces" and along == axis
+    if on_faces == (along == component):
+        return None
+    if on_faces:
+        return mean_of_faces(settings.grid, along)
+    return _mean_of_cells(settings.grid, along)
+
+
+def _factor_to_sides(settings: TransportSettings, component: int | None, axis: int, along: int) -> Factor | None:
+    """Return the same for the sides across `axis` of the control volumes of a component of the field."""
+    grid = settings.grid
+    on_faces = settings.velocity == "faces" and along == axis
+    if along == component:
+        if axis == component:
+            return _to_sides_of_faces(grid, along, on_faces)
+        return _weighted_mean_of_cells(grid, along)
+    if along == axis and not on_faces:
+        return _mean_of_cells(grid, along)
+    return None
+
+
+def _mean_of_cells(grid: Grid, axis: int) -> Factor:
+    """Return the factor from cells to faces by linear interpolation; a wall face gets the value of its cell."""
+    return means(grid, axis, None if grid.periodic[axis] else (neumann, neumann))
+
+
+def _weighted_mean_of_cells(grid: Grid, axis: int) -> Factor:
+    """Return the factor from cells to faces by the mean weighted with the widths."""
+    below = cell_beside(grid, axis, False).matrix
+    above = cell_beside(grid, axis, True).matrix
+    widths = (below + above) @ sp.diags_array(grid.widths[axis])
+    return Factor(sp.diags_array(1.0 / np.maximum(widths.sum(axis=1), np.finfo(float).tiny)) @ widths)
+
+
+def _to_sides_of_faces(grid: Grid, axis: int, on_faces: bool) -> Factor:
+    """Return the factor from faces, or from cells, to the sides of the control volumes of faces along their own axis.
+
+    These sides are the cell centres and, on a bounded axis, the walls.
+    """
+    n = grid.shape[axis]
+    if on_faces:
+        centres = mean_of_faces(grid, axis).matrix
+    else:
+        centres = sp.eye_array(n, format="csr")
+    if grid.periodic[axis]:  # side f is the centre of cell f - 1
+        return Factor(centres[np.arange(-1, n - 1)])
+    return with_ends(centres)
