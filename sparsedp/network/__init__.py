@@ -5,7 +5,7 @@ are any nesting of such dicts, and minimize takes them as they are.
 """
 
 from sparsedp._utils.calls import describe_module
-from sparsedp.network.filters import convolution
+from sparsedp.network.convolution_layer import convolution
 from sparsedp.network.layers import dense, relu, residual_block, softplus, tanh
 from sparsedp.network.weights import convolution_weights, dense_weights, load, residual_weights, save
 

@@ -5,77 +5,148 @@ slice of its columns, which the matrix product reads in place. So a field is cop
 last axis, not for each entry of the filter.
 """
 
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
 from math import prod
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-__all__ = ["MODES", "correlate", "fold", "pad", "weigh"]
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
-BLOCK = 1 << 22  # bytes of the copied matrix that are made at a time: they stay in the cache
-MODES: dict[str, Any] = {"periodic": "wrap", "zero": "constant", "replicate": "edge"}
+__all__ = ["PADDINGS", "correlate", "filter_gradient", "pad", "pad_transposed"]
 
-
-def pad(x, widths, padding):
-    """(s, c, nx, ny) -> the same with (width - 1) / 2 more cells on each side."""
-    around = [(0, 0), (0, 0), *((width // 2, width // 2) for width in widths)]
-    return np.pad(x, around, MODES[padding] if x.size else "constant")
+BLOCK_BYTES = 1 << 22  # of the copied matrix that are built at a time: they stay in the cache
+PADDINGS: dict[str, Any] = {"periodic": "wrap", "zero": "constant", "replicate": "edge"}  # modes of np.pad
 
 
-def fold(x, widths, padding):
-    """The transpose of `pad`."""
+def pad(x: NDArray[Any], widths: Sequence[int], padding: str) -> NDArray[Any]:
+    """Add (width - 1) / 2 cells on each side of the fields.
+
+    Parameters
+    ----------
+    x : (samples, channels, nx, ny) array
+    widths : (int, int)
+        Of the filters; odd.
+    padding : str
+        A key of `PADDINGS`.
+
+    Returns
+    -------
+    array
+    """
+    mode = PADDINGS[padding]
+    if not x.size:  # the other modes refuse axes without cells
+        mode = "constant"
+    return np.pad(x, [(0, 0), (0, 0), *((width // 2, width // 2) for width in widths)], mode)
+
+
+def pad_transposed(x: NDArray[Any], widths: Sequence[int], padding: str) -> NDArray[Any]:
+    """Apply the transpose of `pad`: add what lies on the padded cells to the cells that were copied there.
+
+    Parameters
+    ----------
+    x : (samples, channels, nx + widths[0] - 1, ny + widths[1] - 1) array
+    widths : (int, int)
+    padding : str
+
+    Returns
+    -------
+    (samples, channels, nx, ny) array
+    """
     for axis, width in zip((-2, -1), widths):
-        wide, reach, n = np.moveaxis(x, axis, 0), width // 2, x.shape[axis] - width + 1
-        core = wide[reach : reach + n].copy()
+        padded = np.moveaxis(x, axis, 0)
+        reach = width // 2
+        n = x.shape[axis] - width + 1
+        core = padded[reach : reach + n].copy()
         if padding != "zero" and n:
-            sources = np.pad(np.arange(n), reach, MODES[padding])
+            sources = np.pad(np.arange(n), reach, PADDINGS[padding])
             ghosts = np.r_[:reach, n + reach : n + 2 * reach]
-            np.add.at(core, sources[ghosts], wide[ghosts])
+            np.add.at(core, sources[ghosts], padded[ghosts])
         x = np.moveaxis(core, 0, axis)
     return np.ascontiguousarray(x)
 
 
-def correlate(x, weight):
-    """Padded (s, c, *cells), (o, c, wx, wy) or one filter for each s -> (s, o, *cells).
+def correlate(x: NDArray[Any], weight: NDArray[Any]) -> NDArray[Any]:
+    """Correlate padded fields with filters.
 
+    Parameters
+    ----------
+    x : (samples, inputs, *padded cells) array
+    weight : (outputs, inputs, wx, wy) array, or (samples, outputs, inputs, wx, wy) with filters for each sample
+
+    Returns
+    -------
+    (samples, outputs, *cells) array
+
+    Notes
+    -----
     y[s, o, i] = sum over c, d of weight[o, c, d] x[s, c, i + d].
     """
     cells = [n - width + 1 for n, width in zip(x.shape[2:], weight.shape[-2:])]
     matrices = np.moveaxis(weight, -2, 0)  # one for each shift along the first axis
     matrices = matrices.reshape(*matrices.shape[:-2], -1)
+    per_sample = weight.ndim == 5
     y = np.zeros((len(x), weight.shape[-4], prod(cells)), np.result_type(x, weight))
-    for some, shift, part in _shifted(x, weight.shape[-2:]):
-        y[some] += (matrices[shift, some] if weight.ndim == 5 else matrices[shift]) @ part
+    for samples, shift, columns in _shifted_blocks(x, weight.shape[-2:]):
+        if per_sample:
+            y[samples] += matrices[shift, samples] @ columns
+        else:
+            y[samples] += matrices[shift] @ columns
     return y.reshape(*y.shape[:2], *cells)
 
 
-def weigh(x, g, shape):
-    """Padded (s, c, *cells), (s, o, *cells) -> filters of a shape: sum over s and i of g[s, o, i] x[s, c, i + d].
+def filter_gradient(x: NDArray[Any], g: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    """Correlate padded fields with a cotangent: the derivative of `correlate` with respect to the filters.
 
-    With a leading axis of samples in `shape` the samples are kept apart.
+    Parameters
+    ----------
+    x : (samples, inputs, *padded cells) array
+    g : (samples, outputs, *cells) array
+    shape : tuple of int
+        Of the filters, as in `correlate`. With a leading axis of samples these are kept apart.
+
+    Returns
+    -------
+    array of that shape
+
+    Notes
+    -----
+    weight[o, c, d] = sum over s, i of g[s, o, i] x[s, c, i + d].
     """
     rows = g.reshape(*g.shape[:2], prod(g.shape[2:]))
     filters = np.zeros((shape[-2], *shape[:-2], shape[-1]), np.result_type(x, g))
-    totals = filters.reshape(*filters.shape[:-2], -1)
-    for some, shift, part in _shifted(x, shape[-2:]):
-        products = rows[some] @ np.swapaxes(part, 1, 2)
-        if len(shape) == 5:
-            totals[shift, some] = products
+    matrices = filters.reshape(*filters.shape[:-2], -1)
+    per_sample = len(shape) == 5
+    for samples, shift, columns in _shifted_blocks(x, shape[-2:]):
+        products = rows[samples] @ np.swapaxes(columns, 1, 2)
+        if per_sample:
+            matrices[shift, samples] = products
         else:
-            totals[shift] += products.sum(axis=0)
+            matrices[shift] += products.sum(axis=0)
     return np.ascontiguousarray(np.moveaxis(filters, 0, -2))
 
 
-def _shifted(x, widths):
-    """Blocks of samples whose copies fit into the cache: their slice, a shift along the first axis, and the fields so
-    shifted, with all shifts along the last axis as rows of a matrix (s, c shifts, cells). Nothing without cells."""
-    first, last = widths
-    lines, wide = x.shape[2] - first + 1, x.shape[3] - last + 1
-    step = max(1, BLOCK // max(1, prod(x.shape[1:]) * last * x.itemsize))
-    for start in range(0, len(x) if wide > 0 else 0, step):
-        some = slice(start, start + step)
-        columns = np.ascontiguousarray(np.moveaxis(sliding_window_view(x[some], last, axis=-1), -1, 2))
-        columns = columns.reshape(len(columns), x.shape[1] * last, -1)
-        for shift in range(first):
-            yield some, shift, columns[..., shift * wide : (shift + lines) * wide]
+def _shifted_blocks(x, widths) -> Iterator[tuple[slice, int, NDArray[Any]]]:
+    """Yield blocks of samples whose copies fit into the cache, for each shift along the first axis.
+
+    Each item is the slice of the samples, the shift, and the shifted fields as a matrix (samples, inputs times shifts
+    along the last axis, cells). Nothing is yielded if there are no cells.
+    """
+    first_width, last_width = widths
+    lines = x.shape[2] - first_width + 1
+    line_length = x.shape[3] - last_width + 1
+    if line_length <= 0:
+        return
+    bytes_of_sample = max(1, prod(x.shape[1:]) * last_width * x.itemsize)
+    block = max(1, BLOCK_BYTES // bytes_of_sample)
+    for start in range(0, len(x), block):
+        samples = slice(start, start + block)
+        windows = sliding_window_view(x[samples], last_width, axis=-1)
+        columns = np.ascontiguousarray(np.moveaxis(windows, -1, 2))
+        columns = columns.reshape(len(columns), x.shape[1] * last_width, -1)
+        for shift in range(first_width):
+            yield samples, shift, columns[..., shift * line_length : (shift + lines) * line_length]

@@ -1,17 +1,28 @@
-"""Parameters of layers: drawn with a stated gain, kept in a file without pickle."""
+"""Parameters of layers: drawn at random with a given gain, and stored in files without pickle."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sparsedp.io.atomic_files import load_tree, save_tree
-from sparsedp.network.filters import check_widths
+from sparsedp.network.convolution_layer import check_widths
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 __all__ = ["convolution_weights", "dense_weights", "load", "residual_weights", "save"]
 
 FORMAT = "sparsedp network 1"
 
 
-def dense_weights(rng, inputs, outputs, gain=1.0):
-    """Sizes -> parameters of a dense layer: normal weights of deviation gain / sqrt(inputs), no bias.
+def dense_weights(
+    rng: np.random.Generator, inputs: int, outputs: int, gain: float = 1.0
+) -> dict[str, NDArray[np.float64]]:
+    """Draw the parameters of a dense layer: normal weights of deviation gain / sqrt(inputs), and a bias of 0.
 
     Parameters
     ----------
@@ -31,11 +42,13 @@ def dense_weights(rng, inputs, outputs, gain=1.0):
     >>> p["weight"].shape, p["bias"].shape
     ((3, 2), (2,))
     """
-    return _layer(rng, (inputs, outputs), inputs, outputs, gain)
+    return _drawn(rng, (inputs, outputs), inputs, outputs, gain)
 
 
-def convolution_weights(rng, inputs, outputs, widths, gain=1.0):
-    """Sizes -> parameters of a convolution: normal weights of deviation gain / sqrt(inputs x entries), no bias.
+def convolution_weights(
+    rng: np.random.Generator, inputs: int, outputs: int, widths: int | Sequence[int], gain: float = 1.0
+) -> dict[str, NDArray[np.float64]]:
+    """Draw the parameters of a convolution: normal weights, and a bias of 0.
 
     Parameters
     ----------
@@ -44,7 +57,7 @@ def convolution_weights(rng, inputs, outputs, widths, gain=1.0):
     widths : int or tuple of int
         Odd: an int in 1-D, a pair in 2-D.
     gain : float
-        See dense_weights.
+        See dense_weights. The deviation is gain / sqrt(inputs * entries of a filter).
 
     Returns
     -------
@@ -56,20 +69,22 @@ def convolution_weights(rng, inputs, outputs, widths, gain=1.0):
     >>> convolution_weights(np.random.default_rng(0), 1, 8, (5, 5))["weight"].shape
     (8, 1, 5, 5)
     """
-    widths = (widths,) if np.ndim(widths) == 0 else tuple(widths)
-    check_widths(widths)
-    return _layer(rng, (outputs, inputs, *widths), inputs * int(np.prod(widths)), outputs, gain)
+    all_widths = tuple(np.atleast_1d(widths).tolist())
+    check_widths(all_widths)
+    return _drawn(rng, (outputs, inputs, *all_widths), inputs * int(np.prod(all_widths)), outputs, gain)
 
 
-def _layer(rng, shape, fan, outputs, gain):
-    """Weights of which `fan` numbers are summed for each output."""
+def _drawn(rng, shape, summands, outputs, gain):
+    """Return weights of which `summands` enter each output, and a bias of 0."""
     if not hasattr(rng, "standard_normal"):
         raise TypeError(f"weights are drawn from a numpy Generator, got {rng!r}; write np.random.default_rng(0)")
-    return {"weight": rng.standard_normal(shape) * (gain / np.sqrt(max(fan, 1))), "bias": np.zeros(outputs)}
+    return {"weight": rng.standard_normal(shape) * (gain / np.sqrt(max(summands, 1))), "bias": np.zeros(outputs)}
 
 
-def residual_weights(rng, channels, widths, gain=1.0):
-    """Sizes -> parameters of a residual block.
+def residual_weights(
+    rng: np.random.Generator, channels: int, widths: int | Sequence[int], gain: float = 1.0
+) -> dict[str, dict[str, NDArray[np.float64]]]:
+    """Draw the parameters of a residual block.
 
     Parameters
     ----------
@@ -90,11 +105,12 @@ def residual_weights(rng, channels, widths, gain=1.0):
     ['first', 'second']
     """
     first = convolution_weights(rng, channels, channels, widths)
-    return {"first": first, "second": convolution_weights(rng, channels, channels, widths, gain)}
+    second = convolution_weights(rng, channels, channels, widths, gain)
+    return {"first": first, "second": second}
 
 
-def save(path, parameters):
-    """Parameters -> a .npz file without pickle; the structure stands beside the arrays as JSON.
+def save(path: str | os.PathLike[str], parameters: Any) -> None:
+    """Store parameters in a .npz file without pickle; the structure stands beside the arrays as JSON.
 
     Parameters
     ----------
@@ -106,7 +122,7 @@ def save(path, parameters):
     TypeError
         If a leaf is something else, or a key of a dict is not a string.
     OSError
-        If the file cannot be written; what was saved there before is there still.
+        If the file cannot be written; a previous file of this name is kept.
 
     Examples
     --------
@@ -119,8 +135,8 @@ def save(path, parameters):
     save_tree(path, parameters, FORMAT)
 
 
-def load(path):
-    """File that `save` wrote -> parameters.
+def load(path: str | os.PathLike[str]) -> Any:
+    """Load parameters from a file that `save` wrote.
 
     Parameters
     ----------
@@ -133,7 +149,7 @@ def load(path):
     Raises
     ------
     ValueError
-        If the file is not one of those.
+        If `save` did not write the file, or it is damaged.
 
     Examples
     --------
