@@ -53,8 +53,10 @@ def seeds():
 
 @pytest.fixture
 def rng(request):
-    """A generator of its own for each test, the same in every run (a worker writes the group behind an @)."""
-    return np.random.default_rng(zlib.crc32(request.node.nodeid.split("@")[0].encode()))
+    """A generator of its own for each test: the same in every run, and wherever the file lies among the tests."""
+    name = request.node.nodeid.split("@")[0]  # a worker writes the group of a test behind an @
+    file, separator, test = name.partition("::")
+    return np.random.default_rng(zlib.crc32(f"tests/{Path(file).name}{separator}{test}".encode()))
 
 
 @pytest.hookimpl(tryfirst=True)
