@@ -198,6 +198,15 @@ def _sides(grid: Grid, boundary: Any) -> tuple:
     return sides
 
 
+def method_and_rule(settings: TransportSettings) -> tuple[TransportMethod, Any]:
+    """Return the scheme, and the differentiable rule of a step."""
+    if settings.grid.cells.size:
+        method = METHODS[settings.scheme](settings)
+    else:
+        method = Identity(settings)
+    return method, rule_of(method)
+
+
 class Transport(Frozen, Remade):
     """One time step of transport, ``move(u, v, dt, inflow=0.0)``, built by `transport`. Frozen.
 
@@ -217,17 +226,7 @@ class Transport(Frozen, Remade):
     _rule: Any
 
     def __init__(self, settings: TransportSettings) -> None:
-        layout = settings.grid.layout
-        rule: Any
-        if layout is not None:
-            method = TransportMethod(settings)
-            rule = layout.transport(settings)
-        elif settings.grid.cells.size:
-            method = METHODS[settings.scheme](settings)
-            rule = rule_of(method)
-        else:
-            method = Identity(settings)
-            rule = rule_of(method)
+        method, rule = settings.grid.backend.implementation(method_and_rule)(settings)
         super().__init__(settings=settings, method=method, _rule=rule)
 
     def recipe(self) -> tuple:
@@ -281,8 +280,7 @@ class Transport(Frozen, Remade):
         """
         settings = self.settings
         name = self.method.name
-        if settings.grid.layout is not None:
-            settings.grid.layout.check("transport.operator")
+        settings.grid.backend.check("transport.operator")
         if not self.method.linear:
             raise ValueError(
                 f"{name} is not linear in u and has no matrix; write scheme='upwind', or call move(u, v, dt)"

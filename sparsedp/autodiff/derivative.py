@@ -4,7 +4,6 @@ import gc
 import threading
 import warnings
 from contextlib import contextmanager
-from numbers import Number
 from typing import Any, NamedTuple
 
 import autograd.numpy as anp
@@ -24,7 +23,7 @@ from sparsedp._utils.validation import (
     check_whole,
     surely_finite,
 )
-from sparsedp.autodiff.fast_derivatives import ELSEWHERE, alike, ranks, together
+from sparsedp.autodiff.backend import collectively, is_field, match_value, process_count
 from sparsedp.autodiff.tape import (
     Recorder,
     Rule,
@@ -257,7 +256,7 @@ def _cause_of_non_finite(again):
     again : callable
         ``again()`` computes the derivative once more in reverse mode.
     """
-    if ranks() > 1:
+    if process_count() > 1:
         return None
     try:
         with unwarned(), judged():
@@ -390,7 +389,7 @@ def _directions(x, tangent):
 
 def _is_array(value):
     """Whether a value is one array or number, traced or not."""
-    return isbox(value) or isinstance(value, (np.ndarray, Number)) or type(value) in ELSEWHERE
+    return isbox(value) or is_field(value)
 
 
 def jvp(fun, x, tangent):
@@ -439,7 +438,7 @@ def _jvp(name, fun, x, tangent):
     check_leaves("x", x)
     check_leaves("tangent", tangent)
     tangents = _directions(x, tangent)
-    results = together("jvp", (x, tangent), push, fun, x, tangents)
+    results = collectively("jvp", (x, tangent), push, fun, x, tangents)
 
     def again():
         values, _, pull = linearised(fun, x, [direction is not None for direction in tangents])
@@ -554,11 +553,11 @@ def vjp(fun, *x):
     (5.0, 2.0)
     """
     check_function("vjp", fun, "lambda u: ...")
-    value, pull = together("vjp", x, pullback, lambda parts: fun(*parts), x)
+    value, pull = collectively("vjp", x, pullback, lambda parts: fun(*parts), x)
 
     def back(g):
         check_precision("the cotangent", g)
-        slopes = together("the function of vjp", (g,), pull, g)
+        slopes = collectively("the function of vjp", (g,), pull, g)
         if is_finite(g):
             _warn_unless_finite("vjp", slopes, lambda: pullback(lambda parts: fun(*parts), x)[1](g))
         return slopes[0] if len(x) == 1 else slopes
@@ -657,7 +656,7 @@ def value_and_grad(loss, argnum=0):
         if len(args) <= argnum:
             raise TypeError(f"the gradient in argument {argnum} of the loss needs it, got {len(args)} arguments")
         with growing():  # until the tape is gone: a search for cyclic garbage in between would walk all of it
-            return together("the loss", args, _value_and_gradient, loss, argnum, args)
+            return collectively("the loss", args, _value_and_gradient, loss, argnum, args)
 
     return Made(evaluate, value_and_grad, loss, argnum)
 
@@ -693,7 +692,7 @@ def check_loss(value):
 
 def of_argument(cotangent, value):
     """What a product of fields gives for an argument: summed over batches, and for a real argument the real part."""
-    cotangent = alike(cotangent, value)
+    cotangent = match_value(cotangent, value)
     while np.ndim(cotangent) > np.ndim(value):
         cotangent = anp.sum(cotangent, axis=0)
     return cast(cotangent, float) if dtype_of(cotangent).kind == "c" != dtype_of(value).kind else cotangent

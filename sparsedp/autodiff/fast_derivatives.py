@@ -14,13 +14,28 @@ from typing import Any
 import autograd.numpy as anp
 import numpy as np
 
+from sparsedp.autodiff.backend import ARRAY_KINDS, BOX, formulas_of_kind, is_distributed
 from sparsedp.errors import DerivativeError
 
 __all__ = [
-    "ACTS", "ARRAY", "BOX", "COPY", "ELSEWHERE", "FLOAT", "ITEM", "MAKERS", "NUMBERS", "OPERATORS", "PLAIN", "Part",
-    "REAL", "alike", "array", "by_entry", "elsewhere", "formulas_of", "in_dtype", "on_every_rank",
-    "operand", "power_slope", "ranks", "refuse_elsewhere", "refuse_options", "together", "whole",
-]  # fmt: skip
+    "ACTS",
+    "ARRAY",
+    "COPY",
+    "FLOAT",
+    "ITEM",
+    "MAKERS",
+    "NUMBERS",
+    "OPERATORS",
+    "PLAIN",
+    "REAL",
+    "Part",
+    "by_entry",
+    "formulas_of",
+    "in_dtype",
+    "operand",
+    "power_slope",
+    "refuse_options",
+]
 
 FLOAT = np.dtype(float)
 REAL = {np.ndarray, np.float64, float, int}
@@ -31,7 +46,6 @@ OPERATORS = {
     "add": anp.add, "sub": anp.subtract, "mul": anp.multiply, "truediv": anp.true_divide, "pow": anp.power,
 }  # fmt: skip
 MAKERS = "_array_from_scalar_or_array", "array_from_args"  # what anp.array calls
-BOX = anp.numpy_boxes.ArrayBox
 ITEM = unwrap(BOX.__getitem__)
 # Of NumPy's numbers the operators of Python take a tenth of the time; and a step that is run again without a tape has
 # their bits: a power by the function may differ in the last one.
@@ -65,36 +79,12 @@ def formulas_of(fun, value, args, nums):
     """A call ``value = fun(*args)`` -> its two formulas in FORMULAS; None: autograd knows."""
     line = FORMULAS.get(fun)  # autograd's own: a primitive that a user made of NumPy's has other derivatives
     if line is None or type(value) not in NUMBERS or value.dtype is not FLOAT:
-        return ELSEWHERE and _elsewhere(fun, value, args, nums)
+        return formulas_of_kind(fun, value, args, nums) if ARRAY_KINDS else None
     for num in nums:
         arg = args[num]
         if type(arg) not in NUMBERS or arg.dtype is not FLOAT:
-            return ELSEWHERE and _elsewhere(fun, value, args, nums)
+            return formulas_of_kind(fun, value, args, nums) if ARRAY_KINDS else None
     return line[1:] if line[0](value, nums, args) else None
-
-
-def _kind(value):
-    while type(value) is BOX:
-        value = value._value
-    return type(value)
-
-
-def _elsewhere(fun, value, args, nums):
-    kind = next((kind for kind in map(_kind, args) if kind in ELSEWHERE), None)
-    return kind and ELSEWHERE[kind][0](fun, value, args, nums)
-
-
-def alike(derivative, value):
-    """A derivative as the kind of array that its value is, traced or not: see ELSEWHERE."""
-    pair = ELSEWHERE and (ELSEWHERE.get(_kind(derivative)) or ELSEWHERE.get(_kind(value)))
-    return pair[1](derivative, value) if pair else derivative
-
-
-def together(what, given, act, *args):
-    """act(*args). On ranks all raise what one raises, and `given`, arguments, must be the same: see ELSEWHERE."""
-    for entry in ELSEWHERE.values():
-        return entry[2](what, given, act, *args)
-    return act(*args)
 
 
 def _full_like(a, fill_value, *args, **options):
@@ -114,42 +104,9 @@ def refuse_options(fun, options):
         )
 
 
-def ranks():
-    """How many processes share the fields of this one."""
-    return next((entry[3]() for entry in ELSEWHERE.values()), 1)
-
-
-def array(value):
-    """Plain value -> an array: itself where it lies elsewhere."""
-    return value if type(value) in ELSEWHERE else np.asarray(value)
-
-
-def whole(value):
-    """Plain value -> itself, or all of it where it lies elsewhere."""
-    return value.gather() if type(value) in ELSEWHERE else value
-
-
-def on_every_rank(value):
-    """Value, traced or not -> itself, or all of it on every rank where it lies elsewhere; differentiable."""
-    pair = ELSEWHERE.get(_kind(value))
-    return pair[1](value, np.broadcast_to(0.0, value.shape)) if pair else value
-
-
-def elsewhere(values):
-    """The first of some plain values that lies elsewhere, or None."""
-    return next((value for value in values if type(value) in ELSEWHERE), None)
-
-
-def refuse_elsewhere(name, values):
-    """Refuse plain values that lie elsewhere."""
-    value = elsewhere(values)
-    if value is not None:
-        value.refuse(name)
-
-
 def in_dtype(value, dtype):
     """Plain value -> the same numbers in a dtype."""
-    return value.astype(dtype) if type(value) in ELSEWHERE else np.asarray(value, dtype)
+    return value.astype(dtype) if is_distributed(value) else np.asarray(value, dtype)
 
 
 def _entrywise(*acts):
@@ -194,11 +151,6 @@ def _part(g, place):
 
 def _entries(g, nums):
     return [g[num - 2] for num in nums]
-
-
-# A kind of arrays that do not lie in the memory of one process -> what stands for `formulas_of` where one takes part,
-# ``alike(derivative, value)``, which gives a derivative the kind of the value it belongs to, `together` and `ranks`.
-ELSEWHERE: dict[type, Any] = {}
 
 
 def power_slope(g, x, y):

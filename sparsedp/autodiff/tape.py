@@ -25,8 +25,9 @@ from sparsedp.autodiff.tape_constants import FIXED, constant, constant_args, fro
 from sparsedp.errors import DerivativeError, ShapeError
 
 # isort: off
+from sparsedp.autodiff.backend import BOX, match_value
 from sparsedp.autodiff.fast_derivatives import (
-    ACTS, ARRAY, BOX, COPY, FLOAT, ITEM, MAKERS, NUMBERS, OPERATORS, PLAIN, REAL, Part, alike, formulas_of,
+    ACTS, ARRAY, COPY, FLOAT, ITEM, MAKERS, NUMBERS, OPERATORS, PLAIN, REAL, Part, formulas_of,
     in_dtype, operand, power_slope, refuse_options,
 )  # fmt: skip
 
@@ -589,7 +590,7 @@ def fit(name, value, cotangent, g):
     if type(cotangent) is type(value) and type(value) in NUMBERS:
         if cotangent.shape == value.shape and cotangent.dtype == value.dtype:
             return cotangent
-    cotangent = alike(np.asarray(cotangent) if isinstance(cotangent, list) else cotangent, value)
+    cotangent = match_value(np.asarray(cotangent) if isinstance(cotangent, list) else cotangent, value)
     shape, wanted = np.shape(plain(cotangent)), np.shape(plain(value))
     if shape != wanted:
         raise ShapeError(f"{name} returned a derivative of shape {shape} where {wanted} is needed")
@@ -644,11 +645,14 @@ apply_operator = direct(_operator)  # a field through an Operator: half a rule's
 
 def _operator_vjp(argnums, ans, args, kwargs):
     op, u = args
+    dtype = u.dtype
+    reference = op.backend.reference(u)  # the tape does not keep u
+    del args, u
 
-    def pull(g, dtype=u.dtype, on_ranks=u if op.layout else None):  # the tape does not keep u
+    def pull(g):
         act = partial(apply_operator, op.T) if isbox(g) else op.T.apply
         back = timed(op.name, "vjp", act, g)
-        return (cast(back if op.layout is None else alike(back, on_ranks), dtype),)
+        return (cast(match_value(back, reference), dtype),)
 
     return pull
 

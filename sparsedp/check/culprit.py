@@ -209,7 +209,7 @@ def _entries_of_operator(op, rng):
     in_result = largest_gaps(gap_in_result, [g.shape], 1)
     words = ""
     for name, found, space in (("argument", in_argument, op.domain), ("result", in_result, op.codomain)):
-        spaces = [space] if space.grid is not None and space.layout is None else []
+        spaces = [space] if space.grid is not None and space.backend.whole_fields else []
         words += "".join(f"; largest gap in its {_named(name, one, space.shape, spaces)}" for one in found)
     return words
 

@@ -212,7 +212,7 @@ def spaces_of(function, x):
             for actor in actors.values():
                 for name in ("domain", "codomain"):
                     space: Any = getattr(actor, name, None)
-                    if getattr(space, "grid", None) is not None and space.layout is None:
+                    if getattr(space, "grid", None) is not None and space.backend.whole_fields:
                         spaces.setdefault(str(space), space)
     return list(spaces.values())
 

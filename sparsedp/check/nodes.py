@@ -7,8 +7,8 @@ from types import CellType, FunctionType, MethodType
 
 import numpy as np
 
+from sparsedp.autodiff.backend import array_types
 from sparsedp.autodiff.derivative import name_of, witnessed
-from sparsedp.autodiff.fast_derivatives import ELSEWHERE
 from sparsedp.autodiff.tape import called, isbox, through
 
 __all__ = ["Node", "bytes_held", "calls_seen", "in_order"]
@@ -102,7 +102,7 @@ def bytes_held(nodes):
     waiting: list = [(part, 0) for node in nodes for part in (node.vjp, node.held)]
     while waiting:
         thing, depth = waiting.pop()
-        if isinstance(thing, (np.ndarray, *ELSEWHERE)):
+        if isinstance(thing, array_types()):
             while isinstance(base := getattr(thing, "base", None), np.ndarray):  # a field on ranks has none
                 thing = base
             buffers[id(thing)] = thing.nbytes

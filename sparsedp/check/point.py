@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sparsedp._utils.pytree import copied, mapped, norm
 from sparsedp._utils.validation import check_finite
-from sparsedp.autodiff.fast_derivatives import whole
+from sparsedp.autodiff.backend import gathered
 from sparsedp.autodiff.flattening import Packing, joined
 
 __all__ = ["QUICK_DIRECTIONS", "Point", "audit_generator", "root_mean_square"]
@@ -42,7 +42,7 @@ def _as_numpy(leaf: Any) -> Any:
     """
     if isinstance(leaf, (float, complex)):
         return np.asarray(leaf)[()]
-    return whole(leaf)
+    return gathered(leaf)
 
 
 class Point(Packing):

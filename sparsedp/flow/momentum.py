@@ -19,7 +19,7 @@ import scipy.sparse as sp
 from sparsedp._utils.pytree import copied
 from sparsedp._utils.reconstruction import Made
 from sparsedp._utils.validation import check_on
-from sparsedp.autodiff.fast_derivatives import whole
+from sparsedp.autodiff.backend import gathered
 from sparsedp.autodiff.tape import plain
 from sparsedp.flow.projection_setup import faces_that
 from sparsedp.grid.boundary_conditions import dirichlet, free_slip, inflow, no_slip, outflow, resolve
@@ -325,7 +325,7 @@ def velocities_of(lifted, grid, sides):
     walls = wall_velocities(grid, sides)
     enters = [sides[a][side] == inflow for a, side, _ in _moving_sides(grid, sides)]
     wanted = np.repeat(np.array(enters, bool), np.diff(walls.offsets))
-    values = whole(plain(lifted))
+    values = gathered(plain(lifted))
     count = np.diff(matrix.indptr)  # walls that a face touches
     entering = abs(matrix) @ wanted > 0
     if np.any(values[entering & (count > 1)]):

@@ -103,7 +103,9 @@ class Projection(Operator):
 
     def __init__(self, setup):
         faces = setup.grid.faces
-        structure = Projected(setup, (faces.size,) * 2) if faces.layout is None else setup.operators()[0].structure
+        structure = (
+            Projected(setup, (faces.size,) * 2) if faces.backend.whole_fields else setup.operators()[0].structure
+        )
         super().__init__(structure, faces, faces, "projection", "matrix-free")
         vars(self)["setup"] = setup
 
@@ -126,7 +128,7 @@ class Projection(Operator):
         """Operator faces -> cells: the p with P(v) = v + G(p) on the faces where the flow is free [velocity length]."""
         setup, cells = self.setup, self.setup.grid.cells
         shape = cells.size, self.domain.size
-        structure = Potential(setup, shape) if cells.layout is None else setup.operators()[1].structure
+        structure = Potential(setup, shape) if cells.backend.whole_fields else setup.operators()[1].structure
         return Operator(structure, self.domain, cells, "pressure")
 
     def __str__(self):

@@ -45,11 +45,11 @@ class Setup(Remade):
         self.open = faces_that(grid, self.sides, self.solid, lambda condition: not condition.closed)
         self.exponent = exponent_of(max((float(h.max(initial=0.0)) for h in grid.widths), default=1.0))
         near = Grid(grid.shape, spacing=[np.ldexp(h, -self.exponent) for h in grid.widths], periodic=grid.periodic)
-        near = near if grid.layout is None else grid.layout.laid(near)
+        near = grid.backend.place(near)
         self._maps = D, G = divergence(near), gradient(near, self.pressure_conditions, self.solid)
         self.inverse = _inverse(-D @ G, settings)
         self._refuse_lost_inflow()
-        if grid.layout is not None:
+        if not grid.backend.whole_fields:
             return
         maps = (D.structure, G.structure), (G.T.structure, D.T.structure)
         self._reach = [largest(first.magnitude()(np.ones(grid.faces.size))) for first, _ in maps]
@@ -158,7 +158,7 @@ class Setup(Remade):
 
 def _inverse(op, settings):
     """The inverse for the pressure. Transforms are preferred on small grids too: the passes go with them."""
-    if settings["method"] == "auto" and op.domain.size < FEW and op.separable and op.layout is None:
+    if settings["method"] == "auto" and op.domain.size < FEW and op.separable and op.backend.whole_fields:
         try:
             return _inverse(op, settings | {"method": "separable"})
         except ValueError:  # an axis that cannot be diagonalised with all its digits

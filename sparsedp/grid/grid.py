@@ -19,6 +19,7 @@ from sparsedp._utils.calls import public
 from sparsedp._utils.html import facts
 from sparsedp._utils.reconstruction import Uncached, Value
 from sparsedp._utils.validation import check_number, check_type
+from sparsedp.autodiff.backend import NUMPY, Backend
 from sparsedp.errors import ShapeError
 from sparsedp.grid.space import Space, whole_lengths
 
@@ -87,7 +88,7 @@ class Grid(Value, Uncached):
     origin: tuple[float, ...]
     widths: tuple[np.ndarray, ...]
     meant = {"dx": "grid.widths", "h": "grid.widths", "n": "grid.shape", "ndim": "grid.dim", "x": "grid.centres()[0]"}
-    layout = None  # of a grid whose fields lie on ranks: see parallel/layout.py
+    backend: Backend = NUMPY  # where the fields are stored
 
     @public("dp.Grid", _what_to_write)
     def __init__(self, shape, *, size=None, spacing=None, origin=0.0, periodic=False):
@@ -275,9 +276,7 @@ class Grid(Value, Uncached):
 
     def _mesh(self, places):
         lines = [self.coordinates(axis, at) for axis, at in enumerate(places)]
-        if self.layout is not None:
-            return self.layout.mesh(Space(tuple(line.size for line in lines), "places", self), lines)
-        return tuple(np.array(full) for full in np.meshgrid(*lines, indexing="ij"))
+        return self.backend.mesh(self, lines)
 
     def axis(self, axis):
         """Check an axis number or name ("x") and return the number."""
@@ -290,7 +289,7 @@ class Grid(Value, Uncached):
 
     @cached_property
     def _key(self):
-        return self.shape, self.periodic, self.origin, tuple(widths.tobytes() for widths in self.widths), self.layout
+        return self.shape, self.periodic, self.origin, tuple(widths.tobytes() for widths in self.widths), self.backend
 
     def __repr__(self):
         words = [" x ".join(map(str, self.shape)) + " cells", "size " + " x ".join(f"{size:.6g}" for size in self.size)]
@@ -299,8 +298,8 @@ class Grid(Value, Uncached):
         for word, flags in (("periodic", self.periodic), ("stretched", [not uniform for uniform in self.uniform])):
             if any(flags):
                 words.append(f"{word} in {', '.join(compress(AXES, flags))}")
-        if self.layout is not None:
-            words.append(str(self.layout))
+        if str(self.backend):
+            words.append(str(self.backend))
         return f"Grid({', '.join(words)})"
 
     def _repr_html_(self):
@@ -321,8 +320,7 @@ class Grid(Value, Uncached):
 def check_grid(name, grid):
     """Refuse what is no Grid."""
     check_type(name, grid, Grid, "a Grid", "dp.Grid((64, 64), size=1.0)")
-    if grid.layout is not None:
-        grid.layout.check(name)
+    grid.backend.check(name)
 
 
 # ---- from what the user gave to one entry for each axis ----

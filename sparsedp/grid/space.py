@@ -10,6 +10,7 @@ import numpy as np
 
 from sparsedp._utils.reconstruction import Uncached, Value
 from sparsedp._utils.validation import check_finite, check_on, check_plain
+from sparsedp.autodiff.backend import NUMPY
 from sparsedp.autodiff.tape import dtype_of, isbox
 from sparsedp.errors import ShapeError
 
@@ -67,17 +68,19 @@ class Space(Value, Uncached):
         return (0, *accumulate(map(prod, self.parts)))
 
     @cached_property
-    def layout(self):
-        """Where its fields lie, when that is on ranks; else None."""
-        return self.grid and self.grid.layout
+    def backend(self):
+        """Where the fields are stored."""
+        return NUMPY if self.grid is None else self.grid.backend
 
     @cached_property
     def volumes(self):
         """Control volume of each value [length^dim]; ones in a space without a grid."""
+        return self.backend.volumes(self)
+
+    def array_of_volumes(self):
+        """Return the control volumes as one array: see `volumes`."""
         if self.grid is None:
             return np.ones(self.shape)
-        if self.layout is not None:
-            return self.layout.volumes(self)
         with np.errstate(over="ignore"):  # what overflows is refused
             lengths = (self.grid.control_lengths(self.kind, axis) for axis in range(len(self.parts)))
             flat = [reduce(np.multiply.outer, lines).ravel() for lines in lengths]
@@ -134,9 +137,13 @@ class Space(Value, Uncached):
             If `v` has another shape.
         """
         check_on("split", v, self)
-        if self.layout is not None and self.layout.holds(v):
-            return self.layout.split(self, v)
+        return self.backend.split(self, v)
+
+    def split_array(self, v):
+        """Return the components of an array, traced or not: see `split`."""
         check_plain("split", v)
+        if len(self.parts) == 1:
+            return (anp.reshape(v, self.parts[0]),)
         return tuple(components(anp.reshape(v, (-1,)), self.parts))
 
     def join(self, *parts):
@@ -162,10 +169,12 @@ class Space(Value, Uncached):
                 f"join on {self} takes {len(self.parts)} components, got {len(parts)}; their shapes are {shapes}"
             )
         check_plain("join", *parts)
-        if self.layout is not None and self.layout.holds(*parts):
-            return self.layout.join(self, parts)
+        return self.backend.join(self, parts)
+
+    def join_arrays(self, parts):
+        """Return one array of its components, traced or not: see `join`."""
         numpy = anp if any(map(isbox, parts)) else np  # the same, without the tape
-        if not parts:  # as of walls in a periodic box
+        if len(parts) == 0:  # as of walls in a periodic box
             return np.zeros(self.shape)
         flat = [numpy.reshape(_broadcast(self, part, shape), (-1,)) for part, shape in zip(parts, self.parts)]
         return numpy.reshape(numpy.concatenate(flat), self.shape)

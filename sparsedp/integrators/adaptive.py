@@ -42,8 +42,8 @@ import numpy as np
 from sparsedp._utils.counters import note, thread
 from sparsedp._utils.pytree import flatten, is_uniform, labels, leaves, mapped, paired
 from sparsedp._utils.validation import number_beside
+from sparsedp.autodiff.backend import NUMPY, backend_of, replicated
 from sparsedp.autodiff.derivative import push
-from sparsedp.autodiff.fast_derivatives import elsewhere, on_every_rank
 from sparsedp.autodiff.tape import cast, dtype_of, is_variable, isbox, linear, plain, traces_of
 from sparsedp.autodiff.tape_constants import constant
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
@@ -201,7 +201,7 @@ class Adaptive(Scheme):
         """
         problem = self.scheme.problem
         smooth = problem.rate is None and not problem.moving
-        return None if smooth or elsewhere(leaves(known[0])) is not None else Inspector(self, *known[1:])
+        return None if smooth or backend_of(leaves(known[0])) is not NUMPY else Inspector(self, *known[1:])
 
     def inner_state(self, step):
         """Return a state inside a step, in the form that steps have, and the share of the step at which it is."""
@@ -562,7 +562,7 @@ class Moving:
         """Tree -> flat."""
         found, parts = paired(tree, self.form, "rate"), []
         for place, leaf, size in self.moving:
-            part = on_every_rank(_off(found[place], leaf) / size)
+            part = replicated(_off(found[place], leaf) / size)
             parts += [anp.real(part), anp.imag(part)] if np.iscomplexobj(leaf) else [part]
         return self.space.join(*parts)
 

@@ -31,7 +31,7 @@ from scipy.special import hyp1f1
 
 from sparsedp._utils.pytree import mapped
 from sparsedp._utils.validation import check_finite
-from sparsedp.autodiff.fast_derivatives import refuse_elsewhere
+from sparsedp.autodiff.backend import require_arrays
 from sparsedp.grid.space import Space
 from sparsedp.integrators.problem import combine, later
 from sparsedp.integrators.runge_kutta import Scheme, family
@@ -117,7 +117,7 @@ class PhiFunctions:
         """f(z L) b, or f(z L^T) b, as a rule in (z, b)."""
 
         def forward(z, b):
-            refuse_elsewhere(self.name, [b])
+            require_arrays(self.name, [b])
             op = self._operator(function, float(z))
             return (op.T if transposed else op).apply(b)
 

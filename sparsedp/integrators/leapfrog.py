@@ -27,8 +27,8 @@ from scipy.sparse.linalg import ArpackError, LinearOperator, eigs
 
 from sparsedp._utils.pytree import flatten, is_uniform, leaves, mapped, paired
 from sparsedp._utils.validation import check_function, check_number, is_whole, number_beside, rounded_down
+from sparsedp.autodiff.backend import replicated
 from sparsedp.autodiff.derivative import push
-from sparsedp.autodiff.fast_derivatives import on_every_rank
 from sparsedp.autodiff.tape import is_variable, plain
 from sparsedp.errors import UnstableStepError
 from sparsedp.grid.grid import AXES, check_grid
@@ -72,7 +72,7 @@ class Leapfrog(Scheme):
 
     def check_stable(self, state, params, h, known):
         """Refuse a step that would grow without bound; `known`: what the frequencies depend on."""
-        state, params, h, known = mapped(on_every_rank, untraced((state, params, h, known)))
+        state, params, h, known = mapped(replicated, untraced((state, params, h, known)))
         key = h, *leaves(known)
         fastest = self._speeds.find(key)
         if fastest is None:

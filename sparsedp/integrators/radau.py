@@ -36,7 +36,7 @@ import numpy as np
 
 from sparsedp._utils.pytree import leaves
 from sparsedp._utils.validation import check_shape
-from sparsedp.autodiff.fast_derivatives import refuse_elsewhere
+from sparsedp.autodiff.backend import require_arrays
 from sparsedp.autodiff.tape import cast, dtype_of, is_variable, isbox, linear, plain, traces_of
 from sparsedp.autodiff.tape_constants import constant
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
@@ -86,7 +86,7 @@ class Flat:
     """
 
     def __init__(self, problem, u, name):
-        refuse_elsewhere(name, map(plain, leaves(u)))
+        require_arrays(name, map(plain, leaves(u)))
         self.problem, self.timed, self.layout = problem, problem.timed, Layout(u, name)
         self.size = self.layout.size
         if self.size > UNKNOWNS:
@@ -202,7 +202,7 @@ class Radau(Adaptive):
         """Refuse a state, a rate, or derivatives that it cannot serve."""
         u, _, t, h = untraced(given)
         rate = self.problem.problem(u, self.params, t)
-        refuse_elsewhere(self.name, leaves(rate))
+        require_arrays(self.name, leaves(rate))
         like(combine(u, (0.0, rate)), u)  # refuses other shapes, and complex
         if any(map(isbox, leaves(rate))):
             raise DerivativeError(

@@ -263,7 +263,7 @@ class Resolvent:
     @cached_property
     def _moving(self):
         """Projection from what L leaves as it is; None where that is nothing, or L unsymmetric."""
-        system = (System if self.op.layout is None else self.op.layout.system)(self.op, self.settings["rtol"], None)
+        system = self.op.backend.implementation(System)(self.op, self.settings["rtol"], None)
         if not self.op.structure.has_entries or system.complex or system.weights is None:
             return None
         null = system.null_space

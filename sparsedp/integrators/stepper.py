@@ -283,7 +283,9 @@ def _scheme(method, given, settings):
         raise TypeError(f"{method} needs the stiff linear term: write linear=L or linear=(L, coefficient)")
     scheme: Scheme
     if method in EXPLICIT:
-        plain = problem.linear and problem.source is None and all(term.op.layout is None for term in problem.stiff)
+        plain = (
+            problem.linear and problem.source is None and all(term.op.backend.whole_fields for term in problem.stiff)
+        )
         scheme = (Polynomial if plain else Explicit)(problem, method)
     elif method == "etdrk4":
         from sparsedp.integrators.exponential import Exponential

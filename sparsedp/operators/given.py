@@ -25,8 +25,7 @@ __all__ = ["check_operator", "from_functions", "from_linear_operator", "from_mat
 def check_operator(name, op):
     """Refuse what is no Operator."""
     check_type(name, op, Operator, "an Operator", "dp.from_matrix(...) first")
-    if op.layout is not None:
-        op.layout.check(name)
+    op.backend.check(name)
 
 
 def from_matrix(matrix, domain=None, codomain=None, name="matrix"):

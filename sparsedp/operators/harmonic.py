@@ -13,8 +13,8 @@ import numpy as np
 
 from sparsedp._utils.reconstruction import Made
 from sparsedp._utils.validation import check_finite, check_kind, check_native, check_on
+from sparsedp.autodiff.backend import as_field
 from sparsedp.autodiff.derivative import entrywise
-from sparsedp.autodiff.fast_derivatives import array
 from sparsedp.autodiff.tape import plain
 from sparsedp.grid.grid import check_grid
 from sparsedp.operators.stencils import cell_beside, to_faces
@@ -49,7 +49,7 @@ def harmonic_average(grid):
     --------
     >>> from sparsedp import Grid
     >>> harmonic_average(Grid(2))(np.array([1.0, 3.0]))
-    array([1. , 1.5, 3. ])
+    as_field([1. , 1.5, 3. ])
     """
     check_grid("harmonic_average", grid)
     below, above = to_faces(grid, "cell below", cell_beside, False), to_faces(grid, "cell above", cell_beside, True)
@@ -57,7 +57,7 @@ def harmonic_average(grid):
 
     def average(k):
         check_native("harmonic_average", k)
-        values = array(plain(k))
+        values = as_field(plain(k))
         check_on("harmonic_average", values, grid.cells)
         check_kind("k of harmonic_average", values.dtype, "real numbers", "; write k.real")
         check_finite("harmonic_average", values, "takes a finite coefficient")

@@ -4,7 +4,6 @@ import weakref
 from functools import cached_property
 from math import prod
 from numbers import Number
-from typing import Any
 
 import numpy as np
 from scipy.sparse import issparse
@@ -16,6 +15,7 @@ from sparsedp._utils.counters import active
 from sparsedp._utils.html import facts, spy
 from sparsedp._utils.reconstruction import Frozen, Remade
 from sparsedp._utils.validation import check_finite, check_native, check_out, check_shape, field_array
+from sparsedp.autodiff.backend import NUMPY, Backend
 from sparsedp.autodiff.tape import apply_operator, isbox
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
 from sparsedp.grid.space import Space, fits
@@ -65,7 +65,7 @@ class Operator(Frozen, Remade):
     codomain: Space
     name: str
     form: str
-    layout: Any  # where its fields lie, when that is on ranks; else None
+    backend: Backend  # where the fields are stored
     meant = {
         "dot": "op(u), or A @ B",
         "toarray": "op.matrix.toarray()",
@@ -83,8 +83,14 @@ class Operator(Frozen, Remade):
     def __init__(self, structure, domain, codomain, name, form=None):
         if structure.shape != (codomain.size, domain.size):
             raise ShapeError(f"{name} maps {domain} to {codomain}, but its matrix has shape {structure.shape}")
-        form, layout = form or _chosen_form(structure), codomain.layout if domain.layout is None else domain.layout
-        super().__init__(structure=structure, domain=domain, codomain=codomain, name=name, form=form, layout=layout)
+        super().__init__(
+            structure=structure,
+            domain=domain,
+            codomain=codomain,
+            name=name,
+            form=form or _chosen_form(structure),
+            backend=codomain.backend if domain.backend is NUMPY else domain.backend,
+        )
 
     def recipe(self):
         """The call that makes it again: see _utils/reconstruction.py."""
@@ -128,8 +134,10 @@ class Operator(Frozen, Remade):
         ValueError
             If `out` overlaps `u` or is not contiguous.
         """
-        if self.layout is not None:
-            return self.layout.applied(self, u, out)
+        return self.backend.apply(self, u, out)
+
+    def apply_array(self, u, out=None):
+        """Apply to a NumPy array: see `apply`."""
         u, shape = field_array(self, u, batch=True), self.codomain.shape
         dtype = result_dtype(self.structure, u.dtype)
         lead = u.shape[: u.ndim - len(self.domain.shape)]
@@ -340,7 +348,7 @@ class Operator(Frozen, Remade):
 
     def _repr_html_(self):
         """For a notebook: what it is, and where the entries of a small one are."""
-        small = self.layout is None and self.structure.has_entries and max(self.shape) <= SPY_BELOW
+        small = self.backend.whole_fields and self.structure.has_entries and max(self.shape) <= SPY_BELOW
         matrix = self._acting.explicit() if small else None
         entries = {
             "from": self.domain,

@@ -191,7 +191,7 @@ def _coarse(grid, factor):
     spacing = [h.reshape(-1, f).sum(axis=1) for h, f in zip(grid.widths, factors, strict=True)]
     shape = tuple(n // f for n, f in zip(grid.shape, factors, strict=True))
     coarse = Grid(shape, spacing=spacing, origin=grid.origin, periodic=grid.periodic)
-    return coarse if grid.layout is None else grid.layout.laid(coarse), factors
+    return grid.backend.place(coarse), factors
 
 
 def component(grid, axis):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sparsedp._utils.pytree import flatten, leaves, norm
-from sparsedp.autodiff.fast_derivatives import ranks, whole
+from sparsedp.autodiff.backend import gathered, process_count
 from sparsedp.io.atomic_files import UNFINISHED, load_tree, path_errors, save_tree
 from sparsedp.optimize.checkpoint_upgrade import FORMAT_0_2, upgraded
 from sparsedp.optimize.result import Evaluation, Failure, Record
@@ -88,7 +88,7 @@ class Checkpoint:
             self._check_same(name, setting == content["settings"].get(name))
         history = [_record(fields) for fields in content["history"]]
         start = template.current
-        exact = content["ranks"] == ranks() and content["format"] == FORMAT
+        exact = content["ranks"] == process_count() and content["format"] == FORMAT
         self._check_start(start, history[0], objective, exact)
         if content["format"] == FORMAT:
             state = flatten(template)[1](content["state"])
@@ -153,7 +153,7 @@ class Checkpoint:
         self._unwritten = {
             "iteration": monitor.iteration,
             "settings": self._settings,
-            "ranks": ranks(),
+            "ranks": process_count(),
             "evaluations": objective.count,
             "state": leaves(state),
             "best": list(objective.best),
@@ -192,7 +192,7 @@ def _digest(content):
 
 def _description(leaf):
     """Return the type and content of a leaf in words that are the same in every process."""
-    leaf = whole(leaf)
+    leaf = gathered(leaf)
     kind = type(leaf).__qualname__
     if isinstance(leaf, (np.ndarray, np.generic)) and leaf.dtype != object:
         return f"{kind} {leaf.dtype} {leaf.shape} {_digest(leaf.tobytes())}"

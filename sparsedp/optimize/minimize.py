@@ -12,7 +12,7 @@ from sparsedp._utils.calls import advice_near, foreign_keyword_advice
 from sparsedp._utils.progress import shown_steps
 from sparsedp._utils.pytree import leaves
 from sparsedp._utils.validation import check_choice, check_function, check_number, check_whole, is_number
-from sparsedp.autodiff.fast_derivatives import ELSEWHERE, together
+from sparsedp.autodiff.backend import backend_of, collectively
 from sparsedp.autodiff.flattening import Packing
 from sparsedp.optimize.admm import ADMM
 from sparsedp.optimize.batches import Batches
@@ -204,10 +204,10 @@ def minimize(
         "batches": batches,
         "checkpoint": checkpoint,
     }
-    for leaf in leaves(start):
-        if type(leaf) in ELSEWHERE:  # a field on ranks
-            other_arguments = {**options, **other_arguments}
-            return leaf.layout.minimize(loss, start, method, maxiter, tolerance, callback, bounds, other_arguments)
+    implementation = backend_of(leaves(start)).implementation(minimize)
+    if implementation is not minimize:
+        other_arguments = {**options, **other_arguments}
+        return implementation(loss, start, method, maxiter, tolerance, callback, bounds, other_arguments)
     if isinstance(chosen, ADMM):
         for name, value in {**other_arguments, "tolerance": callable(tolerance)}.items():
             if value:
@@ -252,7 +252,7 @@ def minimize(
     covariance: Any = INTERRUPTED if chosen.uses_residuals else NO_RESIDUALS
     try:
         first_point = box.nearest(packing.pack(start))
-        together("minimize", (start,), _run, chosen, objective, monitor, checkpoints, first_point, steps)
+        collectively("minimize", (start,), _run, chosen, objective, monitor, checkpoints, first_point, steps)
         covariance = objective.covariance(objective.best)
     except KeyboardInterrupt:
         if not monitor.history:

@@ -8,12 +8,13 @@ whole shape is a field that every rank knows: beside a field on ranks, each take
 
 from functools import partial, partialmethod
 from operator import attrgetter
+from typing import Any
 
 import autograd.numpy as anp
 import numpy as np
 
 from sparsedp._utils.pytree import leaves
-from sparsedp.autodiff.fast_derivatives import BOX, ELSEWHERE
+from sparsedp.autodiff.backend import ARRAY_KINDS, BOX, NUMPY, ArrayKind
 from sparsedp.autodiff.tape import VSpace, autograd_rules, isbox, linear, plain
 from sparsedp.errors import ShapeError
 from sparsedp.parallel.agreement import course
@@ -30,7 +31,7 @@ class DistributedField(np.lib.mixins.NDArrayOperatorsMixin):
         flat.flags.writeable = False
         self.flat, self.space = flat, space
 
-    layout = property(lambda self: self.space.grid.layout)
+    layout = backend = property(lambda self: self.space.grid.backend)
     shape = property(lambda self: self.space.shape)
     ndim = property(lambda self: len(self.space.shape))
     size = property(lambda self: self.space.size)
@@ -101,10 +102,10 @@ for name, what in {
 def block(value, space):
     """A field in any form -> one on ranks: such a field, a number, or what every rank has whole (or broadcasts)."""
     if isinstance(value, DistributedField):
-        if value.space.parts != space.parts or value.layout != space.grid.layout:
+        if value.space.parts != space.parts or value.layout != space.grid.backend:
             raise ShapeError(f"a field on {space.described} is needed, got one on {value.space.described}")
         return value
-    value, layout = np.asarray(value), space.grid.layout
+    value, layout = np.asarray(value), space.grid.backend
     layout.tell(value)
     if np.ndim(value) == 0:
         return DistributedField(np.full(layout.size(space.parts), value), space)
@@ -362,10 +363,35 @@ def together(what, given, act, *args):
 
 def _agreement(given):
     """That of the fields among some values, or of the last message since the outermost call began; else None."""
-    layouts = filter(None, (getattr(plain(leaf), "layout", None) for leaf in leaves(given)))
-    return next((layout.agreement for layout in layouts), course.last if course.met > course.begun else None)
+    for leaf in leaves(given):
+        backend: Any = getattr(plain(leaf), "backend", NUMPY)
+        if not backend.whole_fields:
+            return backend.agreement
+    return course.last if course.met > course.begun else None
 
 
 BOX.register(DistributedField)
 VSpace.register(DistributedField, Sums)
-ELSEWHERE[DistributedField] = formulas, alike, together, lambda: course.last.comm.size if course.last else 1
+
+
+class DistributedKind(ArrayKind):
+    """What the tape and public calls ask of fields on ranks."""
+
+    def formulas(self, fun, value, args, nums):
+        """See `formulas`."""
+        return formulas(fun, value, args, nums)
+
+    def match(self, derivative, value):
+        """See `alike`."""
+        return alike(derivative, value)
+
+    def collectively(self, what, arguments, act, *args):
+        """See `together`."""
+        return together(what, arguments, act, *args)
+
+    def process_count(self):
+        """Return the number of ranks of the last communicator."""
+        return course.last.comm.size if course.last else 1
+
+
+ARRAY_KINDS[DistributedField] = DistributedKind()

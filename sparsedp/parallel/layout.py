@@ -6,10 +6,15 @@ from operator import add
 import numpy as np
 
 from sparsedp._utils.validation import field_array
-from sparsedp.autodiff.tape import linear, plain
+from sparsedp.advection.method import TransportMethod
+from sparsedp.advection.transport import method_and_rule
+from sparsedp.autodiff.backend import Backend, is_distributed
+from sparsedp.autodiff.tape import linear
 from sparsedp.errors import ShapeError
 from sparsedp.grid.grid import node_axes
 from sparsedp.grid.space import Space
+from sparsedp.operators.given import from_matrix
+from sparsedp.optimize.minimize import minimize
 from sparsedp.parallel.cut import localized
 from sparsedp.parallel.exchange import hold
 from sparsedp.parallel.fields import DistributedField, block, everywhere
@@ -17,6 +22,11 @@ from sparsedp.parallel.partition import Partition
 from sparsedp.parallel.solve import RanksSystem
 from sparsedp.parallel.stencil import stencil_of
 from sparsedp.parallel.transport import Carry
+from sparsedp.solvers.choose_method import Choice
+from sparsedp.solvers.inverse import system_and_choice
+from sparsedp.solvers.jacobian import jacobian_on_unknowns
+from sparsedp.solvers.newton import space_of_unknowns
+from sparsedp.solvers.system import System
 
 __all__ = ["Layout"]
 
@@ -30,30 +40,34 @@ RIGHT = {
 ENTRIES = 1000  # of an array that meets a field, so many are compared between ranks: it takes 5 us
 
 
-class Layout(Partition):
+class Layout(Partition, Backend):
     """The partition of a grid, and how operators and fields use it."""
+
+    whole_fields = False
 
     def __init__(self, shape, periodic, comm):
         super().__init__(shape, periodic, comm)
         hold(comm)
         self._pieces = cache(_pieces)
 
-    def __repr__(self):
+    def __str__(self):
         return f"on {self.comm.size} ranks"
+
+    __repr__ = __str__
 
     def check(self, name):
         """Refuse what is not known to be right on ranks."""
         if name not in RIGHT:
             raise TypeError(f"{name} does not work on ranks yet; give it the grid from before dp.distribute")
 
-    def laid(self, grid):
-        """Another grid on the same ranks."""
+    def place(self, grid):
+        """Return a grid whose fields are on the same ranks."""
         return laid(grid, self.comm)
 
     # ------------------------------------------------------------ operators
 
-    def applied(self, op, u, out=None):
-        """Operator, field on ranks or known to all -> the result, on ranks where its space is."""
+    def apply(self, op, u, out=None):
+        """Return the result of an Operator for a field on ranks, or one that every rank holds."""
         if out is not None:
             raise TypeError(f"{op.name} takes no out on ranks; leave it out")
         return self.agreement.agreed(op.name, self._applied, op, u)
@@ -66,12 +80,14 @@ class Layout(Partition):
 
     def _applied(self, op, u):
         y = self.cut(op).product(self._given(op, u))
-        return DistributedField(y, op.codomain) if op.codomain.layout else y.reshape(op.codomain.shape)
+        if op.codomain.backend.whole_fields:
+            return y.reshape(op.codomain.shape)
+        return DistributedField(y, op.codomain)
 
     def _given(self, op, u):
         if not isinstance(u, DistributedField):
             u = field_array(op, u)
-            return block(u, op.domain).flat if op.domain.layout else u.reshape(-1)
+            return u.reshape(-1) if op.domain.backend.whole_fields else block(u, op.domain).flat
         if _side(op.domain) != _side(u.space):
             raise ShapeError(f"{op.name} takes a field on {op.domain.described}, got one on {u.space.described}")
         return u.flat if u.dtype.kind in "fc" else u.flat.astype(float)
@@ -87,7 +103,26 @@ class Layout(Partition):
         return RanksSystem(op, rtol, maxiter)
 
     stencil = staticmethod(stencil_of)  # what the rows of a Jacobian on each rank need
-    transport = staticmethod(Carry)  # the setting of a transport -> its step, called with (u, v, dt, inflow)
+
+    def reference(self, u):
+        """Return the argument of an Operator, which tells on which space its gradient is."""
+        return u
+
+    def implementation(self, default):
+        """Return what is called on ranks instead of a class or function of one process."""
+        replacements = {
+            System: self.system,
+            jacobian_on_unknowns: jacobian_on_ranks,
+            method_and_rule: method_and_carry,
+            minimize: self.minimize,
+            space_of_unknowns: self.joined,
+            system_and_choice: self.system_and_choice,
+        }
+        return replacements.get(default, default)
+
+    def system_and_choice(self, op, rtol, maxiter, method, options, solves):
+        """Return the System of an operator on ranks, and that PETSc solves it."""
+        return self.system(op, rtol, maxiter, method, options), Choice("petsc", str(self))
 
     def minimize(self, *given):
         """`minimize` of unknowns on ranks."""
@@ -95,8 +130,8 @@ class Layout(Partition):
 
         return minimized(self.comm, *given)
 
-    def tried(self, act, *args):
-        """act(*args), where the caller goes on in another way if it fails: then all ranks do."""
+    def attempt(self, act, *args):
+        """Return ``act(*args)``; if it fails on one rank it fails on all."""
         return self.agreement.agreed("a trial", act, *args, at_once=True)
 
     # ------------------------------------------------------------ fields
@@ -109,10 +144,6 @@ class Layout(Partition):
             value = value[tuple(slice(None, None, n // most + 1) for n in value.shape)]
         self.agreement.tell(f"{what} beside a field on ranks", value.tobytes())
 
-    def holds(self, *values):
-        """Whether one of some values, traced or not, lies on ranks."""
-        return any(isinstance(plain(value), DistributedField) for value in values)
-
     def volumes(self, space):
         """Control volumes, as a field."""
         lines = [
@@ -120,8 +151,9 @@ class Layout(Partition):
         ]
         return DistributedField(np.concatenate([reduce(np.multiply.outer, some).reshape(-1) for some in lines]), space)
 
-    def mesh(self, space, lines):
-        """Coordinates along each axis -> for each axis a field of them."""
+    def mesh(self, grid, lines):
+        """Return a field of coordinates for each axis, from the coordinates along the axes."""
+        space = Space(tuple(line.size for line in lines), "places", grid)
         lines = self._beside(space.shape, lines)
         return tuple(DistributedField(np.array(full).reshape(-1), space) for full in np.meshgrid(*lines, indexing="ij"))
 
@@ -129,8 +161,12 @@ class Layout(Partition):
         """Arrays along the axes -> what lies beside the block of this rank."""
         return [line[start:stop] for line, (start, stop) in zip(lines, self.box(part))]
 
+    def flat(self, field):
+        """Return the field itself, whose operations act on the flat block."""
+        return field
+
     def field(self, space, value):
-        """What every rank has whole -> a field on ranks."""
+        """Return a field on ranks of values that every rank holds."""
         return block(value, space)
 
     def joined(self, name, fields):
@@ -144,19 +180,35 @@ class Layout(Partition):
         return Joint([field.space for field in fields])
 
     def split(self, space, v):
-        """Field -> its components, or the fields that a joint one holds, each on ranks; differentiable."""
+        """Return the components of a field, or the fields that a joint one holds; differentiable."""
+        if type(space) is Space and not is_distributed(v):
+            return space.split_array(v)
         return tuple(take(v) for _, take, _ in self._pieces(space))
 
     def join(self, space, parts):
-        """Components, or fields, on ranks or known to all -> one field; differentiable."""
+        """Return one field of its components, or of fields; differentiable."""
+        if type(space) is Space and not any(map(is_distributed, parts)):
+            return space.join_arrays(parts)
         pairs = zip(self._pieces(space), parts)
         return reduce(add, (back(everywhere(part, inner)) for (inner, _, back), part in pairs))
+
+
+def jacobian_on_ranks(op, space):
+    """Return a Jacobian that was given as an Operator, between the unknowns on ranks."""
+    if _side(op.domain) == _side(op.codomain) == _side(space):
+        return op
+    return from_matrix(op.matrix, space, space, op.name)
+
+
+def method_and_carry(settings):
+    """Return a scheme of transport, and the differentiable rule of a step on ranks."""
+    return TransportMethod(settings), Carry(settings)
 
 
 def laid(grid, comm):
     """Grid -> the same with its fields on the ranks of a communicator."""
     made = object.__new__(type(grid))
-    vars(made).update(grid.__getstate__(), layout=Layout(grid.shape, grid.periodic, comm))
+    vars(made).update(grid.__getstate__(), backend=Layout(grid.shape, grid.periodic, comm))
     return made
 
 
@@ -174,13 +226,13 @@ class Joint(Space):
     def volumes(self):
         """Control volume of each value; ones where those of a field are not known, as on one process."""
         if any(node_axes(space.kind, 0, space.grid.dim) is None for space in self.spaces):
-            return DistributedField(np.ones(self.layout.size(self.parts)), self)
-        return self.layout.join(self, [space.volumes for space in self.spaces])
+            return DistributedField(np.ones(self.backend.size(self.parts)), self)
+        return self.backend.join(self, [space.volumes for space in self.spaces])
 
 
 def _pieces(space):
     """Space -> for each component, or field that it holds: its space, and the rules from all to it and back."""
-    layout, made, start = space.layout, [], 0
+    layout, made, start = space.backend, [], 0
     for inner in getattr(space, "spaces", None) or [
         Space(part, f"components of {space.kind}", space.grid) for part in space.parts
     ]:
@@ -191,7 +243,7 @@ def _pieces(space):
 
 
 def _piece(space, inner, here):
-    size = space.layout.size(space.parts)
+    size = space.backend.size(space.parts)
 
     def back(g):
         g = block(g, inner).flat
@@ -204,4 +256,4 @@ def _piece(space, inner, here):
 
 def _side(space):
     """Where fields on a space lie: (layout, components), or None where every rank has all of it."""
-    return (space.layout, space.parts) if space.layout else None
+    return None if space.backend.whole_fields else (space.backend, space.parts)

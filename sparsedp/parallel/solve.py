@@ -74,7 +74,7 @@ class RanksSystem(System):
     faces = splitting = None
 
     def __init__(self, op, rtol=1e-10, maxiter=None):
-        self.layout, self.parts = op.domain.layout, op.domain.parts
+        self.layout, self.parts = op.domain.backend, op.domain.parts
         self.side = self.layout, self.parts
         self.seed = [7, self.layout.comm.rank]
         super().__init__(op, rtol, maxiter)

@@ -48,7 +48,7 @@ def stencil_of(name, space, products, lacking=None):
         here = np.all(own == [[one], *cell], axis=0)
         row = np.flatnonzero(act(DistributedField(here.astype(float), space)).flat)[: LARGEST_STENCIL + 1]
         found, _ = stencil_steps(one, cell, own[0, row], own[1:, row], n, around)
-        steps.update(*space.layout.agreement.gathered(found))
+        steps.update(*space.backend.agreement.gathered(found))
     least, lattice = np.bincount([row for _, row, *_ in steps]).max(), None
     if least <= LARGEST_STENCIL and not (lacking and steps == lacking.steps):
         lattice = find_lattice(_differences(space, steps), least, COLOURS * least + 1)
@@ -62,7 +62,7 @@ def stencil_of(name, space, products, lacking=None):
 
 def _own(space):
     """Of each number of the block of this rank its component, and its index there."""
-    boxes = [*map(space.layout.box, space.parts)]
+    boxes = [*map(space.backend.box, space.parts)]
     return field_indices([*map(lengths, boxes)], [[start for start, _ in box] for box in boxes])
 
 
@@ -105,7 +105,7 @@ class Stencil(ColouredPattern):
             column = space.offsets[one] + np.ravel_multi_index(tuple(there), space.parts[one])
             found.append((row, column, (vector[0] * one + vector[1:] @ there) % count))
         row, column, colour = map(np.concatenate, zip(*found))
-        place, self.exchange = reads(column, space.layout, space.parts)
+        place, self.exchange = reads(column, space.backend, space.parts)
         colours = np.zeros(self.exchange.read[0], int)
         colours[place], self.seeds = colour, vector @ own % count
         self._set_pattern(pattern_of(row, place, (len(own[0]), colours.size)), colours)

@@ -36,7 +36,7 @@ class Carry:
     """``move(u, v, dt, inflow)`` on fields that lie on ranks, or that all of them know; made by `Layout`."""
 
     def __init__(self, setting):
-        self.setting, self.layout, self.walls = setting, setting.grid.layout, wall_space(setting)
+        self.setting, self.layout, self.walls = setting, setting.grid.backend, wall_space(setting)
         self.speed, self.block, self.depth = last(self._speed), cache(partial(Block, setting)), 0
         if setting.solid is not None and setting.of == "cells":
             self.depth = int(np.max(distance_transform_cdt(setting.solid, "taxicab"), initial=0))
@@ -97,7 +97,7 @@ class Block:
     """The step on blocks that are so many cells wider, for velocities and inflow values of these shapes."""
 
     def __init__(self, setting, width, shape, inflows, unstable):
-        grid, layout = setting.grid, setting.grid.layout
+        grid, layout = setting.grid, setting.grid.backend
         spans, sides = [], []
         for (a, b), n, pair in zip(layout.box(grid.shape), grid.shape, setting.sides, strict=True):
             low, high = a - width, b + width
@@ -153,7 +153,7 @@ def widened(space, boxes, shape, places=None):
 
     Those that lead there and back.
     """
-    exchange = of_boxes(space.layout, space.parts, boxes)
+    exchange = of_boxes(space.backend, space.parts, boxes)
 
     def wide(x):
         flat = block(x, space).flat

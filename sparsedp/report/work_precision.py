@@ -19,8 +19,8 @@ import numpy as np
 from sparsedp._utils.counters import recording
 from sparsedp._utils.pytree import leaves
 from sparsedp._utils.validation import check_function, check_whole
+from sparsedp.autodiff.backend import process_count
 from sparsedp.autodiff.derivative import value_and_grad
-from sparsedp.autodiff.fast_derivatives import ranks
 from sparsedp.check.summary import Result
 from sparsedp.check.table import table_of
 from sparsedp.errors import SparsedpError
@@ -112,7 +112,7 @@ def work_precision(
     ['0.0313', '0.0078', '0.0020']
     """
     check_function("work_precision", problem, "lambda cells: (loss, x)")
-    if ranks() > 1:
+    if process_count() > 1:
         raise TypeError("work_precision repeats runs by the clock, which no two ranks share; run it on one process")
     repeats = check_whole("repeats of work_precision", repeats, 1, "; the default is 3")
     if not methods or not isinstance(methods, dict):

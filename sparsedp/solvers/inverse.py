@@ -13,7 +13,7 @@ from sparsedp._utils.calls import public
 from sparsedp._utils.counters import active, count, spent
 from sparsedp._utils.html import facts
 from sparsedp._utils.validation import check_finite, check_native, check_on, field_array
-from sparsedp.autodiff.fast_derivatives import together
+from sparsedp.autodiff.backend import collectively
 from sparsedp.autodiff.tape import apply_operator, isbox, plain
 from sparsedp.errors import NonFiniteError, ShapeError
 from sparsedp.grid.space import fits
@@ -130,7 +130,7 @@ def inverse(
     if not fits(op.domain, op.codomain):
         raise ShapeError(f"inverse takes a square operator, got one from {op.domain} to {op.codomain}; write op.T @ op")
     settings = check_settings(method, rtol, maxiter, nullspace, options)
-    return together("inverse", (op,), lambda: build(op, **settings))
+    return collectively("inverse", (op,), lambda: build(op, **settings))
 
 
 # ---- set-up ----
@@ -169,18 +169,8 @@ def build(
         rows, or leaves them out on purpose.
     """
     start_time = perf_counter()
-    if op.layout is not None:
-        system = op.layout.system(op, rtol, maxiter, method, options)
-        choice = Choice("petsc", str(op.layout))
-    else:
-        system = System(op, rtol, maxiter)
-        if method in ("krylov", "separable"):
-            system.splitting = None  # these solve for all unknowns, without looking at the entries
-        if method == "auto":
-            choice = choose_method(system, solves)
-        else:
-            choice = Choice(method, "as asked")
-        check_options(choice.method, options)
+    choose = op.backend.implementation(system_and_choice)
+    system, choice = choose(op, rtol, maxiter, method, options, solves)
     if system.complex and choice.method not in ("direct", "krylov"):
         raise ValueError(f"{choice.method} takes real operators, {op} is complex; write method='direct' or 'krylov'")
     if all_rows:
@@ -191,6 +181,21 @@ def build(
     solver = Solver(system, engine, nullspace, log or SolveLog(), name, made, choice.reason)
     _record_set_up(solver, start_time)
     return Inverse(Solution(solver))
+
+
+def system_and_choice(
+    op: Operator, rtol: float, maxiter: int | None, method: str, options: dict, solves: str
+) -> tuple[System, Choice]:
+    """Return the System of an operator, and the method that solves it: see `build`."""
+    system = System(op, rtol, maxiter)
+    if method in ("krylov", "separable"):
+        system.splitting = None  # these solve for all unknowns, without looking at the entries
+    if method == "auto":
+        choice = choose_method(system, solves)
+    else:
+        choice = Choice(method, "as asked")
+    check_options(choice.method, options)
+    return system, choice
 
 
 def build_dense(op: Operator, rtol: float, nullspace: str, name: str) -> Solver | None:
@@ -374,18 +379,17 @@ class Inverse(Operator):
             return apply_operator(self, b)
         return self.apply(b)
 
-    def apply(self, u: Any, out: np.ndarray | None = None) -> np.ndarray:
-        """Solve for plain data, without the tape; see `Operator.apply`."""
+    def apply_array(self, u: Any, out: np.ndarray | None = None) -> np.ndarray:
+        """Solve for a plain array, without the tape: see `Operator.apply`."""
         if (
             type(u) is np.ndarray
             and u.shape == self.domain.shape
             and u.dtype == self.structure.dtype
             and u.flags.c_contiguous
             and out is None
-            and self.layout is None
         ):  # one field as the solver takes it: its solution is returned without a copy
             return self.structure.product(u.reshape(-1)).reshape(self.codomain.shape)
-        return super().apply(u, out)
+        return super().apply_array(u, out)
 
     def _solve_from(self, b: Any, start: Any) -> Any:
         """Solve from a first guess, or by iterations that are differentiated."""

@@ -147,7 +147,7 @@ class Jacobians:
     def relaxed(self, equation, x, leaves, pace, near):
         """The Solver of J + D / pace, D the rates of its rows; None where its entries are not known."""
         op, _ = self._operator(equation, x, leaves)
-        if op.form != "explicit" or op.layout is not None:
+        if op.form != "explicit" or not op.backend.whole_fields:
             return None
         matrix = op.matrix + sp.diags_array(_rates(op.matrix, equation.layout) / pace)
         return self._solver(from_matrix(matrix, op.domain, op.domain, op.name), near)
@@ -156,7 +156,7 @@ class Jacobians:
         """The Solver of a Jacobian: found again by its entries, or set up."""
         settings, solver = self.settings, None
         key: Any = None
-        if op.form == "explicit" and op.layout is None and not near:
+        if op.form == "explicit" and op.backend.whole_fields and not near:
             entries = op.matrix.indptr, op.matrix.indices, op.matrix.data
             key = (op,) if op is self._operators.last else entries
             solver = self._matrices.find(key)
@@ -201,7 +201,7 @@ class Jacobians:
             )
         equation, x, leaves = known.point
         with self._alone:
-            if equation.layout.ranks:
+            if not equation.layout.backend.whole_fields:
                 self._stencil(equation, [x], leaves, known.solver.system.unscaled.structure.stencil)
             else:
                 self._enlarge(equation, x, leaves, row)
@@ -222,7 +222,7 @@ class Jacobians:
             forward, backward = (self._product(equation, x, leaves, turned) for turned in (False, True))
             return from_functions(forward, backward, size, size, name), True
         product = self._product(equation, x, leaves, coloured.by_rows)
-        if equation.layout.ranks:
+        if not equation.layout.backend.whole_fields:
             return coloured.operator(product, name), False
         matrix = coloured.matrix(product)
         if space is not None and equation.layout.shapes[0] != space.shape:
@@ -240,10 +240,7 @@ class Jacobians:
         if not isinstance(given, Operator):
             given = from_matrix(given if sp.issparse(given) or np.ndim(given) else [[given]], name=name)
         check_shape(f"the jacobian of {self.name}", given, (layout.size,) * 2)
-        sides = [(space.layout, space.parts) for space in (given.domain, given.codomain)]
-        if (given.layout or layout.ranks) and sides != 2 * [(layout.ranks, layout.space.parts)]:  # it lies elsewhere
-            space = layout.space if layout.ranks else None
-            given = from_matrix(given.matrix, space, space, given.name)
+        given = layout.backend.implementation(jacobian_on_unknowns)(given, layout.space)
         check_kind(f"the jacobian of {self.name}", given.dtype, "real numbers")
         return given
 
@@ -264,7 +261,7 @@ class Jacobians:
     def _coloured(self, equation, x, leaves):
         """The coloured pattern for this many unknowns (None: only products will do), and the cells that they lie on."""
         size, pattern = equation.size, self.sparsity
-        if equation.layout.ranks:
+        if not equation.layout.backend.whole_fields:
             return self._stencil(equation, _points(equation, x, leaves), leaves)
         if not self.ways:
             has_jvp = _can(pushforward, lambda y: equation(y, *leaves), x, np.ones_like(x))
@@ -298,12 +295,12 @@ class Jacobians:
 
     def _stencil(self, equation, points, leaves, lacking=None):
         """What the ranks know of the pattern, from some points; of one that is `lacking` entries, with those."""
-        space, ranks = equation.layout.space, equation.layout.ranks
-        self.way = f"the rows of each rank, {ranks}"
+        space, backend = equation.layout.space, equation.layout.backend
+        self.way = f"the rows of each rank, {backend}"
         if self.sparsity is not None:
             raise TypeError(f"{self.name} takes no sparsity for fields on ranks; leave it out")
         products = self._products(equation, points, leaves, False)
-        known = self._patterns[space] = ranks.stencil(self.name, space, products, lacking), None
+        known = self._patterns[space] = backend.stencil(self.name, space, products, lacking), None
         return known
 
     def _guessed(self, equation, points, leaves):
@@ -369,6 +366,13 @@ def _can(derive, *args):
     return True
 
 
+def jacobian_on_unknowns(op, space):
+    """Return a Jacobian that was given as an Operator, between flat unknowns."""
+    if op.backend.whole_fields:
+        return op
+    return from_matrix(op.matrix, name=op.name)
+
+
 def _rates(matrix, layout):
     """The rate at which each unknown relaxes, with the sign of its equation; 0 where it is no equation of rates.
 
@@ -416,7 +420,7 @@ def fields_met(equation, x, leaves):
     spaces = [met[shape] for shape in shapes if shape in met]
     if len(spaces) == len(shapes) and len({space.grid for space in spaces}) == 1:
         one = len(spaces) == 1 and spaces[0].kind == "cells" and len(shapes[0]) > 1
-        return spaces[0] if one and spaces[0].layout is None else None, [
+        return spaces[0] if one and spaces[0].backend.whole_fields else None, [
             part for space in spaces for part in space.parts
         ]
     return None, shapes if len(set(map(len, shapes))) == 1 else [(equation.size,)]

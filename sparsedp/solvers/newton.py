@@ -28,7 +28,6 @@ steps on it is Newton's method again.
 Source: Kelley and Keyes, SIAM J. Numer. Anal. 35 (1998); Coffey, Kelley and Keyes, SIAM J. Sci. Comput. 25 (2003).
 """
 
-from itertools import pairwise
 from typing import Any
 
 import autograd.numpy as anp
@@ -37,8 +36,8 @@ import numpy as np
 from sparsedp._utils.counters import note
 from sparsedp._utils.pytree import flatten, keys, leaves, paired, placed
 from sparsedp._utils.validation import check_finite, check_leaves, check_plain, check_precision, number_beside
+from sparsedp.autodiff.backend import as_field, backend_of, replicated
 from sparsedp.autodiff.derivative import pullback, push
-from sparsedp.autodiff.fast_derivatives import array, elsewhere, on_every_rank
 from sparsedp.autodiff.tape import cast, dtype_of, is_variable, isbox, plain
 from sparsedp.autodiff.tape_constants import constant
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
@@ -80,8 +79,10 @@ class Layout:
 
     Attributes
     ----------
-    ranks : layout or None
-        Of a grid whose ranks hold the unknowns in blocks.
+    backend : Backend
+        Where the unknowns are stored.
+    space : Space
+        One component for each array of the tree.
     """
 
     def __init__(self, guess, name):
@@ -96,51 +97,49 @@ class Layout:
         kinds = [dtype_of(leaf) for leaf in found]
         self.dtypes = [kind if kind.kind == "f" else np.dtype(float) for kind in kinds]
         self.scalar = isinstance(guess, (int, float)) and not isinstance(guess, np.generic)
-        field = elsewhere(found)
-        self.space = Space(None, "unknowns", None, self.shapes) if field is None else field.layout.joined(name, found)
-        self.ranks, self.size = self.space.layout, self.space.size
+        self.backend = backend_of(found)
+        self.space = self.backend.implementation(space_of_unknowns)(name, found)
+        self.size = self.space.size
 
     def flat(self, guess):
         """The numbers of the guess, without a trace, as one fresh float64 array."""
         found = [plain(leaf) for leaf in leaves(guess)]
-        if self.ranks:
-            return self.ranks.join(self.space, found).astype(float)
-        return np.concatenate([np.zeros(0), *(np.asarray(leaf, float).reshape(-1) for leaf in found)])
+        return self.backend.join(self.space, found).astype(float)
 
     def split(self, x):
         """Flat unknowns, traced or not -> the tree of unknowns."""
-        if len(self.shapes) == 1 and not self.ranks:
-            return self.rebuild([anp.reshape(x, self.shapes[0])])
         return self.rebuild(self._fields(x))
 
     def _fields(self, x):
-        return self.ranks.split(self.space, x) if self.ranks else self.space.split(x)
+        return self.backend.split(self.space, x)
 
     def norms(self, x):
         """The norm of each field of plain flat unknowns."""
-        fields = self._fields(x) if self.ranks else (x[a:b] for a, b in pairwise(self.space.offsets))
-        return np.array([length(field) for field in fields])
+        return np.array([length(self.backend.flat(field)) for field in self._fields(x)])
 
     def spread(self, numbers):
         """A number for each field -> the same for all of its unknowns."""
-        if self.ranks:
-            return self.ranks.join(self.space, numbers)
-        return np.repeat(numbers, np.diff(self.space.offsets))
+        return self.backend.join(self.space, numbers)
 
     def laid(self, x):
         """A flat array that every rank has -> as the unknowns lie."""
-        return self.ranks.field(self.space, x) if self.ranks else x
+        return self.backend.field(self.space, x)
 
     def tried(self, act, *args):
         """act(*args), where the caller goes on in another way if it fails: then all ranks do."""
-        return self.ranks.tried(act, *args) if self.ranks else act(*args)
+        return self.backend.attempt(act, *args)
 
     def rounded(self, x):
         """The tree of unknowns in the dtypes of the guess; copies, for the rules go on using x."""
         if self.scalar and not isbox(x):
             return float(x[0])
-        take = cast if isbox(x) or self.ranks else np.array
+        take = np.array if type(x) is np.ndarray else cast
         return self.rebuild(map(take, self._fields(x), self.dtypes))
+
+
+def space_of_unknowns(name, fields):
+    """Return the space of some arrays one after the other."""
+    return Space(None, "unknowns", None, [np.shape(field) for field in fields])
 
 
 def _check_unknown(leaf, name):
@@ -198,7 +197,7 @@ class Equation:
         for number, param in enumerate(self.params(values)):
             for leaf in leaves(param):
                 if is_variable(leaf):
-                    check_finite(f"parameter {number + 1} of {self.name}", array(leaf))
+                    check_finite(f"parameter {number + 1} of {self.name}", as_field(leaf))
 
     def params(self, values):
         """Floating leaves -> the tuple of parameters."""
@@ -238,9 +237,9 @@ class Equation:
             raise ShapeError(f"the residual of {self.name} must hold {self.size} numbers, as many as x, got {size}")
         if any(dtype_of(part).kind not in KINDS for part in parts):
             raise TypeError(f"the residual of {self.name} must be real; give real and imaginary part as two fields")
-        if self.layout.ranks:
-            return cast(self.layout.ranks.join(self.layout.space, parts), np.float64)
-        lines = [anp.reshape(on_every_rank(part), (-1,)) for part in parts]
+        if not self.layout.backend.whole_fields:
+            return cast(self.layout.backend.join(self.layout.space, parts), np.float64)
+        lines = [anp.reshape(replicated(part), (-1,)) for part in parts]
         flat = lines[0] if len(lines) == 1 else anp.concatenate(lines) if lines else np.zeros(0)
         return cast(flat, np.float64)
 
@@ -290,7 +289,7 @@ class Newton:
         self.stalls = 0  # Newton steps on end that left nearly all of the residual
         self.near: Any = None  # the engine of the last Jacobian, where its LU is worth another try
         # Whether pseudo-time may be tried: once, and where one process knows all rows of the Jacobian.
-        self.evolves = not (steps or equation.layout.ranks)
+        self.evolves = equation.layout.backend.whole_fields and not steps
 
     def solve(self, guess, known=None):
         """From a guess to a root, the first steps with the Jacobian `known` where there is one.

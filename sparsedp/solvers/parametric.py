@@ -18,8 +18,9 @@ import scipy.sparse as sp
 from sparsedp._utils.calls import public
 from sparsedp._utils.reconstruction import Remade
 from sparsedp._utils.validation import check_finite, check_kind, check_plain, check_shape, check_type
+from sparsedp.autodiff.backend import as_field, gathered
 from sparsedp.autodiff.derivative import of_argument
-from sparsedp.autodiff.fast_derivatives import array, in_dtype, whole
+from sparsedp.autodiff.fast_derivatives import in_dtype
 from sparsedp.autodiff.tape import cast, dtype_of, isbox, plain
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.grid.space import Space, fits
@@ -81,7 +82,7 @@ class ParametricSolver(Remade):
 
     def _inverse(self, k, shift):
         """The set-up for this content, from the last two or new."""
-        k, shift = (in_dtype(whole(values), np.result_type(values, float)) for values in (k, shift))
+        k, shift = (in_dtype(gathered(values), np.result_type(values, float)) for values in (k, shift))
         known = self._cache.find((k, shift))
         if known is not None:
             return known
@@ -161,7 +162,7 @@ def elliptic_solver(D, G, method="auto", rtol=1e-10, maxiter=None, nullspace="ra
     >>> grid = Grid(2)
     >>> solve = elliptic_solver(divergence(grid), gradient(grid, dirichlet))
     >>> solve(1.0, np.array([2.0, 2.0]))
-    array([1., 1.])
+    as_field([1., 1.])
     >>> value_and_grad(lambda k: solve(k, np.array([2.0, 2.0]))[0])(1.0)
     (1.0, -1.0)
     """
@@ -200,7 +201,7 @@ class EllipticSolver(ParametricSolver):
         array of the shape and dtype of b; complex where k or shift is
         """
         check_plain("elliptic_solver", k, b, shift)
-        b, shift = b if isbox(b) else array(b), _values("shift", shift, self.D.codomain)
+        b, shift = b if isbox(b) else as_field(b), _values("shift", shift, self.D.codomain)
         k, solver = self._settled(k)
         return solver._solution(k, b, shift)
 
@@ -245,11 +246,10 @@ class EllipticSolver(ParametricSolver):
 
     def _settled(self, k):
         """(k for each face, or tensors at the corners; the solver for them)."""
-        k = k if isbox(k) else array(k)
+        k = k if isbox(k) else as_field(k)
         if np.ndim(k) <= 2:
             return self._coefficient(k), self
-        if self.D.layout is not None:
-            self.D.layout.check("a tensor")
+        self.D.backend.check("a tensor")
         solver = self._tensors
         check_tensor("k", k, self.D.codomain.grid)
         return solver.at_corners(cast(k, np.result_type(dtype_of(k), float))), solver
@@ -260,7 +260,7 @@ class EllipticSolver(ParametricSolver):
 
     def _coefficient(self, k):
         k = _values("k", k, self.D.domain, "harmonic_average(grid)(k)", self.D.codomain)
-        values = array(plain(k))
+        values = as_field(plain(k))
         if values.dtype.kind != "c" and np.any(values < 0):
             raise ValueError(f"k must be >= 0, got {np.min(values):g} at {np.argmin(values)}")
         return k * np.ones(self.D.domain.shape) if values.ndim == 0 else k
@@ -312,7 +312,7 @@ def _values(name, given, space, advice="", other=None):
 
     `advice`: what to write where it is a field on the space `other`.
     """
-    values = array(plain(given))
+    values = as_field(plain(given))
     if values.shape not in ((), space.shape):
         advice = f"; write {advice}" if other is not None and values.shape == other.shape else ""
         raise ShapeError(
@@ -397,9 +397,9 @@ def matrix_solver(pattern, method="auto", rtol=1e-10, maxiter=None, nullspace="r
     >>> solve = matrix_solver([[1, 0], [1, 1]])
     >>> data, b = np.array([2.0, 1.0, 4.0]), np.array([2.0, 5.0])
     >>> solve(data, b)
-    array([1., 1.])
+    as_field([1., 1.])
     >>> value_and_grad(lambda data: solve(data, b)[1])(data)
-    (1.0, array([ 0.125, -0.25 , -0.25 ]))
+    (1.0, as_field([ 0.125, -0.25 , -0.25 ]))
     """
     settings = check_settings(method, rtol, maxiter, nullspace, options)
     entries = pattern if sp.issparse(pattern) else np.asarray(pattern)
@@ -441,7 +441,7 @@ def from_coo(rows, columns, domain=None, **settings):
     >>> import sparsedp as dp
     >>> solve = dp.matrix_solver.from_coo([0, 1, 0], [0, 1, 0])  # two values on the first place
     >>> solve(np.array([1.5, 4.0, 0.5]), np.array([2.0, 8.0]))
-    array([1., 2.])
+    as_field([1., 2.])
     """
     places = np.asarray(rows), np.asarray(columns)
     if places[0].ndim != 1 or places[0].shape != places[1].shape:

@@ -17,8 +17,8 @@ from sparsedp._utils.counters import note, thread
 from sparsedp._utils.pytree import mapped, power_of_two
 from sparsedp._utils.reconstruction import Remade
 from sparsedp._utils.validation import check_function, check_takes, check_whole
+from sparsedp.autodiff.backend import collectively, replicated
 from sparsedp.autodiff.derivative import pullback, push
-from sparsedp.autodiff.fast_derivatives import on_every_rank, together
 from sparsedp.autodiff.tape import Rule, plain
 from sparsedp.errors import DerivativeError
 from sparsedp.solvers.adjoint import solve_rule, vary
@@ -221,10 +221,10 @@ class Root(Remade):
         """
         check_takes(self.name, self.residual, 1 + len(params), "lambda x, p: ..., and root(guess, p)")
         layout = Layout(guess, self.name)
-        params = params if layout.ranks else mapped(on_every_rank, params)
+        params = mapped(replicated, params) if layout.backend.whole_fields else params
         equation = Equation(self.residual, layout, params, self.name)
         given = layout.flat(guess), *equation.variables(params)
-        return layout.rounded(together(self.name, (guess, *params), self._solution, equation, *given))
+        return layout.rounded(collectively(self.name, (guess, *params), self._solution, equation, *given))
 
     # ------------------------------------------------------------ the root as a rule of the parameters
 

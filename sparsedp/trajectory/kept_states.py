@@ -11,8 +11,8 @@ import numpy as np
 
 from sparsedp._utils.pytree import flatten, leaves, mapped, paired
 from sparsedp._utils.validation import is_whole
+from sparsedp.autodiff.backend import as_field, is_distributed
 from sparsedp.autodiff.derivative import linearised
-from sparsedp.autodiff.fast_derivatives import ELSEWHERE, array
 from sparsedp.autodiff.tape import dtype_of, is_variable, isbox, plain, split_boxes, traces_of
 from sparsedp.autodiff.tape_constants import constant
 from sparsedp.errors import DerivativeError
@@ -101,7 +101,7 @@ class Some(Last):
         """One block for each variable, or a list where its states are traced, or lie elsewhere."""
         n, lines = len(self._rows), zip(self.layout.shapes, self.layout.dtypes, steps.first.values, strict=True)
         self._blocks: list = [
-            [None] * n if steps.outer or type(value) in ELSEWHERE else np.empty((n, *shape), kind)
+            [None] * n if steps.outer or is_distributed(value) else np.empty((n, *shape), kind)
             for shape, kind, value in lines
         ]
         self._statics, self._stored = [], bool(steps.loop.wanted)
@@ -114,7 +114,7 @@ class Some(Last):
         self._statics.append(state.statics)
         values = list(state.values)
         for number, block in enumerate(self._blocks):
-            if type(values[number]) in ELSEWHERE and not isinstance(block, list):  # the first state was known to all
+            if is_distributed(values[number]) and not isinstance(block, list):  # the first state was known to all
                 block = self._blocks[number] = [*block]
             block[row] = owned(values[number]) if isinstance(block, list) else values[number]
             if np.ndim(values[number]) and self.whole:
@@ -126,7 +126,7 @@ class Some(Last):
         blocks, self._blocks, self._places = self._blocks, [], []
         found: list = []
         for block in blocks:
-            apart = isinstance(block, list) and type(plain(block[-1])) in ELSEWHERE
+            apart = isinstance(block, list) and is_distributed(block[-1])
             found += block if apart else [stacked(block) if isinstance(block, list) else block]
             self._places.append(slice(len(found) - len(block), len(found)) if apart else len(found) - 1)
         for block in found:
@@ -216,7 +216,7 @@ class Each(Last):
                 "keep uses a traced value that is not part of the state, and its derivative would be lost; "
                 "return what it needs of the state, and combine the two outside of rollout"
             )
-        apart = type(plain(leaf)) in ELSEWHERE  # a field on ranks is kept by itself
+        apart = is_distributed(leaf)  # a field on ranks is kept by itself
         key = len(self._stacks) if apart else (np.shape(leaf), dtype_of(leaf).char)
         stack = self._stacks.setdefault(key, [])
         stack.append(owned(leaf))
@@ -224,7 +224,7 @@ class Each(Last):
 
     def _compare(self, i, results):
         """Refuse a function that returns something else for a state than it did before."""
-        values = [array(plain(leaf)) for leaf in results if is_variable(leaf)]
+        values = [as_field(plain(leaf)) for leaf in results if is_variable(leaf)]
         marks = [(value.shape, value.dtype, fingerprint([value])) for value in values]
         if i == len(self._marks):
             self._marks.append(marks)

@@ -8,8 +8,8 @@ import numpy as np
 
 from sparsedp._utils.pytree import described, flatten, keys, labels, leaves, paired
 from sparsedp._utils.validation import check_finite, check_leaves, check_native, hidden_leaves
+from sparsedp.autodiff.backend import array_types, as_field, is_distributed
 from sparsedp.autodiff.derivative import is_finite
-from sparsedp.autodiff.fast_derivatives import ELSEWHERE, array
 from sparsedp.autodiff.tape import cast, dtype_of, is_variable, isbox, plain, split_boxes, traces_of
 from sparsedp.autodiff.tape_constants import constant
 from sparsedp.errors import DerivativeError, ShapeError
@@ -79,7 +79,7 @@ class Layout:
         self.floats = [type(leaf) is float for leaf in variables]  # numbers of Python, and handed out as such
         self.shapes = [np.shape(leaf) for leaf in variables]
         self.dtypes = [dtype_of(leaf) for leaf in variables]
-        self.nbytes = sum(array(leaf).nbytes for leaf in variables)
+        self.nbytes = sum(as_field(leaf).nbytes for leaf in variables)
 
     @cached_property
     def labels(self):
@@ -173,7 +173,7 @@ class Layout:
         if not traces_of([value]) <= outer:
             refuse_lost(when)
         refuse_mask(f"{when} made a masked array of {name}", plain(value))
-        if not isinstance(plain(value), (np.ndarray, np.generic, float, complex, *ELSEWHERE)):
+        if not isinstance(plain(value), (np.generic, float, complex, *array_types())):
             raise ShapeError(_changed(name, "one array", described(value), when))
         if np.shape(value) != shape:
             raise ShapeError(_changed(name, f"shape {shape}", f"shape {np.shape(value)}", when))
@@ -204,14 +204,14 @@ def _brief(value):
 
 def dense(value):
     """Array or number -> contiguous array, or a NumPy scalar when it has no axes; traced values as they are."""
-    if isbox(value) or type(value) in ELSEWHERE:
+    if isbox(value) or is_distributed(value):
         return value
     return np.ascontiguousarray(value) if np.ndim(value) else np.asarray(value)[()]
 
 
 def owned(value):
     """Array or number -> a contiguous copy of its own; traced values as they are: nobody writes into those."""
-    if isbox(value) or type(value) in ELSEWHERE:
+    if isbox(value) or is_distributed(value):
         return value
     return dense(np.array(value, order="C"))
 
@@ -247,7 +247,7 @@ def fingerprint(values, statics=()):
 
 
 def _bits(value):
-    return value.fingerprint() if type(value) in ELSEWHERE else hash(folded(value))
+    return value.fingerprint() if is_distributed(value) else hash(folded(value))
 
 
 def folded(value):

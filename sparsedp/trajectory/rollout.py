@@ -8,7 +8,7 @@ from sparsedp._utils.calls import frames_inside
 from sparsedp._utils.counters import thread
 from sparsedp._utils.pytree import leaves
 from sparsedp._utils.validation import check_function, check_takes, check_whole
-from sparsedp.autodiff.fast_derivatives import together
+from sparsedp.autodiff.backend import collectively
 from sparsedp.autodiff.tape import dtype_of, innermost, is_variable, isbox, plain, through
 from sparsedp.autodiff.tape_constants import constant_args
 from sparsedp.errors import BudgetWarning, DerivativeError, ShapeError
@@ -142,7 +142,7 @@ def rollout(
         _warn_of_repeats(memory, *sizes)
     for hook in thread.loop_hooks:
         hook(step, state, params, inputs, n)
-    result = together("rollout", tuple(given.values()), through, loop, loop.wanted, *args)
+    result = collectively("rollout", tuple(given.values()), through, loop, loop.wanted, *args)
     return loop.keep.tree(loop.parts(result))
 
 
