@@ -1,16 +1,17 @@
-"""Side room: pictures, certificates, measurements, and the demo.
+"""Instruments beside the core: pictures, certificates, measurements, and the demo.
 
 explain.py           explain: what one gradient computes, and the work that was skipped
-certificate.py       certify, certified: the error that solves leave, from recorded solves
+certificate.py       certify: the error that solves leave, from recorded solves
 work_precision.py    work_precision: error against run time
 stress_table.py      stress: one word for each extreme case
-stress_cases.py      the table of those cases, and the judges of what comes out
+stress_cases.py      the table of those cases, and the functions that grade what comes out
 stability.py         the growth factor of a time step, and its map
 plots.py             pictures of fields and charts, files of a result; all of matplotlib
-scene_report.py      a scene in a file, and all instruments on it in one folder (the command `report`)
+scene_file.py        a scene in a file that is named on the command line
+scene_report.py      all instruments on it in one folder (the command `report`)
 demo/                the command `demo`
 
-It may import every floor; only __main__ and the shop window open it.
+It may import all packages; only __main__ and the public window import it.
 """
 
 from sparsedp._utils.calls import describe_module

@@ -57,6 +57,6 @@ def test_the_command_knows_every_file_with_loops():
         )
 
     files = sorted(path for path in PACKAGE.rglob("*.py") if defines(path))
-    assert sorted(__main__.LOOPS) == [
+    assert sorted(__main__.COMPILED_MODULES) == [
         ".".join(("sparsedp", *path.relative_to(PACKAGE).with_suffix("").parts)) for path in files
     ]

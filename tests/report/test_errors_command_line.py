@@ -129,7 +129,7 @@ def test_the_report(scene, tmp_path, capsys):
         with path.open(encoding="utf-8", newline="") as stream:
             assert list(csv.DictReader(stream)), path
     whole = (out / "report.html").read_text(encoding="utf-8")
-    places = "<h1>poisson</h1>", "<strong>agrees</strong>", "Is the gradient right?", "V. Of a wrong one", "fastest at"
+    places = "<h1>poisson</h1>", "<strong>agrees</strong>", "Is the gradient right?", "V. For a wrong one", "fastest at"
     assert sorted(places, key=whole.index) == list(places)
     assert whole.count('src="data:image/png;base64,') == len(drawn) and ("<polyline" in whole) == (not drawn)
     assert not re.search(r"https?:|@import|url\(|<link|src=\"(?!data:)", whole)  # one file, no network

@@ -18,7 +18,7 @@ import sparsedp as dp
 from sparsedp.__main__ import main
 from sparsedp.kernels.team import NOTICE
 from sparsedp.report.demo import story, terrain
-from sparsedp.report.scene_report import claim
+from sparsedp.report.scene_file import claim_folder
 
 
 def header(shape, descr="<f8"):
@@ -221,21 +221,21 @@ def test_refused_sizes_and_grounds():
 def test_folder_that_cannot_be(tmp_path):
     (tmp_path / "file").write_text("here first")
     with pytest.raises(ValueError, match=r"file cannot be made a folder: File exists; name another with --out"):
-        claim(tmp_path / "file", [], False)
+        claim_folder(tmp_path / "file", [], False)
     with pytest.raises(ValueError, match=r"file/out cannot be made a folder: Not a directory; name another with --out"):
-        claim(tmp_path / "file" / "out", [], False)
+        claim_folder(tmp_path / "file" / "out", [], False)
 
 
 def test_folder_that_cannot_be_written(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     with pytest.raises(ValueError, match=r".* cannot be written to; name another with --out"):
-        claim(tmp_path, ["table.csv"], False)
+        claim_folder(tmp_path, ["table.csv"], False)
 
 
 def test_a_link_into_nowhere_is_not_followed(tmp_path):
     (tmp_path / "table.csv").symlink_to(tmp_path / "elsewhere.csv")
     with pytest.raises(ValueError, match=r".* is there already; name another folder with --out, or write --force"):
-        claim(tmp_path, ["table.csv"], False)
+        claim_folder(tmp_path, ["table.csv"], False)
 
 
 def test_file_that_cannot_be_opened(tmp_path, monkeypatch):

@@ -17,7 +17,7 @@ from sparsedp.report.certificate import distance
 from sparsedp.report.demo.scene import NOISE, Ground, Survey, objective, regulariser, survey
 from sparsedp.report.demo.terrain import Terrain, hidden_ground, remap
 from sparsedp.report.explain import total
-from sparsedp.report.scene_report import claim
+from sparsedp.report.scene_file import claim_folder
 
 __all__ = ["FILES", "Study", "grids_for", "prepare", "tell"]
 
@@ -145,7 +145,7 @@ def tell(study, folder, force):
     (*_, logk), rows, curves = zip(*(recover(study, grid) for grid in study.grids))
     print("Error against run time. Misfit/noise 1: the readings are met to the noise. Error 1: the flat start.")
     print(table_of(rows, SHOWN), end="\n\n")
-    claim(folder, FILES, force)  # once more: it is a while since the run began
+    claim_folder(folder, FILES, force)  # once more: it is a while since the run began
     write_file(folder / "table.csv", table_of(rows).csv())
     write_file(folder / "recovered.npy", lambda stream: np.save(stream, logk, allow_pickle=False))
     try:

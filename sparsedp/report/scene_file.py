@@ -1,0 +1,200 @@
+"""A scene in a file that is named on the command line, and the folder that its results are written to.
+
+The code of a user may end or disturb the process that runs it. What is changed in the process while that code runs
+(standard output, ``sys.argv``, ``sys.path``, ``os._exit``) is restored at the end of each block, also after an error.
+The functions here are called by ``python -m sparsedp`` alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+import os
+import re
+import runpy
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn
+
+from sparsedp._utils.calls import warn_deprecated
+
+__all__ = ["SceneFile", "claim_folder", "free_folder", "guarded", "load_scene"]
+
+POINT_NAMES = ("start", "x")  # the first that the file defines is the point
+OPTIONS = ("work_precision", "stress")  # instruments whose arguments the file may hold, as dicts NAME_options
+
+
+class SceneFile(NamedTuple):
+    """A loss and a point from a file, and arguments for the instruments.
+
+    Attributes
+    ----------
+    name : str
+    loss : callable
+        ``loss(x)``.
+    x : tree of arrays
+    options : dict
+        Name of an instrument: dict of its arguments.
+    """
+
+    name: str
+    loss: Callable[[Any], Any]
+    x: Any
+    options: dict[str, dict[str, Any]]
+
+
+def load_scene(target: str) -> SceneFile:
+    """Run a file once, as a module, and return the scene that it defines; what it prints goes to stderr.
+
+    Parameters
+    ----------
+    target : str
+        ``FILE.py[:loss[:start]]``. Without a name the loss is called `loss`, and the point `start` or `x`; a point
+        that is a tuple fills a loss of several arguments. The file may define two dicts of arguments:
+        `work_precision_options` (problem, methods, ...) and `stress_options` (ranges, step, ...).
+
+    Raises
+    ------
+    ValueError
+        If there is no such file, it does not run, or a name is missing.
+    """
+    parts = re.fullmatch(r"(.+\.py)(?::([^:]+))?(?::([^:]+))?", target)
+    if parts is None:
+        raise ValueError(f"{target!r} names no scene; write FILE.py:loss, or FILE.py:loss:start")
+    file = Path(parts[1])
+    loss_name = parts[2] or "loss"
+    point_names = [parts[3]] if parts[3] else POINT_NAMES
+    names = _run(file)
+    if not callable(names.get(loss_name)):
+        raise ValueError(f"{file} has no function {loss_name!r}; write {file}:NAME of the function to examine")
+    point_name = next((name for name in point_names if name in names), None)
+    if point_name is None:
+        expected = " or ".join(point_names)
+        raise ValueError(f"{file} has no {expected!r}, the point; write {file}:{loss_name}:NAME")
+    if "workprec_options" in names:
+        names.setdefault("work_precision_options", names["workprec_options"])
+        warn_deprecated("workprec_options", "work_precision_options", "0.5")
+    options = {}
+    for instrument in OPTIONS:
+        arguments = names.get(f"{instrument}_options", {})
+        if not isinstance(arguments, dict):
+            kind = type(arguments).__name__
+            raise ValueError(f"{instrument}_options in {file} must be a dict of arguments, got {kind}")
+        options[instrument] = arguments
+    name = file.stem if loss_name == "loss" else f"{file.stem}-{loss_name}"
+    point = names[point_name]
+    return SceneFile(name, _with_one_argument(names[loss_name], point), point, options)
+
+
+def _with_one_argument(loss: Callable[..., Any], point: Any) -> Callable[[Any], Any]:
+    """Return a loss as a function of one point: a tuple fills a loss of several arguments."""
+    if not isinstance(point, tuple):
+        return loss
+    try:
+        inspect.signature(loss).bind(None)
+    except TypeError:
+        return lambda arguments: loss(*arguments)
+    return loss
+
+
+def _run(file: Path) -> dict[str, Any]:
+    """Run a file as the command ``python FILE`` would, and return its names."""
+    if not os.path.isfile(file):  # Path.is_file raises for a name that is too long
+        raise ValueError(f"there is no file {file}; name one that is there")
+    arguments = sys.argv
+    path = sys.path
+    sys.argv = [str(file)]
+    sys.path = [str(file.resolve().parent), *path]
+    try:
+        with guarded(file=str(file)):
+            return runpy.run_path(str(file), run_name=file.stem)
+    finally:
+        sys.argv = arguments
+        sys.path = path
+
+
+# ---------------------------------------------------------------- code of the user
+
+
+@contextlib.contextmanager
+def guarded(name: str = "", file: str = "") -> Iterator[None]:
+    """Run code of the user: it prints to stderr, and what it raises becomes a ValueError, also an exit.
+
+    Parameters
+    ----------
+    name : str
+        Of its loss, for the message.
+    file : str
+        The file, if it is the file itself that runs.
+    """
+    try:
+        with contextlib.redirect_stdout(sys.stderr), _exit_as_an_error():
+            yield
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        reason = f"{_line_of(error, file)}{type(error).__name__}: {error}"
+        if not isinstance(error, Exception):
+            reason += "; it ended the program, let it return its value"
+        if file:
+            raise ValueError(f"{file} does not run: {reason}") from error
+        raise ValueError(f"{name} cannot be audited: {reason}") from error
+
+
+@contextlib.contextmanager
+def _exit_as_an_error() -> Iterator[None]:
+    """Let ``os._exit`` raise SystemExit within the block, so that the user's code cannot choose the exit code.
+
+    The function is replaced in the whole process until the block ends; nothing less sees an exit that runs no
+    handlers. Child processes, which end this way, are not affected.
+    """
+    original = os._exit
+    process = os.getpid()
+
+    def raise_exit(status: int) -> NoReturn:
+        if os.getpid() != process:
+            original(status)
+        raise SystemExit(f"os._exit({status})")
+
+    os._exit = raise_exit
+    try:
+        yield
+    finally:
+        os._exit = original
+
+
+def _line_of(error: BaseException, file: str) -> str:
+    """Return in words the last line of a file that took part in an error; empty if none did."""
+    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
+    if isinstance(error, SyntaxError) and error.filename == file:
+        lines.append(error.lineno)
+    return f"line {lines[-1]}: " if lines else ""
+
+
+# ---------------------------------------------------------------- folders
+
+
+def free_folder(folder: Path, names: Sequence[str], force: bool) -> Path:
+    """Return a folder, or if it holds one of these files and `force` is not set the first of folder-2, folder-3, ..."""
+    free = folder
+    number = 1
+    while not force and any(os.path.lexists(free / name) for name in names):
+        number += 1
+        free = folder.with_name(f"{folder.name}-{number}")
+    return free
+
+
+def claim_folder(folder: Path, names: Sequence[str], force: bool) -> None:
+    """Create a folder, and refuse if it holds one of these files and `force` is not set."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"{folder} cannot be made a folder: {error.strerror}; name another with --out") from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise ValueError(f"{folder} cannot be written to; name another with --out")
+    for name in names:
+        path = folder / name
+        if os.path.lexists(path) and not force:
+            raise ValueError(f"{path} is there already; name another folder with --out, or write --force")
