@@ -125,7 +125,7 @@ class ADMM:
                 "admm with a function as inner does not use bounds; leave them out, or keep to them in inner"
             )
         run = _Run(self, loss, start, bounds, minimize_smooth)
-        message = f"stopped after {maxiter} rounds, as maxiter asks"
+        message = f"stopped after {maxiter} rounds, the limit maxiter"
         converged = False
         run.record(run.x, run.z, np.inf)
         try:
@@ -234,7 +234,7 @@ class _Run:
         self._w = self._w / factor
 
     def _minimized_by_lbfgs(self, target, rho):
-        """Return the x of a round, from that of the previous one, and the evaluations of the loss."""
+        """Return the x of a round, starting from the previous one, and the evaluations of the loss."""
         root = np.sqrt(rho)
 
         def augmented_loss(x):

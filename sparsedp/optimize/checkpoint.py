@@ -61,7 +61,7 @@ class Checkpoint:
         Parameters
         ----------
         template : state
-            At the start. Its structure is that of every state; its loss is compared with that of the folder.
+            At the start. Its structure is that of every state; its loss is compared with the stored one.
         objective : Objective
         monitor : Monitor
 
@@ -103,7 +103,7 @@ class Checkpoint:
         return state
 
     def _check_start(self, start, record, objective, exact):
-        """Refuse another loss than that of the first record."""
+        """Refuse a loss that differs from the first record."""
         value = objective.in_units_of_loss(start.value)
         gradient_norm = objective.in_units_of_loss(norm(objective.projected_gradient(start)))
         same = _agree(value, record.value, record.value, exact)
@@ -121,8 +121,8 @@ class Checkpoint:
         """Refuse a folder of a run in which something differs."""
         if not same:
             raise ValueError(
-                f"{self._folder} holds a run with another {name} than the one given; give what it was begun with, or "
-                "write another checkpoint folder"
+                f"{self._folder} holds a run with another {name}; call minimize as that run began, or write another "
+                "checkpoint folder"
             )
 
     def _load(self):

@@ -214,8 +214,8 @@ class Linearization:
             return NOT_FORMED.format(reason) + "; dense=True forms it"
         if rows <= columns and not absolute_sigma:
             return (
-                f"{rows} residuals of {columns} unknowns leave none to estimate their variance from; write "
-                "absolute_sigma=True where the residuals have variance 1"
+                f"{rows} residuals of {columns} unknowns do not determine their variance; write absolute_sigma=True "
+                "where the residuals have variance 1"
             )
         jacobian = self.jacobian()
         largest_entries = np.max(np.abs(jacobian), axis=0, initial=0.0)

@@ -209,32 +209,17 @@ def minimize(
         other_arguments = {**options, **other_arguments}
         return implementation(loss, start, method, maxiter, tolerance, callback, bounds, other_arguments)
     if isinstance(chosen, ADMM):
-        for name, value in {**other_arguments, "tolerance": callable(tolerance)}.items():
-            if value:
-                raise TypeError(f"admm does not use {name}; leave it out")
+        _check_unused("admm", {**other_arguments, "tolerance": callable(tolerance)})
         return chosen.minimize(loss, start, maxiter, tolerance, callback, bounds, minimize)
-
-    if hasattr(tolerance, "inside"):  # `certified` takes part in the evaluations
-        if checkpoint is not None:
-            raise ValueError(
-                "certified keeps answers that a checkpoint does not hold; leave checkpoint out, or give tolerance a "
-                "number"
-            )
-        loss, gradient = tolerance.inside(loss, gradient)
+    if hasattr(tolerance, "inside"):
+        loss, gradient = _certified(loss, gradient, tolerance, checkpoint)
+    batches_by_iteration = _batches(batches, method, chosen)
     packing = Packing(start, "start")
-    batches_by_iteration = Batches(batches)
-    if batches_by_iteration.varied and chosen.compares_losses:
-        raise ValueError(f"{method} compares losses and cannot use batches; write method='adam', or give gd a rate")
-    loss = chosen.composed(loss)
     box = Box(bounds, packing)
+    loss = chosen.composed(loss)
     projection = None
     if project is not None:
-        if box.bounded:
-            raise ValueError(
-                "project and bounds cannot be used together: a projected point may be outside of the bounds; leave one "
-                "of them out"
-            )
-        projection = Projection(project, packing, start)
+        projection = _projection(project, box, packing, start)
         loss = projection.loss(loss)
         if gradient is not None:
             gradient = projection.gradient(gradient)
@@ -296,6 +281,41 @@ def _method(name, options):
     method_class: Any = METHODS[name]
     _check_names(name, options, [field.name for field in fields(method_class)])
     return method_class(**options)
+
+
+def _certified(loss, gradient, tolerance, checkpoint):
+    """Return the loss and the gradient with the solves that a tolerance of `certified` chooses."""
+    if checkpoint is not None:
+        raise ValueError(
+            "checkpoint cannot be used with a tolerance of dp.certified, whose solutions are not saved; leave "
+            "checkpoint out, or write a number as tolerance"
+        )
+    return tolerance.inside(loss, gradient)
+
+
+def _batches(batches, name, method):
+    """Return the batches by iteration; refuse them for a method that compares losses."""
+    by_iteration = Batches(batches)
+    if by_iteration.varied and method.compares_losses:
+        raise ValueError(f"{name} compares losses and cannot use batches; write method='adam', or give gd a rate")
+    return by_iteration
+
+
+def _projection(project, box, packing, start):
+    """Return the projection of the unknowns; refuse it together with bounds."""
+    if box.bounded:
+        raise ValueError(
+            "project and bounds cannot be used together: a projected point may be outside of the bounds; leave one "
+            "of them out"
+        )
+    return Projection(project, packing, start)
+
+
+def _check_unused(method, arguments):
+    """Refuse arguments that a method does not use."""
+    for name, value in arguments.items():
+        if value:
+            raise TypeError(f"{method} does not use {name}; leave it out")
 
 
 def _check_names(method, options, names):

@@ -208,7 +208,7 @@ class Monitor:
             value=self._objective.in_units_of_loss(self._objective.best.value),
             history=tuple(self.history),
             method=method,
-            message=self.message or f"stopped after {self.iteration} iterations, as maxiter asks",
+            message=self.message or f"stopped after {self.iteration} iterations, the limit maxiter",
             converged=self.converged,
             evaluations=self._objective.count,
             resumed=resumed,

@@ -162,7 +162,7 @@ class Objective:
         else:
             value, gradient = self._sum_of_squares(vector, below)
         if not np.isfinite(value):
-            raise NonFiniteError(f"the loss is {value}; it must be finite at the start, and elsewhere it is avoided")
+            raise NonFiniteError(f"the loss is {value}; start where it is finite")
         rounded = self._packing.pack(self._packing.unpack(vector))  # single-precision leaves round
         rounding = max(self._packing.eps * abs(value), SMALLEST)
         return Evaluation(rounded, value, gradient, rounding, self.iteration)
@@ -231,7 +231,7 @@ class Objective:
         The gradient is recorded once; each product is one backward pass.
         """
         if self._gradient is not None:
-            raise TypeError("newton_cg differentiates the loss twice and takes no gradient of yours; leave it out")
+            raise TypeError("newton_cg differentiates the loss twice and does not use gradient; leave it out")
         packing = self._packing
         if packing.complex:
             raise DerivativeError("newton_cg takes real numbers, got complex ones; split them into two real arrays")

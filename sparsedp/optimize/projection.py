@@ -44,8 +44,8 @@ class Projection:
 
     Notes
     -----
-    The loss of P(x) is smooth where the loss is, and its gradient is P^T times that of the loss. Where that is 0, the
-    point P(x) is stationary among all points of the range of P. This does not hold for other maps, such as np.clip.
+    The loss of P(x) is smooth where the loss is, and its gradient is P^T times the gradient of the loss. Where it is 0,
+    the point P(x) is stationary among all points of the range of P. This does not hold for other maps, such as np.clip.
     """
 
     def __init__(self, function: Callable[[Any], Any], packing: Packing, start: Any):

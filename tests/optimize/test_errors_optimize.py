@@ -91,7 +91,7 @@ WRONG = [
     ),
     (
         run(method="newton_cg", gradient=lambda x: x), TypeError,
-        "newton_cg differentiates the loss twice and takes no gradient of yours; leave it out",
+        "newton_cg differentiates the loss twice and does not use gradient; leave it out",
     ),
     (
         run(lambda z: anp.sum(anp.abs(z - 1j) ** 2), (0.5j,), "newton_cg"), DerivativeError,

@@ -131,7 +131,7 @@ def test_start_at_the_minimum_and_no_iterations():
     assert best.converged and best.message == "converged: the gradient is 0" and best.evaluations == 1
     best = dp.minimize(bowl, np.ones(3), maxiter=0)
     assert best.value == 12 and len(best.history) == 1 and not best.converged
-    assert best.message == "stopped after 0 iterations, as maxiter asks"
+    assert best.message == "stopped after 0 iterations, the limit maxiter"
 
 
 def test_a_large_offset_ends_in_rounding():

@@ -185,7 +185,7 @@ def test_admm_stops_when_asked():
     loss = lambda x: anp.sum((x - 1) ** 2)
     seen = []
     best = dp.minimize(loss, np.zeros(3), "admm", maxiter=3, tolerance=0.0, weight=0.1)
-    assert len(best.history) == 4 and best.message == "stopped after 3 rounds, as maxiter asks"
+    assert len(best.history) == 4 and best.message == "stopped after 3 rounds, the limit maxiter"
     call = lambda record, x: seen.append(record) or len(seen) == 2
     best = dp.minimize(loss, np.zeros(3), "admm", tolerance=0.0, callback=call, weight=0.1)
     assert len(best.history) == 3 and best.message == "stopped by the callback"

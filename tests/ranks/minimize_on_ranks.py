@@ -59,7 +59,7 @@ def ends():
     best = dp.minimize(loss, start, callback=lambda record, x: seen.append(x["w"][0]) or record.iteration == 2)
     assert best.message == "stopped by the callback" and len(best.history) == 3 and len(seen) == 2
     best = dp.minimize(loss, start, maxiter=0)
-    assert best.message == "stopped after 0 iterations, as maxiter asks" and len(best.history) == 1
+    assert best.message == "stopped after 0 iterations, the limit maxiter" and len(best.history) == 1
     wall = dp.minimize(barrier, start["u"], tolerance=1e-6)  # its minimum is where u = 0.9, and it ends at 1
     close(wall.x, np.full(PLAIN.shape, 0.9), 1e-6, "barrier")
     assert any(record.failed for record in wall.history), wall
