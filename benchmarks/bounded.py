@@ -133,9 +133,18 @@ def degenerate(rng):
 
 
 PROBLEMS = [
-    tomography, nonnegative_least_squares, rosenbrock_2, rosenbrock_100, deconvolution, box_quadratic, obstacle,
-    poisson_control, logistic_regression, conductivity, degenerate,
-]  # fmt: skip
+    tomography,
+    nonnegative_least_squares,
+    rosenbrock_2,
+    rosenbrock_100,
+    deconvolution,
+    box_quadratic,
+    obstacle,
+    poisson_control,
+    logistic_regression,
+    conductivity,
+    degenerate,
+]
 
 
 class Counted:

@@ -124,13 +124,19 @@ def main():
     few = on_ranks(1, (n // 4,) * 3, 0)[0]
     growth = max(iterations - few, 0) / 2
     counted = messages(options.ranks)
-    print(f"measured on 1 rank: {1e9 * seconds:.0f} ns a cell and iteration; iterations: {few} at {n // 4}^3, "
-          f"{iterations} at {n}^3")  # fmt: skip
-    print(f"measured on {options.ranks} ranks at {COUNTED}^3: an iteration sends {counted[0]:.0f} messages, "
-          f"{counted[1] / 1e3:.0f} kB from the busiest rank")  # fmt: skip
+    print(
+        f"measured on 1 rank: {1e9 * seconds:.0f} ns a cell and iteration; iterations: {few} at {n // 4}^3, "
+        f"{iterations} at {n}^3"
+    )
+    print(
+        f"measured on {options.ranks} ranks at {COUNTED}^3: an iteration sends {counted[0]:.0f} messages, "
+        f"{counted[1] / 1e3:.0f} kB from the busiest rank"
+    )
     rows, many, number = table(seconds, growth, iterations + growth * log2(SHARE / n**3) / 3, counted, options.ranks)
-    print(f"assumed: {1e6 * LATENCY:.0f} us a message, {BANDWIDTH / 1e9:.0f} GB/s; {many:.0f} iterations of "
-          f"{number:.0f} messages at {WHOLE:.0e} cells")  # fmt: skip
+    print(
+        f"assumed: {1e6 * LATENCY:.0f} us a message, {BANDWIDTH / 1e9:.0f} GB/s; {many:.0f} iterations of "
+        f"{number:.0f} messages at {WHOLE:.0e} cells"
+    )
     columns = "ranks", "cells a rank", "compute", "messages", "bytes", "reductions", "one solve", "efficiency"
     print(" ".join(f"{head:>12}" for head in columns))
     for ranks, cells, *parts, solve, efficiency in rows:

@@ -52,9 +52,18 @@ measured = heat(blocks) + 0.005 * rng.standard_normal(grid.shape)
 
 jumps = [pylops.FirstDerivative(grid.shape, axis=axis, edge=True, kind="backward") for axis in (0, 1)]
 start = pylops.optimization.sparsity.splitbregman(
-    Heat, measured.ravel(), jumps, niter_outer=12, niter_inner=3, mu=1.0, epsRL1s=[0.02, 0.02], tol=1e-8,
-    tau=1.0, iter_lim=20, damp=1e-8,
-)[0].reshape(grid.shape)  # fmt: skip
+    Heat,
+    measured.ravel(),
+    jumps,
+    niter_outer=12,
+    niter_inner=3,
+    mu=1.0,
+    epsRL1s=[0.02, 0.02],
+    tol=1e-8,
+    tau=1.0,
+    iter_lim=20,
+    damp=1e-8,
+)[0].reshape(grid.shape)
 
 plain = pylops.optimization.leastsquares.regularized_inversion(
     Heat, measured.ravel(), [pylops.Identity(cells**2)], epsRs=[0.03], iter_lim=200
@@ -118,9 +127,13 @@ if options.out:
     from matplotlib import pyplot
 
     fields = {
-        "true": blocks, "measured": measured, "PyLops, our heat": start,
-        "true ": blocks, "picture": picture, "ours, their camera": best.x,
-    }  # fmt: skip
+        "true": blocks,
+        "measured": measured,
+        "PyLops, our heat": start,
+        "true ": blocks,
+        "picture": picture,
+        "ours, their camera": best.x,
+    }
     drawn, places = pyplot.subplots(2, 3, figsize=(11, 6.6), layout="constrained")
     for ax, (title, field) in zip(places.flat, fields.items()):
         dp.plot(grid, field, ax=ax, title=title, label="temperature", limits=(0.0, 1.0))

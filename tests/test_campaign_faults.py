@@ -61,7 +61,7 @@ FAULTS = {
         '        _check_names("key", tree, reference)\n        return tree.keys()\n',
         "",
     ),
-    "an adjoint null space that is that of the forward system": Bug(
+    "an adjoint null space equal to the forward one": Bug(
         "solvers", "part = self._sides[transposed] * (", "part = self._sides[0] * (", ""
     ),
     "an ensemble whose gradient has no weights": Bug("parallel", "[weight * part for part in parts]", "parts", ""),

@@ -117,7 +117,7 @@ def test_conditions_have_docstrings_of_their_own():
 
 
 def options_in_the_table(function):
-    """Method -> option -> default, as the table of options in a docstring says."""
+    """Return the default of each option of each method, by the tables in a docstring."""
     found: dict = {}
     for line in inspect.getdoc(function).splitlines():
         cells = re.split(r"  +", line.strip(), maxsplit=3)
@@ -128,7 +128,7 @@ def options_in_the_table(function):
 
 
 def options_of(makers, position):
-    """Method -> option -> default, as the signatures say."""
+    """Return the default of each option of each method, by the signatures."""
     parameters = {method: list(inspect.signature(make).parameters.values()) for method, make in makers.items()}
     return {method: {p.name: p.default for p in found[position(method) :]} for method, found in parameters.items()}
 

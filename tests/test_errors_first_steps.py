@@ -19,69 +19,86 @@ RNG = np.random.default_rng(0)
 
 WRONG = [
     (
-        lambda: dp.curl(GRID)(np.zeros((3, 2))), ShapeError,
+        lambda: dp.curl(GRID)(np.zeros((3, 2))),
+        ShapeError,
         "curl takes a field on nodes(3, 2) of shape (4, 3), got an array of shape (3, 2)",
     ),
     (
-        lambda: LIFT(0.0), ShapeError,
+        lambda: LIFT(0.0),
+        ShapeError,
         "lift takes a field on walls(3, 2) of shape (10,), got an array of shape (); write np.full((10,), 0.0)",
     ),
     (
-        lambda: LIFT([np.zeros(2), np.zeros(2), np.zeros(3), np.zeros(3)]), ShapeError,
+        lambda: LIFT([np.zeros(2), np.zeros(2), np.zeros(3), np.zeros(3)]),
+        ShapeError,
         "lift takes one array on walls(3, 2) of shape (10,), got 4 parts; write op.domain.join(*parts)",
     ),
     (
-        lambda: dp.divergence(GRID)(GRID.split(np.zeros(17))), ShapeError,
+        lambda: dp.divergence(GRID)(GRID.split(np.zeros(17))),
+        ShapeError,
         "divergence takes one array on faces(3, 2) of shape (17,), got 2 parts; write grid.join(*parts)",
     ),
     (
-        lambda: SOLVE(np.ones((3, 2)), np.ones((3, 2))), ShapeError,
+        lambda: SOLVE(np.ones((3, 2)), np.ones((3, 2))),
+        ShapeError,
         "k takes a number or a field on faces(3, 2) of shape (17,), got an array of shape (3, 2); "
         "write harmonic_average(grid)(k)",
     ),
     (
-        lambda: dp.network.dense(LAYERS, np.ones((1, 2))), TypeError,
+        lambda: dp.network.dense(LAYERS, np.ones((1, 2))),
+        TypeError,
         "dense takes the dict of one layer, with weight and bias, got first; write p['name'] of that layer",
     ),
     (
-        lambda: dp.network.convolution(LAYERS["first"]["weight"], np.ones((1, 2, 5))), TypeError,
+        lambda: dp.network.convolution(LAYERS["first"]["weight"], np.ones((1, 2, 5))),
+        TypeError,
         "convolution takes the dict of one layer, with weight and bias, got ndarray; write p['name'] of that layer",
     ),
     (
-        lambda: dp.network.dense_weights(0, 2, 3), TypeError,
+        lambda: dp.network.dense_weights(0, 2, 3),
+        TypeError,
         "weights are drawn from a numpy Generator, got 0; write np.random.default_rng(0)",
     ),
     (
-        lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(4), bounds=(np.zeros(3), None)), ShapeError,
+        lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(4), bounds=(np.zeros(3), None)),
+        ShapeError,
         "bounds[0]: shape (3,) does not fit start, of shape (4,)",
     ),
     (
-        lambda: dp.divergence(GRID) * dp.gradient(GRID), TypeError,
+        lambda: dp.divergence(GRID) * dp.gradient(GRID),
+        TypeError,
         "divergence * gradient is not defined; write A @ B to compose operators",
     ),
     (
-        lambda: dp.laplacian(GRID) + 1, TypeError,
+        lambda: dp.laplacian(GRID) + 1,
+        TypeError,
         "a number cannot be added to laplacian; write laplacian + c * dp.identity(space)",
     ),
     (
-        lambda: dp.gradient((4, 4)), TypeError,
+        lambda: dp.gradient((4, 4)),
+        TypeError,
         "an operator, as its first argument, takes a Grid, got tuple; write dp.Grid((8, 6), size=1.0)",
     ),
     (
-        lambda: dp.check.gradient(lambda x: anp.sum(x**2), np.ones(3), directions=-1), ValueError,
+        lambda: dp.check.gradient(lambda x: anp.sum(x**2), np.ones(3), directions=-1),
+        ValueError,
         "directions of check.gradient must be a whole number >= 0, got -1; the default is 3",
     ),
     (
-        lambda: dp.laplacian(GRID, (dp.dirichlet, dp.neumann)), TypeError,
+        lambda: dp.laplacian(GRID, (dp.dirichlet, dp.neumann)),
+        TypeError,
         "a pair of conditions belongs to one axis of Grid(3 x 2 cells, size 3 x 2); name it: "
         "{'x': (dirichlet, neumann)}",
     ),
     (
-        lambda: dp.dirichlet(1.0), TypeError,
+        lambda: dp.dirichlet(1.0),
+        TypeError,
         "dirichlet takes no value here; write G(u) + B(values), B = dp.lift(grid, dp.dirichlet)",
     ),
     (
-        lambda: dp.lapacian, AttributeError, "module 'sparsedp' has no attribute 'lapacian'; write 'laplacian'",
+        lambda: dp.lapacian,
+        AttributeError,
+        "module 'sparsedp' has no attribute 'lapacian'; write 'laplacian'",
     ),
     (lambda: dp.banana, AttributeError, "module 'sparsedp' has no attribute 'banana'"),
     (lambda: MINIMUM.fun, AttributeError, "Minimum has no attribute 'fun'; write best.value"),
@@ -92,48 +109,57 @@ WRONG = [
     (lambda: LIFT.dot, AttributeError, "Operator has no attribute 'dot'; write op(u), or A @ B"),
     (lambda: LIFT.toarray(), AttributeError, "Operator has no attribute 'toarray'; write op.matrix.toarray()"),
     (
-        lambda: dp.minimize(lambda x: x**2, 1.0, tol=1e-3), TypeError,
+        lambda: dp.minimize(lambda x: x**2, 1.0, tol=1e-3),
+        TypeError,
         "lbfgs has no option 'tol'; it has memory, line_search; write tolerance=...",
     ),
     (
-        lambda: dp.minimize(lambda x: x**2, 1.0, jac=True), TypeError,
+        lambda: dp.minimize(lambda x: x**2, 1.0, jac=True),
+        TypeError,
         "lbfgs has no option 'jac'; it has memory, line_search; write gradient=function, or omit it: it is "
         "computed in reverse mode",
     ),
     (
-        lambda: dp.minimize(lambda x: x**2, 1.0, method="L-BFGS-B"), ValueError,
+        lambda: dp.minimize(lambda x: x**2, 1.0, method="L-BFGS-B"),
+        ValueError,
         "method must be one of lbfgs, gd, adam, newton_cg, gauss_newton, levenberg_marquardt, half_inverse, "
         "physical_gradient, admm, got 'L-BFGS-B'; write 'lbfgs'",
     ),
     (
-        lambda: dp.inverse(dp.laplacian(GRID), method="cg"), ValueError,
+        lambda: dp.inverse(dp.laplacian(GRID), method="cg"),
+        ValueError,
         "method must be one of auto, separable, direct, structured, multigrid, krylov, got 'cg'; write 'krylov'",
     ),
     (
-        lambda: dp.inverse(dp.laplacian(GRID), tol=1e-3), TypeError,
+        lambda: dp.inverse(dp.laplacian(GRID), tol=1e-3),
+        TypeError,
         "method auto takes the options precision, cycle, strength, sweeps, levels, preconditioner, diff, iterations, "
         "got 'tol'; write 'rtol'",
     ),
     (
-        lambda: dp.value_and_grad(lambda x: anp.sum(x**2), np.ones(2)), ValueError,
+        lambda: dp.value_and_grad(lambda x: anp.sum(x**2), np.ones(2)),
+        ValueError,
         "argnum of value_and_grad must be a whole number >= 0, got an array of shape (2,); write 0 for the first "
         "argument, and value_and_grad(loss)(x) for the gradient at x",
     ),
     (
-        lambda: dp.check.gradient(dp.value_and_grad(lambda x: anp.sum(x**2)), np.ones(2)), ShapeError,
+        lambda: dp.check.gradient(dp.value_and_grad(lambda x: anp.sum(x**2)), np.ones(2)),
+        ShapeError,
         "the loss must be a scalar, got a tuple; return one number",
     ),
     (
-        lambda: dp.steady(lambda x: x, 1.0, 2.0), TypeError,
+        lambda: dp.steady(lambda x: x, 1.0, 2.0),
+        TypeError,
         "implicit(<lambda>) calls a function with 2 arguments, got one that takes 1; "
         "write lambda x, p: ..., and root(guess, p)",
     ),
     (
-        lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(9), bounds=[(0, 1)] * 9), ValueError,
+        lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(9), bounds=[(0, 1)] * 9),
+        ValueError,
         "bounds must be a pair (lower, upper), each a number, None or a tree like start, got [(0, 1), (0, 1), (0, 1), "
         "(0, 1), (0, 1), (0, 1), ...]; write (0.0, None) for x >= 0",
     ),
-]  # fmt: skip
+]
 
 NO_PARAMS = "; write rollout(step, start, params, n): the params given are None"
 NO_ARRAY = "; write np.asarray(x) for an array: a list is a tree of numbers"

@@ -161,7 +161,7 @@ def scene(name, shape=(5, 4), periodic=False):
 
 
 def alone(run, args, number):
-    """One argument -> a number."""
+    """Return a number that depends on one argument."""
     return lambda x: anp.sum(anp.sin(run(*args[:number], x, *args[number + 1 :])))
 
 
@@ -289,13 +289,22 @@ REFUSED = [
     (lambda: HEAT(HEAT.start(V, 1.0, {"heat": U}), np.inf), NONFINITE, "the rate of 'heat' must be finite, got 12"),
     (lambda: SPLIT(prox=0), TypeError, "admm, as prox, takes a function, got int; write lambda v, t: ..."),
     (lambda: SPLIT(operator=np.eye(3)), TypeError, "admm, as operator, takes a function, got ndarray; write lambda x"),
-    (lambda: dp.stepper("radau", lambda u, p: -u, 0.1, tolerance=1e-3, floor=np.inf), ValueError,
-     "floor must hold finite numbers >= 0, in the units of u, got inf; write 1e-3"),
-    (lambda: dp.smoothness(GRID)(1e200 * np.arange(12.0).reshape(3, 4)), NONFINITE,
-     "the squared slope in smoothness must be finite, got 12 that are NaN or infinite, the first at (0, 0)"),
-    (lambda: dp.total_variation(GRID, 0.1)(np.full((3, 4), np.nan)), NONFINITE,
-     "the squared slope in total_variation must be finite, got 12 that are NaN or infinite, the first at (0, 0)"),
-]  # fmt: skip
+    (
+        lambda: dp.stepper("radau", lambda u, p: -u, 0.1, tolerance=1e-3, floor=np.inf),
+        ValueError,
+        "floor must hold finite numbers >= 0, in the units of u, got inf; write 1e-3",
+    ),
+    (
+        lambda: dp.smoothness(GRID)(1e200 * np.arange(12.0).reshape(3, 4)),
+        NONFINITE,
+        "the squared slope in smoothness must be finite, got 12 that are NaN or infinite, the first at (0, 0)",
+    ),
+    (
+        lambda: dp.total_variation(GRID, 0.1)(np.full((3, 4), np.nan)),
+        NONFINITE,
+        "the squared slope in total_variation must be finite, got 12 that are NaN or infinite, the first at (0, 0)",
+    ),
+]
 
 
 @pytest.mark.parametrize("act, kind, message", REFUSED)
@@ -345,7 +354,7 @@ def test_a_batch_of_flows_is_a_flow_each():
 @pytest.mark.parametrize("periodic", [False, True])
 @pytest.mark.parametrize("left", [0, 1, None])
 def test_solids_everywhere(shape, periodic, left):
-    """So many cells are left open: values and gradients stay finite, and where nothing is open nothing happens."""
+    """Few cells are open: values and gradients stay finite, and where nothing is open nothing happens."""
     grid = dp.Grid(shape, periodic=periodic)
     rng = np.random.default_rng(2)
     solid = np.arange(np.prod(shape)).reshape(shape) >= (np.prod(shape) if left is None else left)

@@ -8,9 +8,30 @@ import numpy as np
 import pytest
 
 from extremes import (  # isort: skip
-    ANISOTROPIC, BOUNDARIES, COEFFICIENTS, EVERY, IN_SCENES, METHODS, NONE, OPTIONS, SCENES, SMALL, STRONG, agree,
-    coefficient, dense, elliptic, exact, neumann, regions, same_bits, solver, stretched, unfit, weak,
-)  # fmt: skip
+    ANISOTROPIC,
+    BOUNDARIES,
+    COEFFICIENTS,
+    EVERY,
+    IN_SCENES,
+    METHODS,
+    NONE,
+    OPTIONS,
+    SCENES,
+    SMALL,
+    STRONG,
+    agree,
+    coefficient,
+    dense,
+    elliptic,
+    exact,
+    neumann,
+    regions,
+    same_bits,
+    solver,
+    stretched,
+    unfit,
+    weak,
+)
 
 import sparsedp as dp
 
@@ -286,8 +307,18 @@ def test_scale_of_the_operator(scene, method, exponent, rng):
 @pytest.mark.sampled(1)
 @EVERY
 @pytest.mark.parametrize("boundary", [dp.dirichlet, dp.neumann], ids=str)
-@pytest.mark.parametrize("shape, exponent", [((14, 13), -450), ((14, 13), -300), ((14, 13), 300), ((14, 13), 450),
-                                             ((5, 4, 6), -300), ((5, 4, 6), 300), ((5, 4, 6), 450)])  # fmt: skip
+@pytest.mark.parametrize(
+    "shape, exponent",
+    [
+        ((14, 13), -450),
+        ((14, 13), -300),
+        ((14, 13), 300),
+        ((14, 13), 450),
+        ((5, 4, 6), -300),
+        ((5, 4, 6), 300),
+        ((5, 4, 6), 450),
+    ],
+)
 def test_scale_of_lengths(shape, exponent, boundary, method, rng):
     """The same bits whatever the unit of length, cells of 2^-450 to 2^450; else a typed error."""
     near, far = (-dp.laplacian(stretched(*shape, unit=unit), boundary) for unit in (1.0, 2.0**exponent))

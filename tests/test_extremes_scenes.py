@@ -13,9 +13,28 @@ import numpy as np
 import pytest
 
 from extremes import (  # isort: skip
-    CLOSED, COEFFICIENTS, COLUMNS, EVERY, STRONG, GEOMETRIES, KINDS, OPTIONS, agree, check_gradient_of_kind, check_kind,
-    coefficient, dense, elliptic, exact, march, projection, same_bits, solver, speeds, stretched,
-)  # fmt: skip
+    CLOSED,
+    COEFFICIENTS,
+    COLUMNS,
+    EVERY,
+    STRONG,
+    GEOMETRIES,
+    KINDS,
+    OPTIONS,
+    agree,
+    check_gradient_of_kind,
+    check_kind,
+    coefficient,
+    dense,
+    elliptic,
+    exact,
+    march,
+    projection,
+    same_bits,
+    solver,
+    speeds,
+    stretched,
+)
 
 import sparsedp as dp
 from sparsedp._utils.validation import place
@@ -51,7 +70,7 @@ def test_against_dense_algebra(column, method, rng):
 @EVERY
 @IN_COLUMNS
 def test_field_zero(column, method, rng):
-    """Exactly 0 without a solve; the gradient is that of the linear map, which is not 0."""
+    """Exactly 0 without a solve; the gradient is the one of the linear map, which is not 0."""
     run, shape, matrix, infos, _ = COLUMNS[column](method)
     x, g = rng.standard_normal((2, *shape))
     same_bits(run(zeros := np.zeros(shape)), zeros)
@@ -177,7 +196,7 @@ def test_projection_of_a_flow_through_the_walls(method, defect, rng):
 @STRONG
 @IN_HARD
 def test_projection_with_jumps_and_flat_cells(method, name, rng):
-    """What is left of the divergence is rounding of k p, and p is up to v / k; in flat cells, the tolerance."""
+    """The remaining divergence is rounding of k p, and p is up to v / k; in flat cells, the tolerance."""
     grid, k = HARD[name]
     flat = name not in COEFFICIENTS
     column = projection(method, grid, None, k, rtol=1e-10 if flat else 1e-13, **OPTIONS.get(method, {}))

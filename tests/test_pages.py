@@ -54,8 +54,13 @@ def test_fractions_have_braces():
 
 
 def test_commands_of_the_pages():
-    found = [words for name in PAGES for block in blocks((DOCS / name).read_text(encoding="utf-8"))
-             if block.language in SHELL for words in commands(block.text)]  # fmt: skip
+    found = [
+        words
+        for name in PAGES
+        for block in blocks((DOCS / name).read_text(encoding="utf-8"))
+        if block.language in SHELL
+        for words in commands(block.text)
+    ]
     assert found
     for words in found:
         if words[:3] == ["python", "-m", "pip"]:

@@ -563,7 +563,7 @@ BUGS = {
 
 
 def planted(folder, bug):
-    """A copy of the package -> the file that the bug is in, and its text with the bug."""
+    """Return the file of a copy of the package that holds the bug, and its text with the bug."""
     place = folder / "sparsedp" / bug.place
     files = [place] if place.is_file() else sorted(place.rglob("*.py"))
     found = [(path, text) for path in files for text in [path.read_text(encoding="utf-8")] if bug.right in text]
@@ -584,7 +584,7 @@ def copied(tmp_path_factory):
 
 
 def failures(folder, tests, compiled=False):
-    """Run tests in a copy -> (exit code, what was printed). With the plain kernels nothing is compiled again."""
+    """Run tests in a copy; return (exit code, output). With the plain kernels nothing is compiled again."""
     environment = {**os.environ, "PYTHONPATH": str(folder), "SPARSEDP_NUMBA": str(int(compiled))}
     for name in ("PYTHONDONTWRITEBYTECODE", "PYTHONPYCACHEPREFIX"):  # bytecode goes with the copy
         environment.pop(name, None)

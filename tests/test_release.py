@@ -114,10 +114,17 @@ def test_issue_forms(name):
 
 
 def run(*words, folder):
-    """A command without the checkout on its path -> what it printed."""
+    """Run a command without the checkout on its path; return its output."""
     environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONHOME")}
-    done = subprocess.run(words, cwd=folder, env={**environment, "MPLBACKEND": "Agg", "PYTHONNOUSERSITE": "1"},
-                          capture_output=True, text=True, timeout=500, check=False)  # fmt: skip
+    done = subprocess.run(
+        words,
+        cwd=folder,
+        env={**environment, "MPLBACKEND": "Agg", "PYTHONNOUSERSITE": "1"},
+        capture_output=True,
+        text=True,
+        timeout=500,
+        check=False,
+    )
     assert done.returncode == 0, f"{words}\n{done.stdout}\n{done.stderr}"
     return done.stdout
 

@@ -44,76 +44,139 @@ TABLE = [
     (lambda: dp.rollout(STEP, U, 100), TypeError, f"dp.rollout needs the argument 'n'; write {PARAMS}"),
     (lambda: dp.rollout(STEP, U, 1.0, steps=3), TypeError, "dp.rollout has no argument 'steps'; write n=..."),
     (lambda: dp.laplacian(GRID, bc=dp.dirichlet), TypeError, "dp.laplacian has no argument 'bc'; write boundary=..."),
-    (lambda: dp.laplacian(GRID, grid=GRID), TypeError,
-     "dp.laplacian was given an argument twice, by position and by name; write dp.laplacian(grid)"),
+    (
+        lambda: dp.laplacian(GRID, grid=GRID),
+        TypeError,
+        "dp.laplacian was given an argument twice, by position and by name; write dp.laplacian(grid)",
+    ),
     (lambda: dp.curl(GRID, U), TypeError, "dp.curl takes 1 by position, got 2; write dp.curl(grid)"),
-    (lambda: dp.save("u.npz", GRID, U), TypeError,
-     "dp.save takes 2 by position, got 3; write dp.save('run.npz', grid, u=u)"),
+    (
+        lambda: dp.save("u.npz", GRID, U),
+        TypeError,
+        "dp.save takes 2 by position, got 3; write dp.save('run.npz', grid, u=u)",
+    ),
     (lambda: dp.save(U, GRID), TypeError, "save takes the path of a file first, got ndarray; write 'fields.npz'"),
     (lambda: dp.grad(square, argnums=0), TypeError, "dp.grad has no argument 'argnums'; write argnum=..."),
-    (lambda: dp.ensemble(square, [U], workers=2), TypeError,
-     "dp.ensemble has no argument 'workers'; write executor=..."),
-    (lambda: dp.ensemble(square, 3), TypeError,
-     "ensemble takes a list of scenes, got 3; write [first, second, ...], or range(n) for numbers"),
-    (lambda: dp.work_precision(square, {"a": {}}, over={"steps": 5}), TypeError,
-     "over of work_precision takes a list of values for 'steps', got 5; write [5]"),
-    (lambda: dp.sample(GRID, (0.5, 0.5)), ShapeError,
-     "sample needs points of shape (m, 2), got an array of shape (2,); write [[0.5, 0.5]] for one point"),
-    (lambda: dp.inverse(L, U), ValueError,
-     "method must be one of auto, separable, direct, structured, multigrid, krylov, got an array of shape (4, 3); "
-     "write dp.inverse(op)(b) for a right-hand side b"),
+    (
+        lambda: dp.ensemble(square, [U], workers=2),
+        TypeError,
+        "dp.ensemble has no argument 'workers'; write executor=...",
+    ),
+    (
+        lambda: dp.ensemble(square, 3),
+        TypeError,
+        "ensemble takes a list of scenes, got 3; write [first, second, ...], or range(n) for numbers",
+    ),
+    (
+        lambda: dp.work_precision(square, {"a": {}}, over={"steps": 5}),
+        TypeError,
+        "over of work_precision takes a list of values for 'steps', got 5; write [5]",
+    ),
+    (
+        lambda: dp.sample(GRID, (0.5, 0.5)),
+        ShapeError,
+        "sample needs points of shape (m, 2), got an array of shape (2,); write [[0.5, 0.5]] for one point",
+    ),
+    (
+        lambda: dp.inverse(L, U),
+        ValueError,
+        "method must be one of auto, separable, direct, structured, multigrid, krylov, got an array of shape (4, 3); "
+        "write dp.inverse(op)(b) for a right-hand side b",
+    ),
     # objects that are called
-    (lambda: dp.transport(GRID)(U, np.zeros(31)), TypeError,
-     "dp.transport(grid) needs the argument 'dt'; write dp.transport(grid)(u, v, dt)"),
-    (lambda: STEP(U), TypeError,
-     "bad operand type for unary -: 'NoneType'; write step(state, params): the params given are None"),
+    (
+        lambda: dp.transport(GRID)(U, np.zeros(31)),
+        TypeError,
+        "dp.transport(grid) needs the argument 'dt'; write dp.transport(grid)(u, v, dt)",
+    ),
+    (
+        lambda: STEP(U),
+        TypeError,
+        "bad operand type for unary -: 'NoneType'; write step(state, params): the params given are None",
+    ),
     # modules
     (lambda: dp.check(square, U), TypeError, "sparsedp.check is a module; write dp.check.gradient(loss, x)"),
     (lambda: dp.network(3), TypeError, "sparsedp.network is a module; write dp.network.dense(p, x)"),
     (lambda: dp.interop(square), TypeError, "sparsedp.interop is a module; write dp.interop.to_torch(f)"),
     (lambda: dp.optimize(square, U), TypeError, "sparsedp.optimize is a module; write dp.minimize(loss, start)"),
     (lambda: dp.advection(GRID), TypeError, "sparsedp.advection is a module; write dp.transport(grid)"),
-    (lambda: dp.report(square), TypeError,
-     "sparsedp.report is a module; write dp.explain(loss, x), or python -m sparsedp report scene.py"),
+    (
+        lambda: dp.report(square),
+        TypeError,
+        "sparsedp.report is a module; write dp.explain(loss, x), or python -m sparsedp report scene.py",
+    ),
     (lambda: dp.check.grad, AttributeError, "module 'sparsedp.check' has no attribute 'grad'; write 'gradient'"),
-    (lambda: dp.check.gradient(square), TypeError,
-     "dp.check.gradient needs the argument 'x'; write dp.check.gradient(loss, x)"),
+    (
+        lambda: dp.check.gradient(square),
+        TypeError,
+        "dp.check.gradient needs the argument 'x'; write dp.check.gradient(loss, x)",
+    ),
     # minimize
-    (lambda: dp.minimize(square, U, constraints=[]), TypeError,
-     f"lbfgs has no option 'constraints'; {LBFGS}; write bounds=(lower, upper), project= for linear equations, or a "
-     "penalty added to the loss"),
-    (lambda: dp.minimize(square, U, lr=0.1), TypeError,
-     f"lbfgs has no option 'lr'; {LBFGS}; write method='adam', rate=..."),
-    (lambda: dp.minimize(square, U, options={}), TypeError,
-     f"lbfgs has no option 'options'; {LBFGS}; write the options themselves as keyword arguments, as in memory=20"),
+    (
+        lambda: dp.minimize(square, U, constraints=[]),
+        TypeError,
+        f"lbfgs has no option 'constraints'; {LBFGS}; write bounds=(lower, upper), project= for linear equations, or a "
+        "penalty added to the loss",
+    ),
+    (
+        lambda: dp.minimize(square, U, lr=0.1),
+        TypeError,
+        f"lbfgs has no option 'lr'; {LBFGS}; write method='adam', rate=...",
+    ),
+    (
+        lambda: dp.minimize(square, U, options={}),
+        TypeError,
+        f"lbfgs has no option 'options'; {LBFGS}; write the options themselves as keyword arguments, as in memory=20",
+    ),
     (lambda: dp.minimize(square, U, memry=3), TypeError, f"lbfgs has no option 'memry'; {LBFGS}; write 'memory'"),
     # operators
     (lambda: L + M, TypeError, ADD),
     (lambda: M + L, TypeError, ADD),
     (lambda: L - M, TypeError, ADD),
     (lambda: M - L, TypeError, ADD),
-    (lambda: L @ M, TypeError,
-     "laplacian @ a sparse matrix is not defined; write A @ dp.from_matrix(M, A.domain, A.codomain)"),
+    (
+        lambda: L @ M,
+        TypeError,
+        "laplacian @ a sparse matrix is not defined; write A @ dp.from_matrix(M, A.domain, A.codomain)",
+    ),
     (lambda: L**2, TypeError, "laplacian ** 2 is not defined; write A @ A, or dp.matrix_power(A, exponent)(u)"),
-    (lambda: L(U.ravel()), ShapeError,
-     "laplacian takes a field on cells(4, 3), got an array of shape (12,); write op(u.reshape(4, 3)), or op @ u for a "
-     "flat array"),
-    (lambda: lobpcg(-L, np.eye(12)[:, :2], M=dp.inverse(-L)), ShapeError,
-     "-laplacian takes a field on cells(4, 3), got an array of shape (12, 2); for the columns of a matrix, as lobpcg "
-     "of SciPy gives them, write op.to_scipy()"),
+    (
+        lambda: L(U.ravel()),
+        ShapeError,
+        "laplacian takes a field on cells(4, 3), got an array of shape (12,); write op(u.reshape(4, 3)), or op @ u for a "
+        "flat array",
+    ),
+    (
+        lambda: lobpcg(-L, np.eye(12)[:, :2], M=dp.inverse(-L)),
+        ShapeError,
+        "-laplacian takes a field on cells(4, 3), got an array of shape (12, 2); for the columns of a matrix, as lobpcg "
+        "of SciPy gives them, write op.to_scipy()",
+    ),
     (lambda: L.tocsr(), AttributeError, "Operator has no attribute 'tocsr'; write op.matrix"),
     # conditions
-    (lambda: dp.transport(GRID, boundary=dp.inflow), TypeError,
-     f"{NEEDS}, got inflow; inflow belongs to dp.projection and dp.flow_step, write dp.dirichlet here"),
-    (lambda: dp.laplacian(GRID, {"x": (dp.outflow, dp.inflow)}), TypeError,
-     f"{NEEDS}, got (outflow, inflow); outflow belongs to dp.projection and dp.flow_step, write dp.neumann here"),
-    (lambda: dp.laplacian(GRID, "periodic"), TypeError,
-     f"{NEEDS}, got 'periodic'; write dp.Grid(shape, periodic=True) and no condition"),
+    (
+        lambda: dp.transport(GRID, boundary=dp.inflow),
+        TypeError,
+        f"{NEEDS}, got inflow; inflow belongs to dp.projection and dp.flow_step, write dp.dirichlet here",
+    ),
+    (
+        lambda: dp.laplacian(GRID, {"x": (dp.outflow, dp.inflow)}),
+        TypeError,
+        f"{NEEDS}, got (outflow, inflow); outflow belongs to dp.projection and dp.flow_step, write dp.neumann here",
+    ),
+    (
+        lambda: dp.laplacian(GRID, "periodic"),
+        TypeError,
+        f"{NEEDS}, got 'periodic'; write dp.Grid(shape, periodic=True) and no condition",
+    ),
     # steps
-    (lambda: dp.stepper(square, 0.1), ValueError,
-     "method must be one of euler, heun, ssprk3, rk4, backward_euler, crank_nicolson, tr_bdf2, imex, radau, etdrk4, "
-     f"leapfrog, got {square!r}; write stepper('rk4', rate, dt)"),
-]  # fmt: skip
+    (
+        lambda: dp.stepper(square, 0.1),
+        ValueError,
+        "method must be one of euler, heun, ssprk3, rk4, backward_euler, crank_nicolson, tr_bdf2, imex, radau, etdrk4, "
+        f"leapfrog, got {square!r}; write stepper('rk4', rate, dt)",
+    ),
+]
 
 
 @pytest.mark.parametrize(("call", "error", "message"), TABLE, ids=[row[2][:50] for row in TABLE])

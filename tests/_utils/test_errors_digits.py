@@ -68,7 +68,7 @@ def test_a_residual_just_above_its_tolerance():
 
 
 def steps_just_too_long(beyond):
-    """Names of schemes -> calls with a step that is too long by a share."""
+    """Return calls with a step that is too long by a share, by name of the scheme."""
     u = np.ones(4)
     wind = np.ones(5)
     decay = dp.stepper("heun", dp.diagonal(LINE.cells, np.full(4, -8.0)), 0.25 * (1 + beyond))

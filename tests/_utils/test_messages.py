@@ -45,7 +45,7 @@ def join(parts):
 
 
 def assigned(tree):
-    """Name -> expressions it stands for: strings given to variables, results of functions."""
+    """Return the expressions that each name stands for: strings given to variables, results of functions."""
     scope = {}
     for node in ast.walk(tree):
         if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):

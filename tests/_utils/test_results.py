@@ -1,4 +1,4 @@
-"""Large fresh results: memory that nobody sees any more serves again, memory that somebody sees never does."""
+"""Buffers of large results: recycled when no reference is left, and never before."""
 
 import gc
 import threading

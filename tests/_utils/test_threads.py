@@ -50,7 +50,7 @@ def hurried():
 
 
 def at_once(work, times):
-    """work(0) ... work(3), each by a thread of its own, several times -> for each thread its results."""
+    """Run work(0) ... work(3) several times in four threads; return the results of each thread."""
     begin = Barrier(FOUR)
     found = [[] for _ in range(FOUR)]
 
@@ -93,7 +93,7 @@ GRID = dp.Grid((7, 6), size=(1.0, 1.3))
 
 
 def through(op):
-    """An Operator -> work: its values, those of its transpose, and a gradient."""
+    """Return a function that computes values of an operator and of its transpose, and a gradient."""
 
     def work(number):
         u = numbers(number, op.domain.shape)

@@ -94,10 +94,13 @@ def test_leaves_are_paired_by_name(tree, reference, wanted):
         ([1, 2], np.ones(2), "tree: expected one array or number, got a list of length 2"),
         ({"u": [{"w": 1}]}, {"u": ({"v": 1},)}, "tree['u'][0]: unknown key 'w'; expected 'v'"),
         ({"u": Pair(1, {})}, {"u": Pair(1, {"v": 1})}, "tree['u'].b: missing key 'v'; expected 'v'"),
-        ({"b": np.ones(2), "a": np.ones(3)}, {"a": np.ones(3), "b": np.ones(4)},
-         "tree['b']: expected shape (4,), got (2,)"),
+        (
+            {"b": np.ones(2), "a": np.ones(3)},
+            {"a": np.ones(3), "b": np.ones(4)},
+            "tree['b']: expected shape (4,), got (2,)",
+        ),
     ],
-)  # fmt: skip
+)
 def test_other_trees_are_refused_by_path(tree, reference, words):
     with pytest.raises(ShapeError) as refused:
         paired(tree, reference, "tree", shapes=True)
@@ -371,7 +374,7 @@ def test_a_floor_of_one_number_for_a_branch():
         ((1.0, 1.0), "floor: expected a dict of fast, slow, got a tuple of length 2"),
         ({"slow": np.ones(2), "fast": 1.0}, r"floor\['slow'\]: shape \(2,\) does not fit the state there"),
     ],
-)  # fmt: skip
+)
 def test_other_floors_are_refused(method, floor, words):
     with pytest.raises(ShapeError, match=words):
         dp.stepper(method, decay, 1.0, tolerance=1e-4, floor=floor)(FIELDS)

@@ -214,7 +214,7 @@ def test_inflow_as_one_number_gets_the_sum():
 @pytest.mark.parametrize("velocity", ["faces", "cells"])
 @pytest.mark.parametrize("kink", ["rest", "some"])
 def test_kinks_get_the_mean_of_both_sides(velocity, kink):
-    """At v = 0 the derivative is that of the central difference."""
+    """At v = 0 the derivative equals the central difference."""
     grid = dp.Grid((5, 4), size=1.0)
     move = dp.transport(grid, boundary=dp.dirichlet, velocity=velocity)
     rng = np.random.default_rng(3)

@@ -139,7 +139,7 @@ def test_scales_of_data_and_cotangent_do_not_change_a_bit(rng):
 
 
 def graph_laplacian(weights, ends, n):
-    """Edges with weights -> (pattern, map from the weights to its entries): row sums 0."""
+    """Return a pattern of edges, and the map from their weights to its entries; row sums are 0."""
     i, j = ends
     places = sp.csr_array((np.ones(2 * i.size), (np.r_[i, j], np.r_[j, i])), shape=(n, n)) + sp.eye_array(n)
     solve = matrix_solver(places, nullspace="project")

@@ -351,7 +351,7 @@ def test_a_step_whose_own_array_changes(memory, when):
         assert found == pytest.approx(expected, rel=1e-7)
 
 
-# ---- what is kept, and handed out ------------------------------------------------------------------------------------
+# ---- kept and returned arrays ------------------------------------------------------------------------------------
 
 
 def test_set_ups_own_their_coefficients():

@@ -212,8 +212,12 @@ def test_real_values_beside_complex_ones_get_real_cotangents(join, real):
 
 
 OPERATORS = {
-    "+": anp.add, "-": anp.subtract, "*": anp.multiply, "/": anp.true_divide, "**": anp.power,
-}  # fmt: skip
+    "+": anp.add,
+    "-": anp.subtract,
+    "*": anp.multiply,
+    "/": anp.true_divide,
+    "**": anp.power,
+}
 
 
 @pytest.mark.parametrize("sign", OPERATORS)

@@ -71,7 +71,7 @@ def test_cotangents_beyond_the_root_of_the_range_pass_in_silence(method):
 
 @pytest.mark.parametrize("method", ["euler", "heun", "ssprk3", "rk4"])
 def test_an_explicit_step_of_an_operator_rounds_traced_numbers_like_plain_ones(method):
-    """Under a budget the steps run plain first, and on a tape on the way back: to the same bits."""
+    """Under a budget the steps run plain first, and on a tape in the backward pass: to the same bits."""
     u = np.sin(np.arange(6.0)).astype(np.float32)
     step = dp.stepper(method, dp.laplacian(dp.Grid(6, size=1.0), dp.dirichlet), 0.01)
     loss = lambda c, **options: anp.sum(dp.rollout(step, u, c, 7, **options) ** 2)

@@ -72,7 +72,7 @@ def test_a_wider_cotangent_is_rounded_to_the_dtype_of_the_field():
 
 def test_float32_has_second_derivatives_in_every_mode():
     op = dp.laplacian(dp.Grid(4))
-    scale = np.arange(1.0, 5.0)  # float64 meets float32: cotangents are cast on the way back
+    scale = np.arange(1.0, 5.0)  # float64 meets float32: cotangents are cast in the backward pass
     f = lambda u: anp.sum(op(u * scale) ** 2)
     u = np.ones(4, np.float32)
     v = np.arange(4, dtype=np.float32)
@@ -154,9 +154,14 @@ def test_counts():
         value_and_grad(lambda u: anp.sum(SQUARE(op(op(u)))))(np.ones(4))
         pushforward(lambda u: SQUARE(op(u)), np.ones(4), np.ones(4))
     assert calls == {
-        ("laplacian", "forward"): 3, ("laplacian", "vjp"): 2, ("laplacian", "jvp"): 1,
-        ("square", "forward"): 2, ("square", "vjp"): 1, ("square", "jvp"): 1, ("laplacian", "assembled"): 1,
-    }  # fmt: skip
+        ("laplacian", "forward"): 3,
+        ("laplacian", "vjp"): 2,
+        ("laplacian", "jvp"): 1,
+        ("square", "forward"): 2,
+        ("square", "vjp"): 1,
+        ("square", "jvp"): 1,
+        ("laplacian", "assembled"): 1,
+    }
     op(np.ones(4))
     assert calls["laplacian", "forward"] == 3
 

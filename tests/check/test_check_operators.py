@@ -118,7 +118,7 @@ class Mutating(Structure):
 
 
 class Reused:
-    """A function that hands out the same array again and again."""
+    """Return a function that returns the same array in every call."""
 
     def __init__(self):
         self.calls = 0

@@ -169,7 +169,7 @@ def settled(law, lake, flow, end):
     ("flow", "n"), [pytest.param(1.0, 25, marks=pytest.mark.whole), pytest.param(4.42, 60, marks=pytest.mark.whole)]
 )
 def test_a_river_over_a_lake_at_rest(flow, n):
-    """The inflow acts beside an equilibrium: the discharge is that of the inflow, and Bernoulli's head the same all
+    """The inflow acts beside an equilibrium: the discharge equals the inflow, and Bernoulli's head the same all
     along: 2.249 m for 4.42."""
     law, lake, ground = river(n, flow)
     depth, discharge = settled(law, lake, flow, 30.0)

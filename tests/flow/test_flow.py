@@ -1,4 +1,4 @@
-"""Viscosity, moving walls, convection and the flow step: identities, orders, derivatives, and what is left out."""
+"""Viscosity, moving walls, convection and the flow step: identities, orders, derivatives, and what is not built."""
 
 import re
 from itertools import product

@@ -118,7 +118,7 @@ def test_a_step_beyond_the_courant_limit_is_refused():
 
 @pytest.mark.parametrize("implicit", [False, True])
 def test_the_limit_is_where_waves_grow(implicit):
-    """The predicted growth beside that of the fastest wave in the linear scheme."""
+    """The predicted growth agrees with the growth of the fastest wave in the linear scheme."""
     from sparsedp.flow.flow_step import _growth
 
     for courant, damping in ((0.3, 0.0), (0.9, 0.2), (0.7, 0.9), (1.5, 0.3)):

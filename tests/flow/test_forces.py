@@ -81,7 +81,7 @@ def test_parts_add_up_and_a_box_holds_what_is_in_it(rng):
 
 
 def test_torque(rng):
-    """Of a uniform acceleration: that of the weight in the middle. About another point: a force times an arm."""
+    """Of a uniform acceleration: that of a point mass in the middle; about another point, force times arm."""
     for dim in (2, 3):
         grid = dp.Grid((4, 5, 6)[:dim], spacing=0.5, origin=1.0)
         on = dp.forces(grid, cells=np.ones(grid.shape, bool), about=(1.5, 2.0, 2.5)[:dim])

@@ -33,7 +33,7 @@ def most(shape, drawn):
 
 
 def flows(grid, most, rng):
-    """Words for the walls of the bounded axes: all of them, or a draw of so many."""
+    """Words for the walls of the bounded axes: all of them, or a sample of n."""
     names = [name for name, flag in zip(grid.axes, grid.periodic) if not flag]
     found = list(product(product(WORDS, repeat=2), repeat=len(names)))
     chosen = found if len(found) <= most else [found[i] for i in rng.choice(len(found), most, replace=False)]

@@ -1,4 +1,4 @@
-"""The staggered grid once more, as dense matrices filled by loops over faces and cells: slow, plain, the reference."""
+"""The staggered grid as dense matrices filled by loops over faces and cells: slow, plain, the reference."""
 
 from itertools import product
 

@@ -13,7 +13,7 @@ NOISES = ("hash", "stairs", "single", "beside")
 
 
 def kinked(seed):
-    """Seed -> (loss, x): a right gradient, whatever its convention, at one or many kinks of any size."""
+    """Return (loss, x) of a right gradient, whatever its convention, at one or many kinks of any size."""
     rng = np.random.default_rng(seed)
     loss, x, _ = scene(seed)
     kind = KINKS[seed % len(KINKS)]
@@ -42,7 +42,7 @@ def bits(u):
 
 
 def noisy(seed):
-    """Seed -> (loss, x): a right gradient of the smooth part, noise of 3e-8 to 1e-2 of it."""
+    """Return (loss, x) of a right gradient of the smooth part, with noise of 3e-8 to 1e-2 of it."""
     rng = np.random.default_rng(10000 + seed)
     loss, x, _ = scene(seed)
     size = 10.0 ** rng.uniform(-7.5, -2)

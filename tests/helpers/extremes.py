@@ -123,10 +123,11 @@ ANISOTROPIC = {
     "weak x": lambda boundary: weak(dp.Grid((15, 16), size=1.0), boundary, 0),
     "flat cells": lambda boundary: -dp.laplacian(dp.Grid((16, 15), spacing=(1.0, 1e-4)), boundary),
     "high cells": lambda boundary: -dp.laplacian(dp.Grid((15, 16), spacing=(1e-4, 1.0)), boundary),
-    "clustered": lambda boundary: -dp.laplacian(dp.Grid((15, 16), spacing=[np.geomspace(1e-4, 1, n) for n in (15, 16)]),
-                                                boundary),
+    "clustered": lambda boundary: (
+        -dp.laplacian(dp.Grid((15, 16), spacing=[np.geomspace(1e-4, 1, n) for n in (15, 16)]), boundary)
+    ),
     "weak z": lambda boundary: weak(dp.Grid((6, 7, 5), size=1.0), boundary, 2),
-}  # fmt: skip
+}
 
 
 # ---- what is right -----------------------------------------------------------------------------------------------
@@ -288,7 +289,7 @@ def check_kind(fun, given):
 
 
 def check_gradient_of_kind(loss, given):
-    """The gradient is that of the contiguous float64 copy, in the dtype of the input; whole numbers have none."""
+    """The gradient equals the gradient at the contiguous float64 copy, in the dtype of the input; integers have none."""
     if given.dtype.kind in "biu":
         with pytest.raises(dp.errors.DerivativeError, match="a gradient needs floating values"):
             dp.value_and_grad(loss)(given)

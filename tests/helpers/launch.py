@@ -26,7 +26,7 @@ SETTINGS = {
 
 
 def launched(script, count, *options, seconds=SECONDS):
-    """A finished run of a script on so many processes."""
+    """Return the finished run of a script on n processes."""
     path = os.pathsep.join([str(ROOT), str(ROOT / "tests" / "helpers")])
     environment = {**os.environ, **SETTINGS, "PYTHONPATH": path}
     command = ["mpirun", "--oversubscribe", "-n", str(count), sys.executable, "-m", "mpi4py"]

@@ -60,7 +60,7 @@ def _plain(p, n, side):
 
 
 def down(part, axis, wraps):
-    """Mean of neighbours along an axis: faces -> cells."""
+    """Return the mean of neighbours along an axis, from faces to cells."""
     if wraps:
         return 0.5 * (part + anp.roll(part, -1, axis))
     n = part.shape[axis] - 1
@@ -68,7 +68,7 @@ def down(part, axis, wraps):
 
 
 def up(part, axis, wraps, widths):
-    """Linear interpolation along an axis: cells -> faces, at a wall the only cell."""
+    """Interpolate along an axis from cells to faces; at a wall the only cell counts."""
     n = part.shape[axis]
     line = [-1 if a == axis else 1 for a in range(part.ndim)]
     before = np.roll(widths, 1) if wraps else np.append(widths[:1], widths)

@@ -83,7 +83,7 @@ def same(wanted, got, **tolerance):
 
 
 def run_blocks(path):
-    """Execute the python blocks of a page in order; what one prints must be what the page says."""
+    """Execute the python blocks of a page in order; the printed text must be the text of the page."""
     all_blocks = blocks(path.read_text(encoding="utf-8"))
     space = {"__name__": "__page__"}
     assert any(block.language == "python" for block in all_blocks), f"{path.name} has no python block"

@@ -12,9 +12,9 @@ SEED = 14
 
 
 def chosen(rows, ways=2, name=""):
-    """Numbers of the rows of a sample: tuples of so many values each, found greedily in a shuffled order.
+    """Numbers of the rows of a sample: tuples of n values each, found greedily in a shuffled order.
 
-    The order is that of the name: tests of the same product run on other rows of it.
+    The order depends on the name: tests of the same product run on other rows of it.
     """
     order = random.Random(f"{SEED} {name}").sample(range(len(rows)), len(rows))
     columns = [list(enumerate(row)) for row in rows]

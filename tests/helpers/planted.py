@@ -10,7 +10,7 @@ KINDS = ("rule", "operator", "inverse", "elliptic", "matrix", "function", "opera
 
 
 def scene(seed, error=0.0, jvp=False):
-    """Seed -> (loss, x, name of the call whose VJP (or JVP) is off by the share `error`)."""
+    """Return (loss, x, name of the call whose VJP or JVP has the relative error `error`)."""
     rng = np.random.default_rng(seed)
     grid = dp.Grid(tuple(map(int, rng.integers(3, 7, 2))), spacing=float(rng.uniform(0.5, 2.0)))
     many = int(rng.integers(2, 5))

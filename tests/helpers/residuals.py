@@ -24,8 +24,12 @@ class Problem:
 
         def measured(params):
             parts = leaves(root(self.guess, params))
-            return sum(anp.sum(anp.cos(np.arange(np.size(self.guess_of(n)))).reshape(np.shape(self.guess_of(n))) * part
-                               + part**2) for n, part in enumerate(parts))  # fmt: skip
+            return sum(
+                anp.sum(
+                    anp.cos(np.arange(np.size(self.guess_of(n)))).reshape(np.shape(self.guess_of(n))) * part + part**2
+                )
+                for n, part in enumerate(parts)
+            )
 
         return measured
 
@@ -93,10 +97,12 @@ def stacked_fields():
     def residual(x, p):
         u = x[0]
         v = x[1]
-        return anp.stack([
-            u * (1 + v**2) - p["k"] * second(u) - p["f"],
-            v - u**2 / (1 + u**2) - 0.1 * second(v) * p["k"],
-        ])  # fmt: skip
+        return anp.stack(
+            [
+                u * (1 + v**2) - p["k"] * second(u) - p["f"],
+                v - u**2 / (1 + u**2) - 0.1 * second(v) * p["k"],
+            ]
+        )
 
     return Problem(residual, np.ones((2, 15)), {"k": 0.05, "f": 2 + field(15)}, 10.0)
 

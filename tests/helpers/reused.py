@@ -32,7 +32,7 @@ CASES = {}
 
 
 def case(*names):
-    """Public names that the case is for; its own name is that of the function."""
+    """Public names that the case is for; its own name is the name of the function."""
 
     def add(make):
         CASES[make.__name__] = make, names

@@ -24,7 +24,10 @@ def of_van_der_pol(u, p):
 
 
 def robertson(u, p):
-    """A -> B, B + C -> A + C, 2 B -> B + C (Robertson 1966)."""
+    """Return the rates of Robertson's three reactions (1966).
+
+    A -> B, B + C -> A + C, 2 B -> B + C
+    """
     slow = p[0] * u[0]
     back = p[1] * u[1] * u[2]
     fast = p[2] * u[1] ** 2
@@ -42,10 +45,27 @@ def of_robertson(u, p):
 
 # HIRES, high irradiance responses of photomorphogenesis (Schaefer 1975): (species, rate, source species, sign)
 REACTIONS = (
-    (0, 0, 0, -1), (0, 1, 1, 1), (0, 2, 2, 1), (1, 0, 0, 1), (1, 4, 1, -1), (2, 5, 2, -1), (2, 1, 3, 1), (2, 6, 4, 1),
-    (3, 2, 1, 1), (3, 0, 2, 1), (3, 7, 3, -1), (4, 8, 4, -1), (4, 1, 5, 1), (4, 1, 6, 1), (5, 10, 3, 1), (5, 0, 4, 1),
-    (5, 1, 5, -1), (5, 10, 6, 1), (6, 11, 6, -1), (7, 11, 6, 1),
-)  # fmt: skip
+    (0, 0, 0, -1),
+    (0, 1, 1, 1),
+    (0, 2, 2, 1),
+    (1, 0, 0, 1),
+    (1, 4, 1, -1),
+    (2, 5, 2, -1),
+    (2, 1, 3, 1),
+    (2, 6, 4, 1),
+    (3, 2, 1, 1),
+    (3, 0, 2, 1),
+    (3, 7, 3, -1),
+    (4, 8, 4, -1),
+    (4, 1, 5, 1),
+    (4, 1, 6, 1),
+    (5, 10, 3, 1),
+    (5, 0, 4, 1),
+    (5, 1, 5, -1),
+    (5, 10, 6, 1),
+    (6, 11, 6, -1),
+    (7, 11, 6, 1),
+)
 SPECIES, RATES, SOURCES, SIGNS = np.array(REACTIONS).T
 GAINS = np.zeros((8, len(REACTIONS)))
 GAINS[SPECIES, np.arange(len(REACTIONS))] = SIGNS

@@ -1,4 +1,4 @@
-"""The schemes of transport once more, with slices in autograd.numpy: slow, plain, and differentiated by the tape."""
+"""The schemes of transport, with slices in autograd.numpy: slow, plain, and differentiated by the tape."""
 
 import autograd.numpy as anp
 
@@ -15,7 +15,7 @@ def line(x, axis, dim):
 
 
 def to_nodes(x, grid, axis, shared):
-    """Cells -> nodes: linear between centres, or the mean weighted with the widths."""
+    """Interpolate from cells to nodes: linear between centres, or the mean weighted with the widths."""
     h = line(grid.widths[axis], axis, grid.dim)
     if grid.periodic[axis]:
         x, h = (anp.concatenate([cut(y, axis, -1, None), y], axis) for y in (x, h))
@@ -28,7 +28,7 @@ def to_nodes(x, grid, axis, shared):
 
 
 def inside(x, grid, axis, nodes):
-    """Nodes (or cells) -> interfaces between the nodes of an axis: the cell centres, and the walls."""
+    """Return values at the interfaces between the nodes of an axis: the cell centres, and the walls."""
     if grid.periodic[axis]:
         x = anp.concatenate([x, cut(x, axis, 0, 1)], axis) if nodes else x
         middle = 0.5 * (cut(x, axis, 0, -1) + cut(x, axis, 1, None)) if nodes else x

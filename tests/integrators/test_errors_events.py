@@ -29,7 +29,7 @@ def thrown(speed, method="rk4"):
 
 
 def weighed(u, g):
-    """An event whose time has another derivative than that of the bounce at the same time."""
+    """An event whose time has another derivative than the bounce at the same time."""
     return u[0] + 0.1 * (g - 9.81)
 
 

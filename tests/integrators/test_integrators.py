@@ -148,7 +148,7 @@ def test_prothero_robinson(n, error):
 
 
 def scenes():
-    """name -> (step, state, params)."""
+    """Return (step, state, params) by name."""
     heat = (np.cos(X), 0.7)
     tree = ({"a": 0.5, "s": 0.2}, {"g": 2.0, "drag": 0.1})
     forced = dict(linear=(L, lambda p: p["nu"]), source=lambda p, t: p["f"] * anp.cos(t))

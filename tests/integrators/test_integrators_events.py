@@ -265,7 +265,7 @@ def test_events_at_the_ends_of_intervals(method):
 
 
 def test_a_terminal_event_in_single_precision_ends_one_interval():
-    """The state that is handed out lies on the surface to its own rounding."""
+    """The returned state lies on the surface to its own rounding."""
     ends = event(lambda u, p, t: u[0], terminal=True)
     step = dp.stepper(
         "tr_bdf2", lambda u, p, t: anp.array([u[1], -10.0 + 0.0 * u[1]]), 1.0, tolerance=1e-4, events=ends

@@ -89,9 +89,15 @@ def test_published_values():
     assert end == pytest.approx([0.2083340149701255e-7, 0.8333360770334713e-13, 0.9999999791665050], rel=1e-6)
     rate, _, start, params, end, _ = SCENES["HIRES"]
     wanted = [
-        0.7371312573325668e-3, 0.1442485726316185e-3, 0.5888729740967575e-4, 0.1175651343283149e-2,
-        0.2386356198831331e-2, 0.6238968252742796e-2, 0.2849998395185769e-2, 0.2850001604814231e-2,
-    ]  # fmt: skip
+        0.7371312573325668e-3,
+        0.1442485726316185e-3,
+        0.5888729740967575e-4,
+        0.1175651343283149e-2,
+        0.2386356198831331e-2,
+        0.6238968252742796e-2,
+        0.2849998395185769e-2,
+        0.2850001604814231e-2,
+    ]
     new = dp.stepper("radau", rate, end, tolerance=1e-9)(np.array(start), np.array(params))
     assert np.max(np.abs(new - wanted)) <= 1e-9 * np.max(wanted)
 
@@ -349,37 +355,75 @@ def test_an_operator_and_a_source():
 ONES = np.ones(2)
 DECAY = lambda u, p: -p * u
 REFUSED = [
-    (lambda: dp.stepper("radau", DECAY, 1.0, sparsity=np.eye(2)), TypeError,
-     "radau does not use sparsity; leave it out"),
-    (lambda: dp.stepper("radau", DECAY, 1.0, solver="krylov"), TypeError,
-     "radau does not use solver; leave it out"),
-    (lambda: dp.stepper("radau", DECAY, 1.0)(np.ones(501), 1.0), ShapeError,
-     "stepper(radau) solves full systems of at most 500 unknowns, got 501; take tr_bdf2"),
-    (lambda: dp.stepper("radau", DECAY, 1.0)(ONES + 1j, 1.0), TypeError,
-     "stepper(radau) solves for real unknowns; give real and imaginary part as two fields"),
-    (lambda: dp.stepper("radau", DECAY, 1.0)(ONES, 1j), TypeError,
-     "a rate of complex numbers needs a complex state, got float64; write u.astype(complex)"),
-    (lambda: value_and_grad(lambda p: dp.stepper("radau", lambda u, p: -anp.abs(p) * u, 1.0)(ONES, p)[0])(1j),
-     DerivativeError, "stepper(radau) has derivatives in real params; give real and imaginary part as two"),
-    (lambda: value_and_grad(lambda k: dp.stepper("radau", lambda u, p: -k * u, 1.0)(ONES, None)[0])(1.0),
-     DerivativeError, "the rate of stepper(radau) uses a traced value that is not an argument; put it into params"),
-    (lambda: dp.stepper("radau", DECAY, 1.0, tolerance=1e-8)(np.ones(2, np.float32), 1.0), ValueError,
-     "stepper(radau) cannot meet the tolerance 1e-08 with a state of float32, whose rounding is 1.2e-07; "
-     "take a larger tolerance or write u.astype(float)"),
-    (lambda: dp.stepper("radau", DECAY, 1.0, jacobian=lambda u, p: np.eye(3))(ONES, 1.0), ShapeError,
-     "the jacobian of stepper(radau) must have shape (2, 2), got (3, 3)"),
-    (lambda: dp.stepper("radau", lambda u, p: u[:1], 1.0)(ONES, 1.0), ShapeError,
-     "rate: expected shape (2,), got (1,); return a tree like the state"),
-    (lambda: dp.stepper("radau", DECAY, 1.0)(np.array([1.0, np.nan]), 1.0), NonFiniteError,
-     "state of stepper(radau) must be finite, got 1 that are NaN or infinite, the first at 1"),
-    (lambda: dp.stepper("radau", lambda u, p: p * u**2, 2.0)(np.array([1.0]), 1.0), ConvergenceError,
-     "stepper(radau): Newton's method does not converge in a step of 2; "
-     "take a smaller dt, or give stepper a tolerance"),
-    (lambda: dp.stepper("radau", lambda u, p: p * u**2, 2.0, tolerance=1e-3)(np.array([1.0]), 1.0), ConvergenceError,
-     "stepper(radau) found no step that meets the tolerance 0.001 at 0.5"),
-    (lambda: dp.stepper("radau", lambda u, p: p * anp.log(u), 1.0, tolerance=1e-3)(np.array([0.0]), 1.0),
-     NonFiniteError, "the rate of stepper(radau) must be finite at the state given; take a state in its domain"),
-]  # fmt: skip
+    (
+        lambda: dp.stepper("radau", DECAY, 1.0, sparsity=np.eye(2)),
+        TypeError,
+        "radau does not use sparsity; leave it out",
+    ),
+    (lambda: dp.stepper("radau", DECAY, 1.0, solver="krylov"), TypeError, "radau does not use solver; leave it out"),
+    (
+        lambda: dp.stepper("radau", DECAY, 1.0)(np.ones(501), 1.0),
+        ShapeError,
+        "stepper(radau) solves full systems of at most 500 unknowns, got 501; take tr_bdf2",
+    ),
+    (
+        lambda: dp.stepper("radau", DECAY, 1.0)(ONES + 1j, 1.0),
+        TypeError,
+        "stepper(radau) solves for real unknowns; give real and imaginary part as two fields",
+    ),
+    (
+        lambda: dp.stepper("radau", DECAY, 1.0)(ONES, 1j),
+        TypeError,
+        "a rate of complex numbers needs a complex state, got float64; write u.astype(complex)",
+    ),
+    (
+        lambda: value_and_grad(lambda p: dp.stepper("radau", lambda u, p: -anp.abs(p) * u, 1.0)(ONES, p)[0])(1j),
+        DerivativeError,
+        "stepper(radau) has derivatives in real params; give real and imaginary part as two",
+    ),
+    (
+        lambda: value_and_grad(lambda k: dp.stepper("radau", lambda u, p: -k * u, 1.0)(ONES, None)[0])(1.0),
+        DerivativeError,
+        "the rate of stepper(radau) uses a traced value that is not an argument; put it into params",
+    ),
+    (
+        lambda: dp.stepper("radau", DECAY, 1.0, tolerance=1e-8)(np.ones(2, np.float32), 1.0),
+        ValueError,
+        "stepper(radau) cannot meet the tolerance 1e-08 with a state of float32, whose rounding is 1.2e-07; "
+        "take a larger tolerance or write u.astype(float)",
+    ),
+    (
+        lambda: dp.stepper("radau", DECAY, 1.0, jacobian=lambda u, p: np.eye(3))(ONES, 1.0),
+        ShapeError,
+        "the jacobian of stepper(radau) must have shape (2, 2), got (3, 3)",
+    ),
+    (
+        lambda: dp.stepper("radau", lambda u, p: u[:1], 1.0)(ONES, 1.0),
+        ShapeError,
+        "rate: expected shape (2,), got (1,); return a tree like the state",
+    ),
+    (
+        lambda: dp.stepper("radau", DECAY, 1.0)(np.array([1.0, np.nan]), 1.0),
+        NonFiniteError,
+        "state of stepper(radau) must be finite, got 1 that are NaN or infinite, the first at 1",
+    ),
+    (
+        lambda: dp.stepper("radau", lambda u, p: p * u**2, 2.0)(np.array([1.0]), 1.0),
+        ConvergenceError,
+        "stepper(radau): Newton's method does not converge in a step of 2; "
+        "take a smaller dt, or give stepper a tolerance",
+    ),
+    (
+        lambda: dp.stepper("radau", lambda u, p: p * u**2, 2.0, tolerance=1e-3)(np.array([1.0]), 1.0),
+        ConvergenceError,
+        "stepper(radau) found no step that meets the tolerance 0.001 at 0.5",
+    ),
+    (
+        lambda: dp.stepper("radau", lambda u, p: p * anp.log(u), 1.0, tolerance=1e-3)(np.array([0.0]), 1.0),
+        NonFiniteError,
+        "the rate of stepper(radau) must be finite at the state given; take a state in its domain",
+    ),
+]
 
 
 @pytest.mark.parametrize("act, kind, message", REFUSED)

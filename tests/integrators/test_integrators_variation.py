@@ -111,7 +111,7 @@ def test_long_runs_are_right_or_refused():
 @pytest.mark.slow
 @pytest.mark.parametrize("floor", [None, np.array([1e-6, 1e-11, 1e-2])])
 def test_species_far_below_the_floor(floor):
-    """What is left of A after 4e7 s is 5e-5, and B is 2e-10: a floor says so."""
+    """The remainder of A after 4e7 s is 5e-5, and B is 2e-10: a floor says so."""
     found = judge("Robertson", [1e-3, 1e-4, 1e-5], floor)
     assert floor is None or all(isinstance(error, float) for error in found)
 

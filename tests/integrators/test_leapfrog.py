@@ -1,4 +1,4 @@
-"""leapfrog and sponge: orders, energy, the way back, damping, echoes, derivatives, refusals."""
+"""leapfrog and sponge: orders, energy, the backward pass, damping, echoes, derivatives, refusals."""
 
 import tracemalloc
 
@@ -310,7 +310,7 @@ def test_a_way_back_that_loses_the_start_is_refused():
 
 @pytest.mark.parametrize("error", [0.0, pytest.param(1e-3, marks=pytest.mark.whole)])
 def test_reversed_steps_in_single_precision(error):
-    """Rounding of float32 is allowed for, and the gradient has its digits; a wrong way back is refused."""
+    """Rounding of float32 is allowed for, and the gradient has its digits; a wrong reverse step is refused."""
     grid = dp.Grid(24, size=1.0)
     D = dp.divergence(grid)
     G = dp.gradient(grid, dp.dirichlet)
@@ -341,7 +341,7 @@ def test_reversed_steps_in_single_precision(error):
 
 
 class Lossy:
-    """Steps whose way back is wrong in a small field beside a large one."""
+    """Steps whose reverse is wrong in a small field beside a large one."""
 
     def __call__(self, state, c):
         large, small = state

@@ -1,4 +1,4 @@
-"""Foreign code with branches: the other side is met later, and no Jacobian is handed out that a probe does not see."""
+"""Foreign code with branches: the other side is met later, and no Jacobian is returned that a probe does not see."""
 
 import numpy as np
 import pytest
@@ -225,7 +225,7 @@ def test_no_memory_is_no_branch_of_the_code(place):
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_never_a_wrong_number(seed):
-    """Random programs of branches, at random points: what is handed out agrees with dense differences."""
+    """Random programs of branches, at random points: the Jacobian agrees with dense differences."""
     rng = np.random.default_rng(seed)
     parts = [rng.choice([relu, upwind, sort, leader, distance, mixed, tiny_rows]) for _ in range(2)]
     f = lambda x: parts[1](parts[0](x))

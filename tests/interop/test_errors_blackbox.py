@@ -33,35 +33,40 @@ def second():
 
 WRONG = [
     (
-        lambda: dp.from_blackbox(3.0), TypeError,
+        lambda: dp.from_blackbox(3.0),
+        TypeError,
         r"from_blackbox takes a function, got float; write dp.from_blackbox\(lambda x: ...\)",
     ),
     (first(np.sin, derivative="exact"), ValueError, "derivative must be one of auto, complex, difference, got 'exact'"),
     (first(drifting), DerivativeError, "drifting gives two results for one argument; fix its random state first"),
     (first(np.sin, sparsity=np.eye(3)), ShapeError, r"the sparsity of sin must have shape \(2, 2\), got \(3, 3\)"),
     (
-        first(lambda x: x * x[::-1], sparsity=np.eye(2), name="swap"), DerivativeError,
+        first(lambda x: x * x[::-1], sparsity=np.eye(2), name="swap"),
+        DerivativeError,
         "the Jacobian of swap by complex step misses in row 0 what a difference along a random direction sees; its "
         "sparsity lacks entries, or it has a kink at x: leave sparsity and derivative out, or move x a little",
     ),
     (first(np.sin, (np.nan, 1.0)), NonFiniteError, "the argument of sin must be finite, got 1 that are NaN"),
     (first(lambda x: x / 0.0, name="f"), NonFiniteError, "f near x must be finite to be differentiated, got 2"),
     (
-        first(np.sqrt, (0.0, 1.0), derivative="difference"), NonFiniteError,
+        first(np.sqrt, (0.0, 1.0), derivative="difference"),
+        NonFiniteError,
         "what differences of sqrt close to x give must be finite, got .*; move x a little",
     ),
     (
-        first(lambda x: x * 1j, name="turn"), TypeError,
+        first(lambda x: x * 1j, name="turn"),
+        TypeError,
         "turn must return real numbers, got dtype complex128; take the real part",
     ),
     (other_shape, ShapeError, r"sin was adopted from \(2,\) to \(2,\), got \(3,\) to \(3,\); adopt it again"),
     (
-        second, DerivativeError,
+        second,
+        DerivativeError,
         "sin is adopted: its Jacobian is known, its second derivative is not; use a method with first "
         "derivatives, or write "
         "the function with autograd.numpy",
     ),
-]  # fmt: skip
+]
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -146,13 +146,13 @@ while True:
 WRITERS = {
     "network.save": "dp.network.save(path, {'w': np.arange(size) * 1.0})",
     "table.save": "dp.work_precision(lambda n: (lambda s: s**n, 1.0), {'a' * (size // 2): {}}, {'n': [2]}, repeats=1,"
-                  " scene='path').save(folder)",
+    " scene='path').save(folder)",
     "work_precision(file)": "dp.work_precision(lambda n: (lambda s: s**n, 1.0), {'a' * (size // 8): {}},"
-                            " {'n': [2, 3, 4]}, repeats=1, file=path)",
+    " {'n': [2, 3, 4]}, repeats=1, file=path)",
     "checkpoint": "dp.minimize(lambda x: (x**2).sum(), np.linspace(-1, 1, size), 'gd', maxiter=3, rate=0.1,"
-                  " tolerance=0, checkpoint=folder)",
+    " tolerance=0, checkpoint=folder)",
     "animate": "dp.animate(dp.Grid((size // 20, 9)), [np.eye(size // 20, 9)] * 3, path)",
-}  # fmt: skip
+}
 
 
 ALIKE = {"table.save", "animate", "work_precision(file)"}  # what they write goes the way of the others

@@ -60,25 +60,45 @@ def test_grid_alone_and_nothing_left_behind(tmp_path):
 
 
 REFUSED = {
-    "suffix": (lambda p: dp.save(p / "a.txt", GRID), ValueError,
-               "save takes a path that ends in .npz, .nc, .zarr, .vti, .vtr or .pvd, got 'a.txt'"),
-    "no suffix": (lambda p: dp.load(p / "a"), ValueError,
-                  "load takes a path that ends in .npz, .nc or .zarr, got 'a'; write "),
+    "suffix": (
+        lambda p: dp.save(p / "a.txt", GRID),
+        ValueError,
+        "save takes a path that ends in .npz, .nc, .zarr, .vti, .vtr or .pvd, got 'a.txt'",
+    ),
+    "no suffix": (
+        lambda p: dp.load(p / "a"),
+        ValueError,
+        "load takes a path that ends in .npz, .nc or .zarr, got 'a'; write ",
+    ),
     "no grid": (lambda p: dp.save(p / "a.npz", 3), TypeError, "save takes a Grid, got int; write dp.Grid"),
-    "shape": (lambda p: dp.save(p / "a.npz", GRID, u=np.ones(5)), dp.errors.ShapeError,
-              "u has shape .5,., which is no field on cells, .* of Grid.*; those on cells have .4, 3."),
-    "scalar": (lambda p: dp.save(p / "a.npz", GRID, u=1.0), dp.errors.ShapeError,
-               "u has shape .., which is no field"),
-    "times": (lambda p: dp.save(p / "a.npz", GRID, times=[0.0, 1.0], u=np.ones((3, 4, 3))), dp.errors.ShapeError,
-              "u has shape .3, 4, 3., and there are 2 times; write np.stack"),
+    "shape": (
+        lambda p: dp.save(p / "a.npz", GRID, u=np.ones(5)),
+        dp.errors.ShapeError,
+        "u has shape .5,., which is no field on cells, .* of Grid.*; those on cells have .4, 3.",
+    ),
+    "scalar": (lambda p: dp.save(p / "a.npz", GRID, u=1.0), dp.errors.ShapeError, "u has shape .., which is no field"),
+    "times": (
+        lambda p: dp.save(p / "a.npz", GRID, times=[0.0, 1.0], u=np.ones((3, 4, 3))),
+        dp.errors.ShapeError,
+        "u has shape .3, 4, 3., and there are 2 times; write np.stack",
+    ),
     "time": (lambda p: dp.save(p / "a.npz", GRID, times=0.0), dp.errors.ShapeError, "save takes times of shape "),
-    "strings": (lambda p: dp.save(p / "a.npz", GRID, u=np.full((4, 3), "a")), TypeError,
-                "save takes arrays of numbers, u is of type ndarray; write np.asarray.u., or dp.gather.u. on ranks"),
-    "masked": (lambda p: dp.save(p / "a.npz", GRID, u=np.ma.ones((4, 3))), TypeError,
-               "save takes plain arrays, got a masked"),
-    "function": (lambda p: dp.save(p / "a.npz", GRID, u=np.sin), TypeError,
-               "save takes arrays of numbers, u is of type uf"),
-}  # fmt: skip
+    "strings": (
+        lambda p: dp.save(p / "a.npz", GRID, u=np.full((4, 3), "a")),
+        TypeError,
+        "save takes arrays of numbers, u is of type ndarray; write np.asarray.u., or dp.gather.u. on ranks",
+    ),
+    "masked": (
+        lambda p: dp.save(p / "a.npz", GRID, u=np.ma.ones((4, 3))),
+        TypeError,
+        "save takes plain arrays, got a masked",
+    ),
+    "function": (
+        lambda p: dp.save(p / "a.npz", GRID, u=np.sin),
+        TypeError,
+        "save takes arrays of numbers, u is of type uf",
+    ),
+}
 
 
 @pytest.mark.parametrize("case", REFUSED)

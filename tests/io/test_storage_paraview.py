@@ -17,7 +17,7 @@ TYPES = {"Int": "i", "UInt": "u", "Float": "f"}
 
 
 def read(path):
-    """VTK file with raw data at its end -> attributes of the grid, and {part: {name: array, components first}}."""
+    """Return the attributes of the grid in a VTK file with raw data, and {part: {name: array, components first}}."""
     text, _, data = path.read_bytes().partition(b'<AppendedData encoding="raw">\n_')
     root = ElementTree.fromstring(text + b"</VTKFile>")
     parts: dict = {"Coordinates": {}, "PointData": {}, "CellData": {}}

@@ -131,7 +131,7 @@ def test_a_missing_neighbour_is_not_read_from_the_far_end(side):
 
 
 def record(matrix, diagonals):
-    """Sparse matrix -> Rows, with or without the diagonals."""
+    """Return the Rows of a sparse matrix, with or without the diagonals."""
     m = sp.csr_array(matrix)
     m.sum_duplicates()
     row = np.repeat(np.arange(m.shape[0]), np.diff(m.indptr))

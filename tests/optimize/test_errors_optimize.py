@@ -26,13 +26,14 @@ def back(inverse):
 
 WRONG = [
     (
-        run(batches=[1]), ValueError,
-        "lbfgs compares losses and cannot use batches; write "
-        "method='adam', or give gd a rate",
+        run(batches=[1]),
+        ValueError,
+        "lbfgs compares losses and cannot use batches; write method='adam', or give gd a rate",
     ),
     (run(method="gd", batches=[1]), ValueError, "gd compares losses and cannot use batches; write method='adam'"),
     (
-        run(method="adam", batches=3), TypeError,
+        run(method="adam", batches=3),
+        TypeError,
         "batches must be a list or a function of the iteration, got int; write list(batches)",
     ),
     (run(method="adam", batches=[]), ValueError, "batches is empty; leave it out, and the loss is called with x alone"),
@@ -43,72 +44,84 @@ WRONG = [
         "got 3; write (0.0, None) for x >= 0",
     ),
     (
-        run(bounds=(2.0, 1.0)), ValueError,
-        "bounds must be numbers with lower <= upper, got 2.0 and 1.0; write None for "
-        "a side without a bound",
+        run(bounds=(2.0, 1.0)),
+        ValueError,
+        "bounds must be numbers with lower <= upper, got 2.0 and 1.0; write None for a side without a bound",
     ),
     (
-        run(bounds=(np.inf, None)), ValueError,
-        "bounds must be numbers with lower <= upper, got inf and inf; write None for "
-        "a side without a bound",
+        run(bounds=(np.inf, None)),
+        ValueError,
+        "bounds must be numbers with lower <= upper, got inf and inf; write None for a side without a bound",
     ),
     (
-        run(bounds=(np.nan, 1.0)), ValueError,
-        "bounds must be numbers with lower <= upper, got nan and 1.0; write None for "
-        "a side without",
+        run(bounds=(np.nan, 1.0)),
+        ValueError,
+        "bounds must be numbers with lower <= upper, got nan and 1.0; write None for a side without",
     ),
     (
-        run(bounds=((np.zeros(2), 1.0), None)), ValueError,
+        run(bounds=((np.zeros(2), 1.0), None)),
+        ValueError,
         "bounds[0]: expected one array or number, got a tuple of length 2; "
         "write one number, None, or a tree like start",
     ),
     (
-        run(project=lambda x: (x, x), loss=lambda x: anp.sum(x[0] ** 2)), ShapeError,
+        run(project=lambda x: (x, x), loss=lambda x: anp.sum(x[0] ** 2)),
+        ShapeError,
         "project(x): expected one array or number, got a tuple of length 2; return a tree like start",
     ),
     (
-        run(project=lambda x: anp.clip(x, 0.5, 1.0)), ValueError,
+        run(project=lambda x: anp.clip(x, 0.5, 1.0)),
+        ValueError,
         "project must be a projection onto a linear or affine space, but it is not affine near the start; with other "
         "maps a search may stop where the loss has no minimum. Write bounds=(lower, upper) to keep x in a box",
     ),
     (
-        run(project=lambda x: x, bounds=(0.0, None)), ValueError,
+        run(project=lambda x: x, bounds=(0.0, None)),
+        ValueError,
         "project and bounds cannot be used together: a projected point may be outside of the bounds; leave one of "
         "them out",
     ),
     (
-        lambda: run(maxiter=0)().covariance, ValueError,
+        lambda: run(maxiter=0)().covariance,
+        ValueError,
         "the covariance is not known: only least-squares problems have one; return the residuals and write "
         "method='levenberg_marquardt'",
     ),
     (
-        run(lambda x: anp.sum((1e170 * x) ** 2), (1e-170,), "admm", weight=1e200), ValueError,
+        run(lambda x: anp.sum((1e170 * x) ** 2), (1e-170,), "admm", weight=1e200),
+        ValueError,
         "rho of admm, the weight divided by the size of K x, is inf here; rescale x or write rho=",
     ),
     (
-        run(method="newton_cg", inner=0), ValueError,
+        run(method="newton_cg", inner=0),
+        ValueError,
         "inner of newton_cg must be a whole number >= 1, got 0; the default is 200",
     ),
     (
-        run(method="newton_cg", gradient=lambda x: x), TypeError,
+        run(method="newton_cg", gradient=lambda x: x),
+        TypeError,
         "newton_cg differentiates the loss twice and does not use gradient; leave it out",
     ),
     (
-        run(lambda z: anp.sum(anp.abs(z - 1j) ** 2), (0.5j,), "newton_cg"), DerivativeError,
+        run(lambda z: anp.sum(anp.abs(z - 1j) ** 2), (0.5j,), "newton_cg"),
+        DerivativeError,
         "newton_cg takes real numbers, got complex ones; split them into two real arrays",
     ),
     (
-        run(method="levenberg_marquardt", damping=0), ValueError,
+        run(method="levenberg_marquardt", damping=0),
+        ValueError,
         "damping of levenberg_marquardt must be > 0, got 0; the default is 1e-3",
     ),
     (run(method="half_inverse", rate=0), ValueError, "rate of half_inverse must be > 0, got 0; the default is 1"),
     (
-        run(method="physical_gradient"), TypeError,
+        run(method="physical_gradient"),
+        TypeError,
         "physical_gradient needs physics and inverse; write minimize(loss_of_y, x, 'physical_gradient', physics=f, "
         "inverse=f_inverse)",
     ),
     (
-        run(method="gauss_newton"), DerivativeError,
+        run(method="gauss_newton"),
+        DerivativeError,
         "the outputs are one number; return the residuals as an array, do not sum them",
     ),
     (direction(power=2), ValueError, "power must be from 0 to 1, got 2; 0.75 gives half-inverse gradients"),
@@ -117,33 +130,38 @@ WRONG = [
     (direction(method="svd"), ValueError, "method must be one of auto, dense, krylov, got 'svd'"),
     (direction(rank=0), ValueError, "rank must be a whole number >= 1, got 0; leave it out for no limit"),
     (
-        direction(x=(1j, 1.0)), DerivativeError,
+        direction(x=(1j, 1.0)),
+        DerivativeError,
         "this method takes real numbers, got complex ones; split them into two real arrays",
     ),
     (
-        direction(g=np.ones(3)), ShapeError,
+        direction(g=np.ones(3)),
+        ShapeError,
         "the cotangent must have shape (2,), got (3,); give one like the outputs",
     ),
     (direction(lambda u: u * np.nan), NonFiniteError, "an output must be finite, got 2 that are NaN or infinite"),
     (
-        direction(g=np.array([1, np.nan])), NonFiniteError,
-        "the cotangent must be finite, got 1 that are NaN or "
-        "infinite",
+        direction(g=np.array([1, np.nan])),
+        NonFiniteError,
+        "the cotangent must be finite, got 1 that are NaN or infinite",
     ),
     (
-        direction(lambda u: anp.ones((6, 2)) @ anp.reshape(u, (-1, 2))[0], apart=True, method="dense"), ShapeError,
+        direction(lambda u: anp.ones((6, 2)) @ anp.reshape(u, (-1, 2))[0], apart=True, method="dense"),
+        ShapeError,
         "with apart=True every leaf of x gets a leading axis of 6 copies, one for each sample, and the outputs do not "
         "follow them; let the function broadcast over it",
     ),
     (
-        lambda: dp.physical_gradient(lambda x: x, lambda y, x: y, rate=0), ValueError,
+        lambda: dp.physical_gradient(lambda x: x, lambda y, x: y, rate=0),
+        ValueError,
         "rate of physical_gradient must be > 0, got 0; the default is 1",
     ),
     (
-        back(lambda y, x: y[:1]), ShapeError,
+        back(lambda y, x: y[:1]),
+        ShapeError,
         "x from the inverse of physical gradient must have shape (3,), got (1,)",
     ),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize("call, error, message", WRONG)

@@ -48,9 +48,13 @@ def test_starts_on_bounds_and_close_to_them(seed):
     loss = lambda x: 0.5 * anp.dot(x, anp.dot(matrix, x)) - anp.dot(linear, x)
     best = dp.minimize(loss, start, bounds=(lower, upper), maxiter=3000)
     known = minimize(
-        loss, start, jac=lambda x: matrix @ x - linear, bounds=list(zip(lower, upper)), method="L-BFGS-B",
+        loss,
+        start,
+        jac=lambda x: matrix @ x - linear,
+        bounds=list(zip(lower, upper)),
+        method="L-BFGS-B",
         options={"maxiter": 5000, "maxfun": 20000, "ftol": 1e-15, "gtol": 1e-10},
-    )  # fmt: skip
+    )
     assert best.converged and best.value <= known.fun + 1e-9 * abs(known.fun)
 
 
@@ -82,8 +86,9 @@ def test_bounds_at_all_scales(rng):
     for height, length in ((2.0**600, 1.0), (2.0**-600, 1.0), (1.0, 2.0**400), (2.0**-300, 2.0**-300)):
         scaled = dp.minimize(
             lambda x, height=height, length=length: height * valley(x / length),
-            length * start, bounds=(-1.5 * length, upper * length),
-        )  # fmt: skip
+            length * start,
+            bounds=(-1.5 * length, upper * length),
+        )
         assert np.array_equal(scaled.x / length, plain_run.x) and plain_run.converged
 
 
@@ -159,9 +164,15 @@ def projected_gradient(residuals, x, lower, upper):
 
 
 METHODS = [
-    ("gauss_newton", {}), ("gauss_newton", {"dense": False}), ("levenberg_marquardt", {}),
-    ("levenberg_marquardt", {"dense": False}), ("lbfgs", {}), ("newton_cg", {}), ("gd", {}), ("adam", {"rate": 0.02}),
-]  # fmt: skip
+    ("gauss_newton", {}),
+    ("gauss_newton", {"dense": False}),
+    ("levenberg_marquardt", {}),
+    ("levenberg_marquardt", {"dense": False}),
+    ("lbfgs", {}),
+    ("newton_cg", {}),
+    ("gd", {}),
+    ("adam", {"rate": 0.02}),
+]
 
 
 @pytest.mark.parametrize("method, options", METHODS)
@@ -172,13 +183,21 @@ def test_random_bounded_problems_end_where_scipy_does(method, options):
         residuals, lower, upper, start = bounded_problem(seed)
         half_square = lambda x, r=residuals: 0.5 * anp.sum(r(x) ** 2)
         best = dp.minimize(
-            residuals if squares else half_square, start, method, bounds=(lower, upper),
-            maxiter=400 if first_order else 200, **options,
-        )  # fmt: skip
+            residuals if squares else half_square,
+            start,
+            method,
+            bounds=(lower, upper),
+            maxiter=400 if first_order else 200,
+            **options,
+        )
         known = minimize(
-            half_square, start, jac=grad(half_square), bounds=np.c_[lower, upper], method="L-BFGS-B",
+            half_square,
+            start,
+            jac=grad(half_square),
+            bounds=np.c_[lower, upper],
+            method="L-BFGS-B",
             options={"maxiter": 2000, "ftol": 1e-15, "gtol": 1e-9},
-        )  # fmt: skip
+        )
         assert np.all((lower <= best.x) & (best.x <= upper))
         size = max(projected_gradient(residuals, start, lower, upper), 1e-3)
         if best.converged:

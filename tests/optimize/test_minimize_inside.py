@@ -93,9 +93,10 @@ def test_half_inverse_leaves_what_presses_against_a_bound():
 def test_bounds_as_trees_and_on_one_side():
     start = {"a": np.zeros(2), "b": 5.0, "n": 3}
     best = dp.minimize(
-        lambda x: anp.sum((x["a"] - 2.0) ** 2) + (x["b"] - 1.0) ** 2, start,
+        lambda x: anp.sum((x["a"] - 2.0) ** 2) + (x["b"] - 1.0) ** 2,
+        start,
         bounds=({"a": None, "b": 4.0, "n": None}, {"a": np.array([1.0, 9.0]), "b": None, "n": None}),
-    )  # fmt: skip
+    )
     assert np.allclose(best.x["a"], [1, 2]) and best.x["b"] == 4.0 and best.x["n"] == 3 and best.converged
     assert np.allclose(dp.minimize(lambda x: anp.sum(x**2), np.ones(3), "adam", bounds=(0.5, None), rate=0.1).x, 0.5)
     assert np.allclose(dp.minimize(lambda x: x - 2.0, np.zeros(3), "levenberg_marquardt", bounds=(None, 1.0)).x, 1.0)
@@ -153,7 +154,7 @@ def test_a_projection_that_is_not_affine_only_near_the_result_is_refused():
 
 @pytest.mark.parametrize("method", ["lbfgs", "gd", "newton_cg", "gauss_newton", "levenberg_marquardt"])
 def test_an_affine_projection_and_a_gradient_of_the_user(method):
-    """The gradient of the user is that of the loss; with project it was taken at x, and not projected."""
+    """The gradient of the user is the gradient of the loss; with project it was taken at x, and not projected."""
     target = np.array([1.0, 2.0, 6.0])
     mean_two = lambda x: x - anp.mean(x) + 2.0
     squares = method in ("gauss_newton", "levenberg_marquardt")

@@ -41,8 +41,9 @@ def test_residuals_of_any_magnitude(method, options, bounds):
             assert best.value == pytest.approx(np.float64(known.value) * factor * factor, rel=1e-6)
 
 
-@pytest.mark.parametrize("method, options", [*SQUARES, ("lbfgs", {}), ("gd", {}), ("gd", {"momentum": 0.5}),
-                                             ("newton_cg", {})])  # fmt: skip
+@pytest.mark.parametrize(
+    "method, options", [*SQUARES, ("lbfgs", {}), ("gd", {}), ("gd", {"momentum": 0.5}), ("newton_cg", {})]
+)
 @pytest.mark.parametrize("bounds", [None, 1.0])
 def test_unknowns_of_any_magnitude(method, options, bounds):
     """Also those whose quotients by the gradient, or whose squared Jacobian, are beyond the range of floats."""
@@ -50,9 +51,13 @@ def test_unknowns_of_any_magnitude(method, options, bounds):
 
     def run(size):
         return dp.minimize(
-            lambda x: misfit(x / size), size * np.array([0.1, 0.0, -0.2]), method,
-            bounds=bounds and (-bounds * size, bounds * size), maxiter=300, **options,
-        )  # fmt: skip
+            lambda x: misfit(x / size),
+            size * np.array([0.1, 0.0, -0.2]),
+            method,
+            bounds=bounds and (-bounds * size, bounds * size),
+            maxiter=300,
+            **options,
+        )
 
     known = run(1.0)
     assert known.converged
@@ -146,9 +151,14 @@ def test_one_batch_with_a_small_gradient_is_not_converged(as_function, resumed, 
 
     def run(maxiter, **more):
         return dp.minimize(
-            lambda x, weight: weight * anp.sum((x - target) ** 2), np.zeros(2), "gd", rate=0.3, batches=batches,
-            maxiter=maxiter, **more,
-        )  # fmt: skip
+            lambda x, weight: weight * anp.sum((x - target) ** 2),
+            np.zeros(2),
+            "gd",
+            rate=0.3,
+            batches=batches,
+            maxiter=maxiter,
+            **more,
+        )
 
     if resumed:
         assert not run(20, checkpoint=tmp_path).converged

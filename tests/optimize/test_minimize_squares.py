@@ -131,8 +131,9 @@ def test_covariance_where_it_is_not_known(rng):
     assert np.allclose(exact, np.linalg.inv(square.T @ square), rtol=1e-6)
     assert np.all(np.isinf(run(square[:3], lambda x: square[:3] @ x - 1.0, absolute_sigma=True).covariance))
     known = run(matrix).covariance
-    assert np.allclose(known, np.linalg.inv(matrix.T @ matrix) * least_squares(
-        lambda x: matrix @ x - data, np.zeros(3)).cost * 2 / 7)  # fmt: skip
+    assert np.allclose(
+        known, np.linalg.inv(matrix.T @ matrix) * least_squares(lambda x: matrix @ x - data, np.zeros(3)).cost * 2 / 7
+    )
     copies = lambda x: anp.sum(matrix * x, axis=-1) - data
     assert np.allclose(run(matrix, copies, apart=True).covariance, known)
 

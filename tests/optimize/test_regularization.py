@@ -147,9 +147,13 @@ def test_admm_of_complex_unknowns(rng):
     data = rng.normal(size=6) + 1j * rng.normal(size=6)
     for weight in (1.0, 12.0):
         best = dp.minimize(
-            lambda x: 0.5 * anp.sum(anp.abs(anp.dot(matrix, x) - data) ** 2), np.zeros(5, complex), "admm",
-            weight=weight, tolerance=1e-6, maxiter=500,
-        )  # fmt: skip
+            lambda x: 0.5 * anp.sum(anp.abs(anp.dot(matrix, x) - data) ** 2),
+            np.zeros(5, complex),
+            "admm",
+            weight=weight,
+            tolerance=1e-6,
+            maxiter=500,
+        )
         slope = matrix.conj().T @ (matrix @ best.x - data)
         zero = np.abs(best.x) < 1e-6
         assert best.converged

@@ -157,10 +157,19 @@ TREE = {"x": START, "n": 2, "word": "a", "none": None, "flag": True, "pair": (1.
 
 @pytest.mark.parametrize(
     "leaf",
-    [{"n": 3}, {"n": 2.0}, {"word": "b"}, {"none": 0}, {"flag": False}, {"pair": [1.0, np.arange(3)]},
-     {"pair": (1.0, np.arange(3) + 1)}, {"pair": (np.float64(1.0), np.arange(3))},
-     {"pair": (1.0, np.arange(3, dtype=np.int32))}, {"more": 1}],
-)  # fmt: skip
+    [
+        {"n": 3},
+        {"n": 2.0},
+        {"word": "b"},
+        {"none": 0},
+        {"flag": False},
+        {"pair": [1.0, np.arange(3)]},
+        {"pair": (1.0, np.arange(3) + 1)},
+        {"pair": (np.float64(1.0), np.arange(3))},
+        {"pair": (1.0, np.arange(3, dtype=np.int32))},
+        {"more": 1},
+    ],
+)
 def test_another_leaf_that_is_not_an_unknown_is_refused(tmp_path, leaf):
     """Also where the loss at the start is the same: it is asked for the unknowns alone."""
     loss = lambda tree: valley(tree["x"]) + tree["pair"][0] ** 2
@@ -177,9 +186,14 @@ def test_the_order_of_names_is_part_of_the_start(tmp_path):
 BATCHES = [np.full(1, 1e-3 * i) for i in range(5)]
 
 
-@pytest.mark.parametrize("given", [
-    [BATCHES[0], BATCHES[1], BATCHES[1], BATCHES[3], BATCHES[4]], BATCHES[:2], lambda i: BATCHES[(2 * i) % 5],
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "given",
+    [
+        [BATCHES[0], BATCHES[1], BATCHES[1], BATCHES[3], BATCHES[4]],
+        BATCHES[:2],
+        lambda i: BATCHES[(2 * i) % 5],
+    ],
+)
 @pytest.mark.parametrize("begun", [BATCHES, lambda i: BATCHES[i % 5]])
 def test_other_batches_are_refused(tmp_path, begun, given):
     run = {"loss": residuals, "start": START, "method": "half_inverse", "rate": 0.1}
@@ -225,9 +239,16 @@ def test_a_loss_that_is_another_one_away_from_the_start(tmp_path):
 def test_functions_among_the_options_do_not_hinder_the_next_process(tmp_path):
     """They have no address in the folder."""
     run = lambda maxiter, **more: dp.minimize(
-        lambda y: anp.sum((y - 2.0) ** 2), START, "physical_gradient", maxiter, 0, rate=0.3,
-        physics=lambda x: 2 * x, inverse=lambda y, x: y / 2, **more,
-    )  # fmt: skip
+        lambda y: anp.sum((y - 2.0) ** 2),
+        START,
+        "physical_gradient",
+        maxiter,
+        0,
+        rate=0.3,
+        physics=lambda x: 2 * x,
+        inverse=lambda y, x: y / 2,
+        **more,
+    )
     run(3, checkpoint=tmp_path)
     assert same(run(6, checkpoint=tmp_path), run(6))
 
@@ -298,7 +319,7 @@ def newest(folder):
 
 
 def killed_on_its_way(run, folder, delay):
-    """Whether kill -9, so many seconds after the first new state, came before the end of the run."""
+    """Whether kill -9, n seconds after the first new state, came before the end of the run."""
     process = subprocess.Popen(run)
     before = newest(folder)
     while process.poll() is None and newest(folder) == before:
@@ -366,8 +387,10 @@ def test_an_interrupted_run_returns_its_best_point_and_can_go_on(tmp_path):
     last = newest(tmp_path / "parts")  # one less where the signal came before an iteration was written down
     assert 11 <= int(many) < 150 and last in (int(many) - 2, int(many) - 1)
     assert float(value) < valley(np.linspace(-1.2, 1.0, 60))
-    again, whole = (dp.minimize(valley, np.linspace(-1.2, 1.0, 60), maxiter=150, tolerance=0, checkpoint=folder)
-                    for folder in (tmp_path / "parts", None))  # fmt: skip
+    again, whole = (
+        dp.minimize(valley, np.linspace(-1.2, 1.0, 60), maxiter=150, tolerance=0, checkpoint=folder)
+        for folder in (tmp_path / "parts", None)
+    )
     assert again.resumed.startswith(f"resumed from iteration {last} in") and same(again, whole)
 
 

@@ -14,7 +14,7 @@ SHAPES = [(12, 30), (30, 12), (9, 9), (1, 5), (5, 1)]
 
 
 def jacobian(rng, shape, decades=3):
-    """A matrix with singular values over so many decades."""
+    """Return a matrix whose singular values span n decades."""
     u, _, v = np.linalg.svd(rng.standard_normal(shape), full_matrices=False)
     return u * np.logspace(0, -decades, min(shape)) @ v
 
@@ -288,7 +288,10 @@ def test_damped_steps_of_unknowns_of_any_magnitude(method, exponent, rng):
     data = rng.standard_normal(6)
     factor = 2.0**exponent
     run = lambda factor: dp.update_direction(
-        lambda x: anp.dot(matrix, x / factor) - data, factor * np.ones(4), method=method, power=1.0,
+        lambda x: anp.dot(matrix, x / factor) - data,
+        factor * np.ones(4),
+        method=method,
+        power=1.0,
         damping=0.25 / factor / factor,
-    )  # fmt: skip
+    )
     assert np.allclose(run(factor).step, factor * run(1.0).step, rtol=1e-9)

@@ -226,7 +226,7 @@ def test_an_error_names_the_scene(kind, make):
 
 
 class Stopped(Reversed):
-    """Somebody presses Ctrl-C before anything is done."""
+    """Ctrl-C is pressed before the first scene."""
 
     def all_done(self):
         raise KeyboardInterrupt

@@ -1,4 +1,4 @@
-"""What is refused on ranks, and what one process is told: every message of parallel/."""
+"""Errors on ranks and in one process: every message of parallel/."""
 
 import pickle
 import sys
@@ -181,7 +181,7 @@ def test_what_gather_does_not_take():
         dp.gather([np.ones(3), np.ones(2)])
 
 
-# ------------------------------------------------------------ what one of several ranks raises
+# ------------------------------------------------------------ errors of one rank among several
 
 PLANTED = {
     "clock: TypeError": "work_precision repeats runs by the clock, which no two ranks share; run it on one process",

@@ -11,7 +11,7 @@ import sparsedp as dp
 
 PARTS = 6  # of the table of transport
 pytestmark = pytest.mark.xdist_group("ranks")  # several processes at a time are enough
-run = cache(printed)  # what one test has run, another one need not run again
+run = cache(printed)  # a run serves several tests
 FUNCTIONS = "cannot be cut for ranks, for no rank knows its rows; make it of operators of the grid or of a matrix"
 
 
@@ -92,8 +92,9 @@ def test_a_run_goes_on_where_another_number_of_ranks_left_it(tmp_path, first, th
     for folder in (kept, whole):
         folder.mkdir()
     runs = [(first, kept, 3), (then, kept, 6), (then, whole, 6), (then, whole, 6)]
-    _, resumed, once, again = [[line.split(None, 3) for line in printed("resumes.py", n, str(f), str(k)).splitlines()]
-                               for n, f, k in runs]  # fmt: skip
+    _, resumed, once, again = [
+        [line.split(None, 3) for line in printed("resumes.py", n, str(f), str(k)).splitlines()] for n, f, k in runs
+    ]
     for there, here in zip(resumed, [*once[:2], again[2]], strict=True):
         assert float(there[1]) == pytest.approx(float(here[1]), rel=1e-6)
         assert there[2] == here[2] or first != then and (there[0] != "steps" or 1 in (first, then))

@@ -119,7 +119,9 @@ FAULTS = {
     "NaN in one block of a state": (dp.errors.NonFiniteError, "rollout", lambda: rollout(heat, poked(np.nan))),
     "singular": (dp.errors.IncompatibleError, "is singular", lambda: dp.inverse(WALL)(1.0 + U)),
     "no convergence": (
-        dp.errors.ConvergenceError, "petsc on", lambda: dp.inverse(-laplacian(), rtol=1e-13, maxiter=1)(U)
+        dp.errors.ConvergenceError,
+        "petsc on",
+        lambda: dp.inverse(-laplacian(), rtol=1e-13, maxiter=1)(U),
     ),
     "shape": (dp.errors.ShapeError, "on rank", lambda: laplacian()(here(U, np.zeros(3)))),
     "dtype": (TypeError, "on rank", lambda: laplacian()(here(U, U.astype(str)))),
@@ -127,15 +129,20 @@ FAULTS = {
     "matrix": (MemoryError, "on rank", within(cut._Cut, "explicit", MemoryError(), lambda: dp.inverse(STEP))),
     "kernel": (MemoryError, "on rank", within(cut._Cut, "product", MemoryError(), lambda: laplacian()(FIELD))),
     "kernel in a product": (
-        FloatingPointError, "overflow",
+        FloatingPointError,
+        "overflow",
         within(cut._Cut, "product", FloatingPointError("overflow"), lambda: (laplacian() @ STEP)(FIELD)),
     ),
     "kernel in a gradient": (
-        MemoryError, "no room", within(cut._Cut, "product", MemoryError("no room"), lambda: dp.grad(misfit)(FIELD))
+        MemoryError,
+        "no room",
+        within(cut._Cut, "product", MemoryError("no room"), lambda: dp.grad(misfit)(FIELD)),
     ),
     "engine": (RuntimeError, "no", within(solve.PetscEngine, "solve", RuntimeError("no"), lambda: dp.inverse(STEP)(U))),
     "adjoint": (
-        RuntimeError, "no", within(solve.PetscEngine, "solve", RuntimeError("no"), lambda: dp.inverse(STEP).T(U))
+        RuntimeError,
+        "no",
+        within(solve.PetscEngine, "solve", RuntimeError("no"), lambda: dp.inverse(STEP).T(U)),
     ),
     "set-up": (MemoryError, "PETSc", within(solve, "assembled", MemoryError("PETSc"), lambda: dp.inverse(STEP))),
     "loss": (ZeroDivisionError, "of one rank", lambda: dp.value_and_grad(lambda u: fails() + misfit(u))(FIELD)),
@@ -145,45 +152,54 @@ FAULTS = {
     "step": (ZeroDivisionError, "of one rank", lambda: rollout(lambda u, k: heat(u, k) + fails())),
     "step, before": (Exception, "1 and 2", lambda: rollout(lambda u, k: fails(Shy(1, 2)) + heat(u, k))),
     "step, its gradient": (
-        KeyError, "of one rank",
+        KeyError,
+        "of one rank",
         lambda: dp.grad(lambda u: anp.sum(rollout(lambda u, k: heat(u, k) + fails(KeyError("of one rank")), u)))(FIELD),
     ),
     "callback": (
-        ZeroDivisionError, "of one rank",
+        ZeroDivisionError,
+        "of one rank",
         lambda: dp.minimize(misfit, U, maxiter=3, callback=lambda *_: fails()),
     ),
     "loss of minimize, later": (
-        ZeroDivisionError, "of one rank",
+        ZeroDivisionError,
+        "of one rank",
         lambda: dp.minimize(counted(lambda u, n: misfit(u) + (fails() if n > 2 else 0.0)), U, maxiter=5),
     ),
     "argument": (ValueError, "argument 0['k'] of the loss is not the same", lambda: seen({"k": here(0.5, 0.7)})),
     "argument, one entry": (
-        ValueError, "argument 0['k'] of the loss is not the same on rank",
+        ValueError,
+        "argument 0['k'] of the loss is not the same on rank",
         lambda: seen({"k": np.where(U == U[3, 3], here(0.0, 1.0), U)}),
     ),
     "random numbers": (
-        ValueError, "an array of shape (12, 10) beside a field on ranks is not the same",
+        ValueError,
+        "an array of shape (12, 10) beside a field on ranks is not the same",
         lambda: dp.value_and_grad(lambda u: misfit(u + RUNS.standard_normal(PLAIN.shape)))(FIELD),
     ),
     "a random number": (
-        ValueError, "a number beside a field on ranks is not the same on rank", lambda: np.sum(FIELD * RUNS.random())
+        ValueError,
+        "a number beside a field on ranks is not the same on rank",
+        lambda: np.sum(FIELD * RUNS.random()),
     ),
     "loss of one rank": (
-        ValueError, "the result[0] of the loss is not the same on rank",
+        ValueError,
+        "the result[0] of the loss is not the same on rank",
         lambda: dp.value_and_grad(lambda u: misfit(u) + RUNS.random())(FIELD),
     ),
     "operator of one rank": (
-        ValueError, "is not the same on rank", lambda: dp.diagonal(GRID.cells, RUNS.random(PLAIN.shape))(FIELD)
+        ValueError,
+        "is not the same on rank",
+        lambda: dp.diagonal(GRID.cells, RUNS.random(PLAIN.shape))(FIELD),
     ),
     "kernel, caught by its rank": (
-        ValueError, "came to an error in laplacian where",
+        ValueError,
+        "came to an error in laplacian where",
         within(cut._Cut, "product", MemoryError(), lambda: dp.grad(caught)(FIELD)),
     ),
     "clock": (TypeError, "by the clock", lambda: dp.work_precision(lambda: (misfit, U), [{}])),
-    "another way": (
-        ValueError, "let nothing depend on the number of the rank", lambda: here(np.sum, np.max)(FIELD)
-    ),
-}  # fmt: skip
+    "another way": (ValueError, "let nothing depend on the number of the rank", lambda: here(np.sum, np.max)(FIELD)),
+}
 
 
 def counted(loss):

@@ -191,7 +191,9 @@ def errors_are_the_same_on_all_ranks():
     L = dp.laplacian(grid)
     refused(dp.errors.UnstableStepError, "planted", lambda: dp.implicit(narrow)(3 * one, 2.0))
     solve = dp.implicit(narrow)
-    close(solve(0.1 * one, 2.0), np.full(grid.shape, 2**0.5), 1e-12, "a search on all ranks for what one refuses")
+    close(
+        solve(0.1 * one, 2.0), np.full(grid.shape, 2**0.5), 1e-12, "a search on all ranks for a point that one refuses"
+    )
     assert solve.info.forward.iterations > 3
     hole = np.ones(grid.shape)
     hole[-1, -1] = np.nan

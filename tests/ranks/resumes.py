@@ -1,4 +1,4 @@
-"""A run of minimize that was begun on another number of ranks: so many iterations of it, to and from a folder.
+"""A run of minimize that was begun on another number of ranks: n iterations of it, to and from a folder.
 
     mpirun -n 2 python -m mpi4py tests/ranks/resumes.py FOLDER 8
 

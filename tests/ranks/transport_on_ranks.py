@@ -38,7 +38,7 @@ SOME += [(PLANE, SCHEMES[6], "faces", "faces", False), (LINE, SCHEMES[7], "cells
 
 
 def on_ranks(space, grid):
-    """A plain array -> a field of this kind on a grid on ranks."""
+    """Return a plain array as a field of this kind on a grid on ranks."""
     return dp.identity(getattr(grid, space.kind))
 
 

@@ -1,4 +1,4 @@
-"""What a function uses beside its arguments, and what changes before the way back: refused, never a wrong number."""
+"""What a function reads beside its arguments, and changes before the backward pass: refused, never a wrong number."""
 
 from collections import OrderedDict, defaultdict
 

@@ -65,8 +65,9 @@ def scene(tmp_path):
     return path
 
 
-@pytest.mark.parametrize("name, code, word", [("loss", 0, "agrees"), ("wrong", 1, "disagrees"),
-                                              ("kinked", 3, "inconclusive")])  # fmt: skip
+@pytest.mark.parametrize(
+    "name, code, word", [("loss", 0, "agrees"), ("wrong", 1, "disagrees"), ("kinked", 3, "inconclusive")]
+)
 def test_check(scene, capsys, name, code, word):
     assert main(["check", f"{scene}:{name}"]) == code
     printed = capsys.readouterr()
@@ -80,16 +81,20 @@ def test_check_at_another_point(scene, capsys):
 
 
 STRANGERS = {
-    "without a guard": ("grid = dp.Grid(9, size=1.0)\nstart = np.ones(9)\nL = dp.laplacian(grid, dp.dirichlet)\n"
-                        "loss = lambda u: np.sum(L(u) ** 2)\nprint(dp.minimize(loss, start, maxiter=2))",
-                        "", 0, "agrees"),
+    "without a guard": (
+        "grid = dp.Grid(9, size=1.0)\nstart = np.ones(9)\nL = dp.laplacian(grid, dp.dirichlet)\n"
+        "loss = lambda u: np.sum(L(u) ** 2)\nprint(dp.minimize(loss, start, maxiter=2))",
+        "",
+        0,
+        "agrees",
+    ),
     "a tuple as the point": ("start = (np.ones(3), 2.0)\nloss = lambda p: np.sum(p[0] ** 3) * p[1]", "", 0, "agrees"),
     "two arguments": ("x = (np.ones(3), 2.0)\ndef energy(u, k):\n    return k * np.sum(u**3)", ":energy", 0, "agrees"),
     "one that prints": ("x = np.ones(3)\ndef loss(u):\n    print('here')\n    return np.sum(u**3)", "", 0, "agrees"),
     "a constant": ("x = np.ones(3)\nloss = lambda u: 0 * np.sum(u)", "", 3, "constant to rounding"),
     "no function": ("x = np.ones(3)", "", 2, ""),
     "no Python": ("def loss(x)\n    return x", "", 2, ""),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("kind", STRANGERS)
@@ -121,8 +126,9 @@ def test_the_report(scene, tmp_path, capsys):
     table = (out / "point_load.md").read_text(encoding="utf-8")
     assert "| method | cells | unknowns |" in table and "| * |" in table  # the settings that tell rows apart
     names = {path.name for path in out.iterdir()}
-    assert names >= {f"{name}.{kind}" for name in ("audit", "plan", "certificate", "stress", "point_load")
-                     for kind in ("md", "csv")}  # fmt: skip
+    assert names >= {
+        f"{name}.{kind}" for name in ("audit", "plan", "certificate", "stress", "point_load") for kind in ("md", "csv")
+    }
     drawn = {"audit.png", "point_load.png"} if importlib.util.find_spec("matplotlib") else set()
     assert {path.name for path in out.glob("*.png")} == drawn
     for path in out.glob("*.csv"):
@@ -252,7 +258,7 @@ def loss(u):
 
 @pytest.fixture
 def ending(tmp_path, monkeypatch):
-    """Write a file with a statement in its loss, from the evaluation after so many on, or at the top."""
+    """Write a file with a statement in its loss, from the evaluation after n others on, or at the top."""
     monkeypatch.chdir(tmp_path)
 
     def write(end="pass", after=0, top=""):
@@ -373,7 +379,7 @@ def test_ctrl_c_in_the_demo(tmp_path):
 
 
 def interrupted(folder, word, *arguments):
-    """A command that gets the signal of Ctrl-C once a line begins with a word -> (exit code, stdout, stderr)."""
+    """Send Ctrl-C to a command once a line begins with a word; return (exit code, stdout, stderr)."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
     command = [sys.executable, "-m", "sparsedp", *arguments]
     stream = "stdout" if arguments[0] == "demo" else "stderr"

@@ -20,27 +20,36 @@ def no_module(name):
     return f"ModuleNotFoundError: No module named '{name}'"
 
 
-@pytest.mark.parametrize("wrong, told", [
-    (no_module("mpi4py"), "python -m pip install mpi4py"),
-    (no_module("petsc4py"), "apt-get install -y --no-install-recommends python3-petsc4py && ls -d /usr/lib/petscdir/*/"
-     f"*-real/lib/python3/dist-packages > {get_path('purelib')}/petsc.pth (not on Debian: conda install -c conda-forge "
-     "petsc4py)"),
-    ("No such file or directory: 'mpirun'", "apt-get install -y --no-install-recommends openmpi-bin"),
-    (ROOT_USER, "export OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1"),
-    (NUMPY, 'python -m pip install "numpy<2"'),
-    (OTHER_MPI, "python -m pip install --force-reinstall --no-binary mpi4py mpi4py"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "wrong, told",
+    [
+        (no_module("mpi4py"), "python -m pip install mpi4py"),
+        (
+            no_module("petsc4py"),
+            "apt-get install -y --no-install-recommends python3-petsc4py && ls -d /usr/lib/petscdir/*/"
+            f"*-real/lib/python3/dist-packages > {get_path('purelib')}/petsc.pth (not on Debian: conda install -c conda-forge "
+            "petsc4py)",
+        ),
+        ("No such file or directory: 'mpirun'", "apt-get install -y --no-install-recommends openmpi-bin"),
+        (ROOT_USER, "export OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1"),
+        (NUMPY, 'python -m pip install "numpy<2"'),
+        (OTHER_MPI, "python -m pip install --force-reinstall --no-binary mpi4py mpi4py"),
+    ],
+)
 def test_what_is_missing_or_wrong_is_named_with_a_command(wrong, told, monkeypatch, capsys):
     monkeypatch.setattr(selftest, "run", lambda command: (["found"], wrong))
     assert main(["ranks"]) == 1
     assert capsys.readouterr().out.splitlines() == ["found", f"{wrong}; write {told}", "ranks do not work here"]
 
 
-@pytest.mark.parametrize("said, told", [
-    (f"-----\n{ROOT_USER}\n\nRunning as root is discouraged", ROOT_USER),
-    (f"Traceback\n  File numpy.py\n{NUMPY}\n--\nMPI_ABORT", NUMPY),
-    ("", "exit code 1"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "said, told",
+    [
+        (f"-----\n{ROOT_USER}\n\nRunning as root is discouraged", ROOT_USER),
+        (f"Traceback\n  File numpy.py\n{NUMPY}\n--\nMPI_ABORT", NUMPY),
+        ("", "exit code 1"),
+    ],
+)
 def test_what_fails_is_told_in_one_line(said, told):
     script = f"import sys; print('Python'); sys.stderr.write({said!r}); sys.exit(1)"
     assert selftest.run([sys.executable, "-c", script]) == (["Python"], told)

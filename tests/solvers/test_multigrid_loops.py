@@ -34,14 +34,14 @@ def engine_of(shape, periodic, rng):
 
 
 def matrix_of(function, rows, columns):
-    """A linear function of fields in natural order -> its matrix."""
+    """Return the matrix of a linear function of fields in natural order."""
     return np.stack([function(unit.reshape(columns)).reshape(-1) for unit in np.eye(np.prod(columns))], axis=1).reshape(
         np.prod(rows), np.prod(columns)
     )
 
 
 def dense(level, extras=True):
-    """Level -> its matrix."""
+    """Return the matrix of a level."""
     cells = level.grid.cells
     number = np.arange(cells(level.extra).size).reshape(level.grid.shape)
     matrix = np.diag(cells(level.extra).reshape(-1)) if extras else np.zeros((number.size,) * 2)

@@ -58,7 +58,7 @@ def test_neumann_defects(grid, method, defect, rng):
 
 @EVERY
 def test_data_that_are_almost_only_null_space(method, rng):
-    """What is left after the projection has to be compatible to its own digits."""
+    """The right-hand side after the projection has to be compatible to its own digits."""
     op = neumann(stretched(20, 22))
     inv = dp.inverse(op, method, nullspace="project")
     b = 1.0 + 1e-11 * rng.standard_normal(op.domain.shape)

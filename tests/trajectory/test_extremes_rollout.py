@@ -8,9 +8,21 @@ import numpy as np
 import pytest
 
 from extremes import (  # isort: skip
-    GEOMETRIES, KINDS, OPTIONS, agree, check_gradient_of_kind, check_kind, coefficient, dense, exact, neumann,
-    projection, same_bits, stretched, walled,
-)  # fmt: skip
+    GEOMETRIES,
+    KINDS,
+    OPTIONS,
+    agree,
+    check_gradient_of_kind,
+    check_kind,
+    coefficient,
+    dense,
+    exact,
+    neumann,
+    projection,
+    same_bits,
+    stretched,
+    walled,
+)
 
 import sparsedp as dp
 from sparsedp.autodiff.derivative import pullback
@@ -36,13 +48,13 @@ SCENES = {
     "implicit diffusion": (dp.inverse(IMPLICIT), GRID.shape, exact(IMPLICIT)),
     "projection": (dp.projection(GRID), (GRID.faces.size,), projection("direct", GRID).matrix),
     "singular solves": (half_closed, (GRID.faces.size,), (dense(INSIDE) + projection("direct", GRID).matrix) / 2),
-}  # fmt: skip
+}
 IN_SCENES = pytest.mark.parametrize("scene", SCENES)
 FEW = pytest.mark.parametrize("few", [False, True])
 
 
 def loop(scene, few=False):
-    """(field -> field after some steps, shape, dense matrix). `few`: with room for two states beside those at work."""
+    """Return (rollout of some steps, shape, dense matrix). `few`: with memory for two more states."""
     step, shape, matrix = SCENES[scene]
     memory = 48 * int(np.prod(shape)) + 16 if few else None
     run = lambda u: dp.rollout(lambda u, _: 0.9 * step(u), u, None, STEPS, memory=memory)

@@ -99,7 +99,7 @@ def test_refused_or_right(name, keep):
 @pytest.mark.parametrize("keep", KEEPS)
 @pytest.mark.parametrize("name", ["pure", "counter", "once, much later", "cancels", "cancels, later"])
 def test_tangents_and_second_derivatives_are_refused_or_right(name, keep):
-    """The run that carries the tangents must go through what was handed out."""
+    """The run that carries the tangents must pass through the returned states."""
     slope = lambda f: lambda p: dp.value_and_grad(f)(p)[1]
     ways = {
         "forward": lambda f: pushforward(f, 1.3, 1.0)[1],

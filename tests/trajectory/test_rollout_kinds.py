@@ -358,7 +358,7 @@ def test_jvp_needs_no_kept_state():
 
 @pytest.mark.parametrize("memory", [136, None])
 def test_nothing_is_left_behind(memory):
-    """Without the cycle collector, everything is gone once the gradient is there."""
+    """Without the cycle collector, all records are freed once the gradient is computed."""
 
     class Step:
         def __call__(self, u, p):

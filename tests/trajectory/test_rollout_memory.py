@@ -204,7 +204,7 @@ def test_the_budget_is_what_a_step_without_needs_of_its_own_takes(states, params
     u = rng.random(size // 8)
     v = rng.random(u.shape)
     weights = np.cos(u)
-    for given in (u, v, weights):  # nobody writes into them: the tape of the loss keeps no copies beside the rollout
+    for given in (u, v, weights):  # they are read-only: the tape of the loss keeps no copies beside the rollout
         given.flags.writeable = False
     step = SCALED
     runs = []

@@ -62,7 +62,7 @@ def constant_part(x):
 
 @dataclass(frozen=True)
 class Linear(Ingredient):
-    """u -> keep u + A(u), where A is an expression, scaled to size 1."""
+    """Map u to keep u + A(u), where A is an expression, scaled to size 1."""
 
     expression: tuple
     keep: float
@@ -87,7 +87,7 @@ class Linear(Ingredient):
 
 @dataclass(frozen=True)
 class WallValues(OnCells):
-    """u -> u + D(G(u) + B(values)) / scale, values given on the walls."""
+    """Map u to u + D(G(u) + B(values)) / scale, values given on the walls."""
 
     sides: tuple
     seed: int
@@ -123,7 +123,7 @@ class WallValues(OnCells):
 
 @dataclass(frozen=True)
 class Solve(Ingredient):
-    """u -> the solution x of A x = u, or of the transposed system, scaled to size 1."""
+    """Map u to the solution x of A x = u, or of the transposed system, scaled to size 1."""
 
     expression: tuple
     shift: float
@@ -181,7 +181,7 @@ def inverse_without_mean(system, volumes):
 
 @dataclass(frozen=True)
 class Elliptic(OnCells):
-    """u -> x of (shift - D diag(k) G) x = u; k on faces from a field on cells, on faces, or one number."""
+    """Map u to x of (shift - D diag(k) G) x = u; k on faces from a field on cells, on faces, or one number."""
 
     sides: tuple
     solid: int | None
@@ -276,7 +276,7 @@ def face_neighbours(table):
 
 @dataclass(frozen=True)
 class Entries(OnCells):
-    """u -> x of A x = u, where the entries of A on a given pattern are parameters."""
+    """Map u to x of A x = u, where the entries of A on a given pattern are parameters."""
 
     seed: int
     method: str
@@ -417,7 +417,7 @@ class BlackBox(OnCells):
 
 @dataclass(frozen=True)
 class Diffusion(OnCells):
-    """u -> u + D((1 + sin(A(u))^2) k G(u)) / scale."""
+    """Map u to u + D((1 + sin(A(u))^2) k G(u)) / scale."""
 
     sides: tuple
     solid: int | None
@@ -527,7 +527,7 @@ class Transport(Ingredient):
 
 @dataclass(frozen=True)
 class Convection(Ingredient):
-    """v -> v - dt div(w v), with w a parameter or v itself."""
+    """Map v to v - dt div(w v), with w a parameter or v itself."""
 
     sides: tuple
     solid: int | None
@@ -602,7 +602,7 @@ def at_index(place, axis, index):
 def mean_of_two(table, axis, node, component, place, units):
     """Return the weights of faces of a component whose linear interpolation along an axis is taken at a node.
 
-    Beyond a wall the value is 0 (no_slip) or that of the last cell (free_slip).
+    Beyond a wall the value is 0 (no_slip) or the value of the last cell (free_slip).
     """
     cells = table.shape[axis]
     widths = table.h[axis]
@@ -758,11 +758,13 @@ def etdrk4(equation, u, h):
 def radau(equation, u, h):
     """Three stages U_i = u + h sum of a_ij f(U_j), the last of which is the new state (Hairer and Wanner)."""
     root = np.sqrt(6.0)
-    weights = np.array([
-        [(88 - 7 * root) / 360, (296 - 169 * root) / 1800, (-2 + 3 * root) / 225],
-        [(296 + 169 * root) / 1800, (88 + 7 * root) / 360, (-2 - 3 * root) / 225],
-        [(16 - root) / 36, (16 + root) / 36, 1 / 9],
-    ])  # fmt: skip
+    weights = np.array(
+        [
+            [(88 - 7 * root) / 360, (296 - 169 * root) / 1800, (-2 + 3 * root) / 225],
+            [(296 + 169 * root) / 1800, (88 + 7 * root) / 360, (-2 - 3 * root) / 225],
+            [(16 - root) / 36, (16 + root) / 36, 1 / 9],
+        ]
+    )
     size = len(equation.A)
 
     def residual(stages, of):
@@ -805,7 +807,7 @@ def reaction(u, p):
 
 @dataclass(frozen=True)
 class TimeStep(OnCells):
-    """u -> the state after one step of u' = nu L u + r u - u^3 + f."""
+    """Map u to the state after one step of u' = nu L u + r u - u^3 + f."""
 
     method: str
     sides: tuple
@@ -871,7 +873,7 @@ def viscosity_of(p):
 
 @dataclass(frozen=True)
 class Root(OnCells):
-    """u -> x of x - nu L x + r x^3 = u, by `implicit` or `steady`."""
+    """Map u to x of x - nu L x + r x^3 = u, by `implicit` or `steady`."""
 
     sides: tuple
     entry: str  # "implicit" or "steady"
@@ -925,7 +927,7 @@ class Root(OnCells):
 
 @dataclass(frozen=True)
 class Sum(Ingredient):
-    """u -> a weighted sum of two ingredients of the same field, or one times the sine of the other."""
+    """Map u to a weighted sum of two ingredients of the same field, or one times the sine of the other."""
 
     one: Ingredient
     other: Ingredient
@@ -990,7 +992,7 @@ def part_of(p, prefix):
 
 @dataclass(frozen=True)
 class Rollout(Ingredient):
-    """u -> the state after n steps, each a chain of ingredients with the same parameters."""
+    """Map u to the state after n steps, each a chain of ingredients with the same parameters."""
 
     chain: tuple
     n: int

@@ -103,7 +103,7 @@ def largest_water_speed(u, p, axis):
 
 @dataclass(frozen=True)
 class Law(OnCells):
-    """u -> u + dt times the sum of the rates of shallow water whose depth and momenta are made of u."""
+    """Map u to u + dt times the sum of the rates of shallow water whose depth and momenta are made of u."""
 
     scheme: str
     sides: tuple  # for each axis None or a pair of "outflow", "free_slip", "inflow"
@@ -246,7 +246,7 @@ def pair_of(speed):
 
 @dataclass(frozen=True)
 class Flow(Ingredient):
-    """v -> the velocity after steps of `flow_step`, started from v, with a force and a viscosity."""
+    """Map v to the velocity after steps of `flow_step`, started from v, with a force and a viscosity."""
 
     sides: tuple
     solid: int | None
@@ -390,7 +390,7 @@ def cooling(s, p):
 
 @dataclass(frozen=True)
 class TwoFields(OnCells):
-    """u -> u + w after one step of two fields that react and diffuse, as a dict."""
+    """Map u to u + w after one step of two fields that react and diffuse, as a dict."""
 
     method: str
     sides: tuple
@@ -493,7 +493,7 @@ class TwoFields(OnCells):
 
 @dataclass(frozen=True)
 class Waves(OnCells):
-    """p -> p after steps of leapfrog of p' = -c D v, v' = -G p, with damping or without."""
+    """Map p to p after steps of leapfrog of p' = -c D v, v' = -G p, with damping or without."""
 
     damped: bool
     memory: object
@@ -544,7 +544,7 @@ class Waves(OnCells):
 
 @dataclass(frozen=True)
 class Adaptive(OnCells):
-    """u -> the state after an interval that is crossed with error control, beside many small steps of rk4."""
+    """Map u to the state after an interval that is crossed with error control, beside many small steps of rk4."""
 
     method: str
     sides: tuple
@@ -594,7 +594,7 @@ SHARP = ("rk4", "ssprk3", "radau")
 
 @dataclass(frozen=True)
 class Switched(OnCells):
-    """u -> the state after an interval in which a source is switched off, beside the closed form.
+    """Map u to the state after an interval in which a source is switched off, beside the closed form.
 
     u' = -k u + f until the time `off`, u' = -k u after it.
     """
@@ -640,7 +640,7 @@ def switch_of(p):
 
 @dataclass(frozen=True)
 class Ball(OnCells):
-    """u -> u h + v of a ball that bounces once, started from a height that depends on the mean of u."""
+    """Map u to u h + v of a ball that bounces once, started from a height that depends on the mean of u."""
 
     method: str
     batched = False
@@ -694,7 +694,7 @@ class Ball(OnCells):
 
 @dataclass(frozen=True)
 class Damped(OnCells):
-    """u -> real and imaginary parts of x of (shift - D k G) x = u, k and the shift complex."""
+    """Map u to real and imaginary parts of x of (shift - D k G) x = u, k and the shift complex."""
 
     sides: tuple
     method: str
@@ -741,7 +741,7 @@ class Damped(OnCells):
 
 @dataclass(frozen=True)
 class Spectral(OnCells):
-    """u -> f(-L / scale) u, f the exponential, a power or a function."""
+    """Map u to f(-L / scale) u, f the exponential, a power or a function."""
 
     sides: tuple
     kind: str  # "exponential", "power" or "function"
@@ -780,7 +780,7 @@ ACTIVATIONS = {
 
 @dataclass(frozen=True)
 class Network(OnCells):
-    """u -> u + a layer of convolution, an activation, and one back to one channel."""
+    """Map u to u + a layer of convolution, an activation, and one back to one channel."""
 
     padding: str
     activation: str

@@ -382,7 +382,7 @@ def compare_by_jax(scene, loss, values, twin, outcome):
 
 
 def arrays_of(scene, values):
-    """Return the values as arrays; what was a number of Python, which has no precision, has that of the scene."""
+    """Return the values as arrays; a number of Python, which has no precision, gets the precision of the scene."""
     arrays = {}
     for name, value in values.items():
         arrays[name] = in_precision(np.asarray(value), scene.dtype) if isinstance(value, float) else np.asarray(value)
@@ -486,6 +486,4 @@ def check_gradient(scene, what, found, wanted, values):
         scale = np.max(np.abs(leaf)) + 1e-3 * largest + SMALLEST
         if not error <= scene.tolerance * scale:
             place = np.unravel_index(np.argmax(np.abs(own - leaf)), own.shape)
-            raise Mismatch(
-                f"{what}: {name}{list(map(int, place))} is {own[place]!r}, that of the twin {np.asarray(leaf)[place]!r}"
-            )
+            raise Mismatch(f"{what}: {name}{list(map(int, place))} is {own[place]!r}, twin {np.asarray(leaf)[place]!r}")
