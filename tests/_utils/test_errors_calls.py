@@ -143,14 +143,14 @@ TABLE = [
     (
         lambda: L(U.ravel()),
         ShapeError,
-        "laplacian takes a field on cells(4, 3), got an array of shape (12,); write op(u.reshape(4, 3)), or op @ u for a "
-        "flat array",
+        "laplacian takes a field on cells(4, 3), got an array of shape (12,); write op(u.reshape(4, 3)), or op @ u for "
+        "a flat array",
     ),
     (
         lambda: lobpcg(-L, np.eye(12)[:, :2], M=dp.inverse(-L)),
         ShapeError,
-        "-laplacian takes a field on cells(4, 3), got an array of shape (12, 2); for the columns of a matrix, as lobpcg "
-        "of SciPy gives them, write op.to_scipy()",
+        "-laplacian takes a field on cells(4, 3), got an array of shape (12, 2); for the columns of a matrix, as "
+        "lobpcg of SciPy gives them, write op.to_scipy()",
     ),
     (lambda: L.tocsr(), AttributeError, "Operator has no attribute 'tocsr'; write op.matrix"),
     # conditions

@@ -289,7 +289,7 @@ def check_kind(fun, given):
 
 
 def check_gradient_of_kind(loss, given):
-    """The gradient equals the gradient at the contiguous float64 copy, in the dtype of the input; integers have none."""
+    """The gradient equals that at the contiguous float64 copy, in the dtype of the input; integers have none."""
     if given.dtype.kind in "biu":
         with pytest.raises(dp.errors.DerivativeError, match="a gradient needs floating values"):
             dp.value_and_grad(loss)(given)

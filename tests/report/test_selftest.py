@@ -27,8 +27,8 @@ def no_module(name):
         (
             no_module("petsc4py"),
             "apt-get install -y --no-install-recommends python3-petsc4py && ls -d /usr/lib/petscdir/*/"
-            f"*-real/lib/python3/dist-packages > {get_path('purelib')}/petsc.pth (not on Debian: conda install -c conda-forge "
-            "petsc4py)",
+            f"*-real/lib/python3/dist-packages > {get_path('purelib')}/petsc.pth (not on Debian: conda install "
+            "-c conda-forge petsc4py)",
         ),
         ("No such file or directory: 'mpirun'", "apt-get install -y --no-install-recommends openmpi-bin"),
         (ROOT_USER, "export OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1"),
