@@ -39,7 +39,7 @@ def coefficients(cells):
     older = state["v"]
     for number in range(steps):
         before, state = state, step(state)
-        ahead = state["v"] + dt * step.slope(state["p"] - before["p"])  # before the pressure is corrected
+        ahead = state["v"] + dt * step.pressure_gradient(state["p"] - before["p"])  # before the pressure is corrected
         taken = grid.faces.volumes * rub * (ahead - 0.5 * (before["v"] - older))
         older = before["v"]
         found.append([number * dt, *(SCALE * np.sum(part) for part in grid.split(taken))])

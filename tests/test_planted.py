@@ -91,8 +91,8 @@ BUGS = {
     ),
     "a friction whose share in the acceleration before has no derivative": Bug(
         "flow",
-        "a = a + rub * v",
-        "a = a + plain(rub) * v",
+        "a = a + friction * v",
+        "a = a + plain(friction) * v",
         "tests/flow/test_flow_friction.py",
     ),
     "a wall that is felt beside the place where it stands": Bug(
@@ -141,14 +141,14 @@ BUGS = {
     ),
     "a force that acts on walls": Bug(
         "flow",
-        "a = a + self.free(self._pushed(",
-        "a = a + (self._pushed(",
+        "a = a + self._free_faces(self._force(",
+        "a = a + (self._force(",
         "tests/flow/test_flow.py::test_a_force_on_walls_and_inflows_does_nothing",
     ),
     "the rate of a scalar that is not carried on": Bug(
         "flow",
-        "u + self.flow.dt * (1.5 * rate - 0.5 * before)",
-        "u + self.flow.dt * rate",
+        "u + self.dt * (1.5 * rate - 0.5 * previous_rate)",
+        "u + self.dt * rate",
         "tests/flow/test_flow_scalars.py::test_second_order_in_time",
     ),
     "a variation that counts walls": Bug(

@@ -1,17 +1,20 @@
-"""What acts on a velocity besides pressure: viscosity (face_laplacian, face_lift) and convection.
+"""Momentum: viscosity (face_laplacian, face_lift) and convection of a velocity on faces.
 
-Every component lives on its own faces. Along its own axis it is a field on nodes, and the wall faces
-hold the wall values; along the other axes it is a field between walls half a cell away, with the
-condition that what the fluid does there implies (`along` of grid/boundary_conditions.py).
+Every component lives on its own faces. Along its own axis it is a field on nodes, and the wall faces hold the wall
+values. Along the other axes it is a field between walls half a cell away, with the condition that `FlowCondition.along`
+states for the velocity along a wall.
 
 The velocity of a wall therefore has two parts. Its normal component stands on the faces of the wall. Its tangential
-components are the wall velocities, a flat array on ``face_lift(grid, boundary).domain``: those of walls that move along
-themselves, and those of a flow that enters at an angle. Viscosity takes them by `face_lift`, convection by its argument
+components are the wall velocities, a flat array on ``face_lift(grid, boundary).domain``: the velocities of moving walls
+and of a flow that enters at an angle. Viscosity takes them through `face_lift`, convection through its argument
 `walls`.
 """
 
+from __future__ import annotations
+
 from functools import cached_property
 from itertools import product
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -19,10 +22,8 @@ import scipy.sparse as sp
 from sparsedp._utils.pytree import copied
 from sparsedp._utils.reconstruction import Made
 from sparsedp._utils.validation import check_on
-from sparsedp.autodiff.backend import gathered
-from sparsedp.autodiff.tape import plain
 from sparsedp.flow.projection_setup import faces_that
-from sparsedp.grid.boundary_conditions import dirichlet, free_slip, inflow, no_slip, outflow, resolve
+from sparsedp.grid.boundary_conditions import dirichlet, free_slip, no_slip, outflow, resolve
 from sparsedp.grid.grid import Grid
 from sparsedp.grid.space import Space
 from sparsedp.operators.difference import divergence, gradient
@@ -37,11 +38,18 @@ from sparsedp.operators.stencils import (
     slopes,
     wall_slopes,
     with_ends,
-)  # fmt: skip
+)
 from sparsedp.operators.structure.base import Matrix
 from sparsedp.operators.structure.factor import Factor
 from sparsedp.operators.structure.kronecker import Kronecker
 from sparsedp.operators.structure.lazy import Mask, compose, total
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from sparsedp.operators.structure.base import Structure
 
 __all__ = [
     "MomentumFluxes",
@@ -51,40 +59,42 @@ __all__ = [
     "face_lift",
     "free_faces",
     "stresses",
-    "velocities_of",
+    "wall_sides",
     "wall_stresses",
     "wall_velocities",
 ]
 
 
-def face_laplacian(grid, boundary=no_slip, solid=None, solid_boundary=no_slip):
-    """Faces -> faces: the Laplacian of each component of a velocity, 0 on faces that are not free.
+def face_laplacian(
+    grid: Grid, boundary: Any = no_slip, solid: ArrayLike | None = None, solid_boundary: Any = no_slip
+) -> Operator:
+    """Return the Laplacian of each component of a velocity on faces, 0 on faces that are not free.
 
     Parameters
     ----------
     grid : Grid
     boundary : flow condition or dict
-        What the fluid does at the walls: no_slip, free_slip, inflow, outflow, for all bounded
-        sides or as {"x": (lower, upper), ...}. Moving walls enter through `face_lift`.
+        no_slip, free_slip, inflow or outflow, for all bounded sides or as {"x": (lower, upper), ...}. The velocity of
+        moving walls is added with `face_lift`.
     solid : bool array, shape `grid.shape`, optional
         Obstacles.
     solid_boundary : no_slip or free_slip
-        What the fluid does along the obstacles.
+        Condition along the obstacles.
 
     Returns
     -------
     Operator
-        in: faces [velocity]; out: faces [velocity / length^2]. Order 2 inside; values on walls and on
-        faces that touch an obstacle are taken as they are.
+        in: faces [velocity]; out: faces [velocity / length^2]. Order 2 in the interior; the values on walls and on
+        faces that touch an obstacle are boundary values.
 
     Raises
     ------
     ShapeError
         If `solid` has another shape than the grid.
     ValueError
-        If an axis is named that is periodic or not there.
+        If an axis is named that is periodic or does not exist.
     TypeError
-        If `boundary` or `solid_boundary` holds what is no flow condition.
+        If `boundary` or `solid_boundary` is not a flow condition.
 
     Examples
     --------
@@ -100,17 +110,17 @@ def face_laplacian(grid, boundary=no_slip, solid=None, solid_boundary=no_slip):
     return Operator(structure, grid.faces, grid.faces, "face_laplacian")
 
 
-def face_lift(grid, boundary=no_slip, solid=None):
-    """Return the operator from tangential wall velocities to their part of the Laplacian, L(v) + B(values).
+def face_lift(grid: Grid, boundary: Any = no_slip, solid: ArrayLike | None = None) -> Operator:
+    """Return the operator B from tangential wall velocities to their part of the Laplacian, L(v) + B(velocities).
 
     Parameters
     ----------
     grid : Grid
     boundary : flow condition or dict
-        The same as for `face_laplacian`. Walls that are no_slip and inflows have a velocity along them; sides of
-        free_slip and outflow have none, and no entry in the domain.
+        As for `face_laplacian`. Walls with no_slip and inflows have a tangential velocity; sides of free_slip and
+        outflow have none, and no entry in the domain.
     solid : bool array, shape `grid.shape`, optional
-        The same as for `face_laplacian`: faces that touch an obstacle get 0.
+        As for `face_laplacian`: faces that touch an obstacle get 0.
 
     Returns
     -------
@@ -124,9 +134,9 @@ def face_lift(grid, boundary=no_slip, solid=None):
     ShapeError
         If `solid` has another shape than the grid.
     ValueError
-        If an axis is named that is periodic or not there.
+        If an axis is named that is periodic or does not exist.
     TypeError
-        If `boundary` holds what is no flow condition.
+        If `boundary` is not a flow condition.
 
     Examples
     --------
@@ -140,11 +150,11 @@ def face_lift(grid, boundary=no_slip, solid=None):
     return Operator(structure, wall_velocities(grid, sides), grid.faces, "face_lift")
 
 
-def convection(grid, boundary=no_slip, solid=None):
-    """Return ``convect(v, w, walls=None)``: the momentum that w carries, div(w v) on faces, by central differences.
+def convection(grid: Grid, boundary: Any = no_slip, solid: ArrayLike | None = None) -> Callable[..., Any]:
+    """Return ``convect(v, w, walls=None)``: the convection div(w v) of v by w on faces, by central differences.
 
-    Each component of v and the velocity w that carries it are averaged to the sides of its control
-    volume. The flux form conserves momentum and, where w has no divergence, energy.
+    Each component of v, and the velocity w that carries it, are averaged to the sides of its control volume. The flux
+    form conserves momentum and, where w has no divergence, energy.
 
         N(v, w) = C ((A v + E walls) (B w))
 
@@ -158,23 +168,23 @@ def convection(grid, boundary=no_slip, solid=None):
     Returns
     -------
     callable
-        ``convect(v, w)`` with two face fields [velocity] -> faces [velocity^2 / length], 0 on faces that
-        are not free; differentiable in all arguments, to every order. Order 2.
-        ``convect(v, w, walls)``: with the tangential velocity of v at walls and inflows, one flat array on
-        ``face_lift(grid, boundary).domain`` [velocity]. Without it, it is 0: flow enters at right angles.
+        ``convect(v, w)`` takes two face fields [velocity] and returns a face field [velocity^2 / length], 0 on faces
+        that are not free; differentiable in all arguments, to every order. Order 2.
+        ``convect(v, w, walls)`` also takes the tangential velocity of v at walls and inflows, one flat array on
+        ``face_lift(grid, boundary).domain`` [velocity]. Default: 0, so that flow enters at right angles.
 
     Raises
     ------
     ShapeError
         If `solid` has another shape than the grid; on use, if a field or `walls` has another shape.
     ValueError
-        If an axis is named that is periodic or not there.
+        If an axis is named that is periodic or does not exist.
     TypeError
-        If `boundary` holds what is no flow condition.
+        If `boundary` is not a flow condition.
 
-    Notes
-    -----
-    Source: Harlow and Welch, Physics of Fluids 8 (1965).
+    References
+    ----------
+    F. H. Harlow, J. E. Welch, Physics of Fluids 8 (1965) 2182-2189.
 
     Examples
     --------
@@ -196,7 +206,8 @@ def convection(grid, boundary=no_slip, solid=None):
     sides = resolve(grid, boundary, no_slip)
     fluxes = MomentumFluxes(grid, sides)
     gain = fluxes.gain
-    C = Operator(compose(Mask(free_faces(grid, sides, solid)), gain.structure), gain.domain, grid.faces, "gain")
+    free = Mask(free_faces(grid, sides, solid))
+    C = Operator(compose(free, gain.structure), gain.domain, grid.faces, "gain")
 
     def convect(v, w, walls=None):
         # On walls where the carrying velocity w needs a wall velocity, the faces are not free: C drops the flux.
@@ -205,29 +216,31 @@ def convection(grid, boundary=no_slip, solid=None):
     return Made(convect, convection, *copied((grid, boundary, solid)))
 
 
-# ------------------------------------------------------------ the same on every face, walls and obstacles too
+# ---- stresses and fluxes on all faces, walls and obstacles included --------------------------------------------------
 
 
-def stresses(grid, sides, solid, solid_boundary):
-    """The Laplacian of each component: what passes through the sides of a control volume, over its size -> structure.
+def stresses(grid: Grid, sides: tuple, solid: ArrayLike | None, solid_boundary: Any) -> Structure:
+    """Return the Laplacian of each component: the stresses on the sides of a control volume, over its size.
 
-    With obstacles also that of the faces they close: the friction there.
+    With obstacles it includes the faces that they close, where it is the friction on the obstacle.
     """
     if solid_boundary not in (no_slip, free_slip):
         raise TypeError(f"solid_boundary needs dp.no_slip or dp.free_slip, got {solid_boundary!r}")
     if solid is None:
-        blocks = {
-            (c, c): sum((along(a, grid.dim, _second(grid, c, a, sides)) for a in range(grid.dim)), ())
-            for c in range(grid.dim)
-        }
+        blocks: dict = {}
+        for component in range(grid.dim):
+            terms: tuple = ()
+            for axis in range(grid.dim):
+                terms += along(axis, grid.dim, _second_differences(grid, component, axis, sides))
+            blocks[component, component] = terms
         return Kronecker(grid.faces.parts, grid.faces.parts, blocks)
-    flags = grid.faces.split(np.logical_or(*solid_faces(grid, check_solid(grid, solid))))
-    lines = [_around(grid, c, sides, flags[c], solid_boundary.along) for c in range(grid.dim)]
-    return Matrix(sp.block_diag(lines, format="csr"))
+    closed = grid.faces.split(np.logical_or(*solid_faces(grid, check_solid(grid, solid))))
+    matrices = [_laplacian_around(grid, c, sides, closed[c], solid_boundary.along) for c in range(grid.dim)]
+    return Matrix(sp.block_diag(matrices, format="csr"))
 
 
 class MomentumFluxes:
-    """The parts of div(w v) = gain (carried(v) * carrier(w)), on all faces, as in `convection`.
+    """The parts of div(w v) = gain(carried(v) * carrier(w)), on all faces, as in `convection`.
 
     Parameters
     ----------
@@ -241,54 +254,56 @@ class MomentumFluxes:
         From the fluxes through the sides of control volumes to faces.
     """
 
-    def __init__(self, grid, sides):
+    def __init__(self, grid: Grid, sides: tuple) -> None:
         self._walls = wall_velocities(grid, sides)
-        carried = {}
-        carrier = {}
-        gain = {}
+        carried: dict = {}
+        carrier: dict = {}
+        gain: dict = {}
         sites = []
         # At walls: the tangential velocity is the value on the side itself.
-        wall_carried = {}
-        wall_carrier = {}
+        wall_carried: dict = {}
+        wall_carrier: dict = {}
         numbers = {pair: number for number, pair in enumerate(product(range(grid.dim), repeat=2))}
         for (c, a), number in numbers.items():  # component c through the sides across axis a
             if a == c:
-                mean = other = _to_centres(grid, c)
-                back = _from_centres(grid, c)
+                carried_mean = carrier_mean = _nodes_to_centres(grid, c)
+                back = _centres_to_nodes(grid, c)
             else:
-                mean, other = (means(grid, b, _conditions(sides[b])) for b in (a, c))
+                carried_mean = means(grid, a, _conditions_along(sides[a]))
+                carrier_mean = means(grid, c, _conditions_along(sides[c]))
                 back = differences(grid, a)
-            carried[number, c], carrier[number, a] = along(a, grid.dim, mean), along(c, grid.dim, other)
+            carried[number, c] = along(a, grid.dim, carried_mean)
+            carrier[number, a] = along(c, grid.dim, carrier_mean)
             gain[c, number] = along(a, grid.dim, back)
-            sites.append(tuple(mean.shape[0] if b == a else n for b, n in enumerate(grid.face_shape(c))))
-        for part, (a, side, c) in enumerate(_moving_sides(grid, sides)):
-            at_wall = along(a, grid.dim, _at_wall(grid, a, side))
+            sites.append(tuple(carried_mean.shape[0] if b == a else n for b, n in enumerate(grid.face_shape(c))))
+        for part, (a, side, c) in enumerate(wall_sides(grid, sides)):
+            at_wall = along(a, grid.dim, _wall_to_faces(grid, a, side))
             wall_carried[numbers[c, a], part] = at_wall
             wall_carrier[numbers[a, c], part] = at_wall
         fluxes = Space(None, "fluxes", grid, sites)
+        self._fluxes = fluxes
+        self._wall_carried_blocks = wall_carried
+        self._wall_carrier_blocks = wall_carrier
         self._carried = kronecker_operator(grid.faces, fluxes, carried, "carried")
         self._carrier = kronecker_operator(grid.faces, fluxes, carrier, "carrier")
-        self._at_walls = fluxes, wall_carried, wall_carrier
         self.gain = kronecker_operator(fluxes, grid.faces, gain, "gain")
 
     @cached_property
-    def _wall_carried(self):
-        fluxes, blocks, _ = self._at_walls
-        return kronecker_operator(self._walls, fluxes, blocks, "carried at walls")
+    def _wall_carried(self) -> Operator:
+        return kronecker_operator(self._walls, self._fluxes, self._wall_carried_blocks, "carried at walls")
 
     @cached_property
-    def _wall_carrier(self):
-        fluxes, _, blocks = self._at_walls
-        return kronecker_operator(self._walls, fluxes, blocks, "carrier at walls")
+    def _wall_carrier(self) -> Operator:
+        return kronecker_operator(self._walls, self._fluxes, self._wall_carrier_blocks, "carrier at walls")
 
-    def carried(self, v, walls=None):
+    def carried(self, v: Any, walls: Any = None) -> Any:
         """Return the velocity that is carried, at the sides of the control volumes of its components."""
         if walls is None:
             return self._carried(v)
         check_walls("convection", walls, self._walls)
         return self._carried(v) + self._wall_carried(walls)
 
-    def carrier(self, w, walls=None):
+    def carrier(self, w: Any, walls: Any = None) -> Any:
         """Return the velocity that carries, at the same sides."""
         if walls is None:
             return self._carrier(w)
@@ -296,120 +311,112 @@ class MomentumFluxes:
         return self._carrier(w) + self._wall_carrier(walls)
 
 
-# ------------------------------------------------------------ tangential velocities of walls
+# ---- tangential velocities of walls ----------------------------------------------------------------------------------
 
 
-def wall_velocities(grid, sides):
-    """Return the space of tangential wall velocities."""
-    parts = [
-        tuple(1 if b == a else n for b, n in enumerate(grid.face_shape(c))) for a, _, c in _moving_sides(grid, sides)
+class WallSide(NamedTuple):
+    """A wall with a tangential velocity, and a component of that velocity."""
+
+    axis: int  # across which the wall lies
+    side: int  # 0 lower, 1 upper
+    component: int
+
+
+def wall_sides(grid: Grid, sides: tuple) -> list[WallSide]:
+    """Return one entry for each tangential component of each wall that has a tangential velocity."""
+    return [
+        WallSide(axis, side, component)
+        for axis in range(grid.dim)
+        for side, condition in enumerate(sides[axis] or ())
+        for component in range(grid.dim)
+        if component != axis and condition.along == dirichlet
     ]
+
+
+def wall_velocities(grid: Grid, sides: tuple) -> Space:
+    """Return the space of tangential wall velocities."""
+    parts = []
+    for axis, _, component in wall_sides(grid, sides):
+        parts.append(tuple(1 if b == axis else n for b, n in enumerate(grid.face_shape(component))))
     return Space(None, "moving walls", grid, parts)
 
 
-def check_walls(name, walls, space):
-    """Refuse wall velocities, one array or a batch of them, of another shape than their space."""
+def check_walls(name: str, walls: Any, space: Space) -> None:
+    """Raise unless wall velocities, one array or a batch of them, have the shape of their space."""
     if np.shape(walls)[-1:] != space.shape:
         check_on(f"{name}, as walls,", walls, space, "; write face_lift(grid, boundary).domain.join(...)")
 
 
-def velocities_of(lifted, grid, sides):
-    """Return the wall velocities at inflows that `face_lift` turned into an array on faces, and 0 at other walls.
-
-    Raises
-    ------
-    ValueError
-        If a face at an inflow lies at another wall too: the array holds the sum of their parts.
-    """
-    matrix = compose(Mask(free_faces(grid, sides, None)), wall_stresses(grid, sides)).explicit().tocsr()
-    walls = wall_velocities(grid, sides)
-    enters = [sides[a][side] == inflow for a, side, _ in _moving_sides(grid, sides)]
-    wanted = np.repeat(np.array(enters, bool), np.diff(walls.offsets))
-    values = gathered(plain(lifted))
-    count = np.diff(matrix.indptr)  # walls that a face touches
-    entering = abs(matrix) @ wanted > 0
-    if np.any(values[entering & (count > 1)]):
-        raise ValueError(
-            "walls of flow_step does not tell which of the walls that meet at an inflow has which velocity; write "
-            "walls=lambda params: values, with values on face_lift(grid, boundary).domain"
-        )
-    face, wall = matrix.nonzero()
-    alone = (count[face] == 1) & wanted[wall]
-    weights = 1.0 / matrix.data[alone]
-    back = sp.csr_array((weights, (wall[alone], face[alone])), shape=matrix.shape[::-1])
-    return Operator(Matrix(back), grid.faces, walls, "wall velocities")(lifted)
-
-
-def wall_stresses(grid, sides):
+def wall_stresses(grid: Grid, sides: tuple) -> Kronecker:
     """Return the structure from tangential wall velocities to their part of the Laplacian, on all faces."""
-    blocks = {}
-    for part, (a, side, c) in enumerate(_moving_sides(grid, sides)):
-        factor = differences(grid, a) @ wall_slopes(grid, a, side, dirichlet)
-        blocks[c, part] = along(a, grid.dim, factor)
+    blocks: dict = {}
+    for part, (axis, side, component) in enumerate(wall_sides(grid, sides)):
+        factor = differences(grid, axis) @ wall_slopes(grid, axis, side, dirichlet)
+        blocks[component, part] = along(axis, grid.dim, factor)
     return Kronecker(grid.faces.parts, wall_velocities(grid, sides).parts, blocks)
 
 
-def _moving_sides(grid, sides):
-    """Return (axis, side, component) for each tangential component of each wall that has one."""
-    return [
-        (a, side, c)
-        for a in range(grid.dim)
-        for side, condition in enumerate(sides[a] or ())
-        for c in range(grid.dim)
-        if c != a and condition.along == dirichlet
-    ]
+def free_faces(grid: Grid, sides: tuple, solid: ArrayLike | None) -> NDArray[np.bool_]:
+    """Return the mask of the faces whose velocity is unknown: not on closed walls, inflows and obstacles."""
+    return faces_that(grid, sides, solid, lambda condition: condition == outflow)
 
 
-def _at_wall(grid, axis, side):
+# ---- 1-D factors -----------------------------------------------------------------------------------------------------
+
+
+def _conditions_along(pair: tuple | None) -> tuple | None:
+    """Return the conditions of a velocity along both walls of an axis; None if it is periodic."""
+    if pair is None:
+        return None
+    return tuple(condition.along for condition in pair)
+
+
+def _second_differences(grid: Grid, component: int, axis: int, sides: tuple) -> Factor:
+    """Return the second differences of a component along an axis."""
+    if axis == component:
+        return slopes(grid, component, sides[component] and (dirichlet, dirichlet)) @ differences(grid, component)
+    return differences(grid, axis) @ slopes(grid, axis, _conditions_along(sides[axis]))
+
+
+def _laplacian_around(grid: Grid, c: int, sides: tuple, closed: NDArray, condition: Any) -> sp.csr_array:
+    """Return the Laplacian of component c with faces `closed` by obstacles.
+
+    The faces of the component are the cells of an auxiliary grid, on which the obstacles are solid cells.
+    """
+    spacing = [np.ones(n) if a == c else grid.widths[a] for a, n in enumerate(grid.face_shape(c))]
+    lattice = Grid(grid.face_shape(c), spacing=spacing, periodic=grid.periodic)
+    conditions = {name: _conditions_along(sides[a]) for a, name in enumerate(grid.axes) if sides[a] and a != c}
+    across = Mask(lattice.join(*(a != c for a in range(grid.dim))))
+    slope = gradient(lattice, conditions, closed, condition).structure
+    laplacian_across = compose(divergence(lattice).structure, compose(across, slope))
+    # Along its own axis a closed face holds the velocity of the obstacle itself.
+    blocks = {(0, 0): along(c, grid.dim, _second_differences(grid, c, c, sides))}
+    laplacian_along = Kronecker(lattice.cells.parts, lattice.cells.parts, blocks)
+    return total(laplacian_across, laplacian_along).explicit()
+
+
+def _wall_to_faces(grid: Grid, axis: int, side: int) -> Factor:
     """Return the factor from the value at a wall to the faces across an axis."""
     nodes = grid.node_count(axis)
     wall = np.full(min(nodes, 1), side * (nodes - 1))
     return Factor.from_diagonals((nodes, 1), (wall, np.zeros_like(wall), np.ones(wall.size)))
 
 
-# ------------------------------------------------------------ the factors
+def _nodes_to_centres(grid: Grid, c: int) -> Factor:
+    """Return the means from nodes to cells.
 
-
-def _conditions(pair):
-    return None if pair is None else tuple(condition.along for condition in pair)
-
-
-def free_faces(grid, sides, solid):
-    """Faces whose velocity is found: not on closed walls or inflows, and not at an obstacle."""
-    return faces_that(grid, sides, solid, lambda condition: condition == outflow)
-
-
-def _second(grid, c, a, sides):
-    """Second differences of component c along axis a."""
-    if a == c:
-        return slopes(grid, c, sides[c] and (dirichlet, dirichlet)) @ differences(grid, c)
-    return differences(grid, a) @ slopes(grid, a, _conditions(sides[a]))
-
-
-def _around(grid, c, sides, closed, condition):
-    """The Laplacian of component c with the faces `closed` by obstacles, as a matrix: on cells of a grid of its own."""
-    spacing = [np.ones(n) if a == c else grid.widths[a] for a, n in enumerate(grid.face_shape(c))]
-    lattice = Grid(grid.face_shape(c), spacing=spacing, periodic=grid.periodic)
-    named = {name: _conditions(sides[a]) for a, name in enumerate(grid.axes) if sides[a] and a != c}
-    beside = Mask(lattice.join(*(a != c for a in range(grid.dim))))
-    slope = gradient(lattice, named, closed, condition).structure
-    across = compose(divergence(lattice).structure, compose(beside, slope))
-    # Along its own axis a closed face holds the value of the obstacle itself.
-    blocks = {(0, 0): along(c, grid.dim, _second(grid, c, c, sides))}
-    return total(across, Kronecker(lattice.cells.parts, lattice.cells.parts, blocks)).explicit()
-
-
-def _to_centres(grid, c):
-    """Nodes -> cells: means; on a bounded axis the wall values stand before and after them, for the half control volume
-    of an open side.
+    On a bounded axis the wall values are added before and after them, for the half control volume of an open side.
     """
     inner = mean_of_faces(grid, c)
-    return inner if grid.periodic[c] else with_ends(inner.matrix)
+    if grid.periodic[c]:
+        return inner
+    return with_ends(inner.matrix)
 
 
-def _from_centres(grid, c):
-    """Fluxes at cells (and walls) -> nodes: (F[i] - F[i - 1]) / d[i]."""
+def _centres_to_nodes(grid: Grid, c: int) -> Factor:
+    """Return the differences of fluxes at cells (and walls) to nodes: (F[i] - F[i - 1]) / d[i]."""
     if grid.periodic[c]:
         return slopes(grid, c, None)
-    lower, upper = (wall_slopes(grid, c, side, dirichlet).matrix for side in (0, 1))
+    lower = wall_slopes(grid, c, 0, dirichlet).matrix
+    upper = wall_slopes(grid, c, 1, dirichlet).matrix
     return Factor(sp.hstack([lower, slopes(grid, c, (dirichlet, dirichlet)).matrix, upper], format="csr"))

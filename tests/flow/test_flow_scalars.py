@@ -119,7 +119,7 @@ def test_a_step_beyond_the_courant_limit_is_refused():
 @pytest.mark.parametrize("implicit", [False, True])
 def test_the_limit_is_where_waves_grow(implicit):
     """The predicted growth agrees with the growth of the fastest wave in the linear scheme."""
-    from sparsedp.flow.flow_step import _growth
+    from sparsedp.flow.diffusion import wave_growth
 
     for courant, damping in ((0.3, 0.0), (0.9, 0.2), (0.7, 0.9), (1.5, 0.3)):
         angles = np.linspace(0, np.pi, 200)
@@ -131,7 +131,7 @@ def test_the_limit_is_where_waves_grow(implicit):
             now = (1 - d / 2 + 1.5 * c if implicit else 1 + 1.5 * (c - d)) / left
             matrix = np.array([[now, -0.5 * (c if implicit else c - d) / left], [1, 0]])
             fastest = max(fastest, *np.abs(np.linalg.eigvals(matrix)))
-        assert _growth(courant, damping, implicit) == pytest.approx(fastest, rel=2e-3)
+        assert wave_growth(courant, damping, implicit) == pytest.approx(fastest, rel=2e-3)
 
 
 def test_refusals():

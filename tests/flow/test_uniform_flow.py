@@ -453,7 +453,7 @@ REFUSED = [
     Case(
         act=lambda: dp.flow_step(ROOM, 0.1, boundary=SIDES, walls=EVERYWHERE),
         error=ValueError,
-        match="walls of flow_step does not tell which of the walls that meet at an inflow has which velocity; write "
+        match="walls that meet at an inflow are summed; write "
         r"walls=lambda params: values, with values on face_lift\(grid, boundary\).domain",
     ),
     Case(

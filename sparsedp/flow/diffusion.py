@@ -1,0 +1,163 @@
+"""Diffusive terms of a flow step, explicit or by the trapezoidal rule, and the growth of waves in a step.
+
+Adams-Bashforth is stable for an explicit term nu L u if dt nu |lambda| <= 1 for all eigenvalues of L. A wave that moves
+by the Courant number c in a step and is damped by d = dt nu k^2 grows in that step by the largest root |z| of
+
+    z^2 - z = (3/2 z - 1/2) (i c - d),      or, with implicit damping,  (z^2 - z) + d z (z + 1) / 2 = (3/2 z - 1/2) i c.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sparsedp._utils.validation import check_number, number_beside, rounded_down
+from sparsedp.autodiff.tape import plain
+from sparsedp.errors import UnstableStepError
+from sparsedp.operators.masks_and_lift import identity
+from sparsedp.solvers.inverse import inverse
+
+if TYPE_CHECKING:
+    from sparsedp.flow.settings import FlowSettings
+    from sparsedp.operators.operator import Operator
+
+__all__ = ["Diffusion", "wave_growth"]
+
+ROUNDING = 1e-12  # a step at the stability limit may lie beyond it by rounding
+
+
+class Diffusion:
+    """A term nu (L u + wall part) of a flow step; for nu = 0 nothing is built.
+
+    Parameters
+    ----------
+    name : str
+        Name of nu in messages.
+    coefficient : float or callable
+        nu, or ``nu(params)``.
+    build_operator : callable
+        ``build_operator()`` returns L.
+    settings : FlowSettings
+
+    Attributes
+    ----------
+    op : Operator or None
+        L.
+    solve : Operator or None
+        The inverse of I - dt nu L / 2, if the term is implicit.
+    damping : float
+        dt nu |L|; 0 if nu is a function.
+    """
+
+    op: Any
+    solve: Any
+
+    def __init__(
+        self,
+        name: str,
+        coefficient: Any,
+        build_operator: Callable[[], Operator],
+        settings: FlowSettings,
+    ) -> None:
+        self.name = name
+        self.coefficient = coefficient
+        self.settings = settings
+        self.op = build_operator() if coefficient else None
+        self.solve = None
+        self.damping = 0.0
+        if self.op is None:
+            return
+        row_sums = self.op.structure.magnitude()(np.ones(self.op.domain.size))
+        self._spectral_bound = float(np.max(row_sums, initial=0.0))  # no eigenvalue exceeds the largest row sum
+        if not callable(coefficient):
+            self.damping = settings.dt * coefficient * self._spectral_bound
+        if settings.implicit:
+            self.solve = inverse(identity(self.op.domain) - (0.5 * settings.dt * coefficient) * self.op)
+        elif not callable(coefficient):
+            self._check_stable(coefficient)
+
+    def add_explicit(self, rate: Any, u: Any, params: Any, wall_part: Callable[[], Any]) -> Any:
+        """Return a rate plus this term if it is explicit.
+
+        Parameters
+        ----------
+        rate, u : array
+        params : tree
+            For a coefficient that is a function.
+        wall_part : callable
+            ``wall_part()`` returns what walls add to L u, or None for 0.
+        """
+        if self.op is None or self.solve is not None:
+            return rate
+        coefficient = self.coefficient
+        if callable(coefficient):
+            coefficient = coefficient(params)
+            check_number("the viscosity of flow_step", plain(coefficient), ">= 0")
+            self._check_stable(float(plain(coefficient)))
+        return rate + coefficient * self._laplacian(u, wall_part())
+
+    def step_implicit(self, explicit: Any, u: Any, wall_part: Any) -> Any:
+        """Return the new field of the trapezoidal rule.
+
+        Parameters
+        ----------
+        explicit : array
+            The field after all other terms.
+        u : array
+            The field at the beginning of the step.
+        wall_part : array or None
+            What walls add to L u at the beginning of the step plus what they add at its end.
+        """
+        half_step = 0.5 * self.settings.dt * self.coefficient
+        return self.solve(explicit + half_step * self._laplacian(u, wall_part))
+
+    def _laplacian(self, u: Any, wall_part: Any) -> Any:
+        if wall_part is None:
+            return self.op(u)
+        return self.op(u) + wall_part
+
+    def _check_stable(self, coefficient: float) -> None:
+        """Raise UnstableStepError if the explicit term is unstable."""
+        dt = self.settings.dt
+        rate = coefficient * self._spectral_bound
+        if not self.settings.strict or not dt * rate > 1 + ROUNDING:
+            return
+        largest = rounded_down(1 / rate)
+        if self.settings.may_be_implicit:
+            advice = "take smaller steps or write implicit=True"
+        else:
+            advice = "take smaller steps, or write unstable='allow'"
+        raise UnstableStepError(
+            f"flow_step is unstable for {self.name} = {coefficient:.6g} with "
+            f"dt = {number_beside(dt, float(largest), digits=12)}: the largest stable dt is {largest}; {advice}"
+        )
+
+
+def wave_growth(courant: float, damping: float, implicit: bool) -> float:
+    """Return the largest growth of a wave in one step; see the head of this module.
+
+    Parameters
+    ----------
+    courant : float
+        Courant number of the flow.
+    damping : float
+        dt nu |L| of the damping term.
+    implicit : bool
+        Whether the damping term is implicit.
+    """
+    angle = np.linspace(0.0, np.pi, 65)
+    advance = 1j * courant * np.sin(angle)
+    decay = damping * np.sin(angle / 2) ** 2
+    # The quadratic equation a z^2 - b z + e = 0.
+    if implicit:
+        a: Any = 1 + decay / 2
+        b = 1 - decay / 2 + 1.5 * advance
+        e = 0.5 * advance
+    else:
+        a = 1.0
+        b = 1 + 1.5 * (advance - decay)
+        e = 0.5 * (advance - decay)
+    root = np.sqrt(b**2 - 4 * a * e)
+    return float(np.max(np.maximum(np.abs(b + root), np.abs(b - root)) / (2 * a)))

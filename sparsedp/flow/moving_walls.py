@@ -1,0 +1,162 @@
+"""The tangential velocities of walls and inflows in a flow step, for convection and viscosity.
+
+They are given in one of two forms:
+
+- a function ``walls(params)``, whose result holds the velocities themselves, one flat array on the domain of
+  `face_lift` (`ChangingWalls`);
+- an array on faces, ``face_lift(grid, boundary)(velocities)``: the contribution of constant velocities to the
+  Laplacian of the flow (`ConstantWalls`). Viscosity takes it as it is. Convection needs the velocities at inflows,
+  which `velocities_from_lift` recovers.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from sparsedp.autodiff.backend import gathered
+from sparsedp.autodiff.tape import cast, plain
+from sparsedp.flow.momentum import check_walls, face_lift, free_faces, wall_sides, wall_stresses, wall_velocities
+from sparsedp.grid.boundary_conditions import inflow
+from sparsedp.operators.masks_and_lift import mask
+from sparsedp.operators.operator import Operator
+from sparsedp.operators.structure.base import Matrix
+from sparsedp.operators.structure.lazy import Mask, compose
+
+if TYPE_CHECKING:
+    from sparsedp.flow.settings import FlowSettings
+    from sparsedp.grid.grid import Grid
+
+__all__ = ["ChangingWalls", "ConstantWalls", "WallsAtRest", "moving_walls", "velocities_from_lift"]
+
+
+def moving_walls(settings: FlowSettings, sides: tuple) -> WallsAtRest:
+    """Return the wall velocities of a flow step in the form in which they are given.
+
+    Parameters
+    ----------
+    settings : FlowSettings
+    sides : tuple
+        The flow conditions as `resolve` returns them.
+    """
+    if settings.walls is None:
+        return WallsAtRest()
+    if callable(settings.walls):
+        return ChangingWalls(settings)
+    return ConstantWalls(settings, sides)
+
+
+class WallsAtRest:
+    """Walls and inflows without a tangential velocity.
+
+    Attributes
+    ----------
+    changes : bool
+        Whether the velocities depend on params; the state of a flow step then holds them.
+    constant : array or None
+        Constant velocities on the domain of `face_lift`, as convection needs them; None where they are 0.
+    """
+
+    changes = False
+    constant: Any = None
+
+    def velocities(self, params: Any, dtype: np.dtype) -> Any:
+        """Return the velocities for params on the domain of `face_lift`; None where convection needs none."""
+        return self.constant
+
+    def laplacian_part(self, velocities: Any) -> Any:
+        """Return what wall velocities add to the Laplacian of the flow; None for 0."""
+        return None
+
+    def laplacian_part_sum(self, before: Any, after: Any) -> Any:
+        """Return the sum of `laplacian_part` for the velocities at both ends of a step; None for 0."""
+        return None
+
+
+class ConstantWalls(WallsAtRest):
+    """Constant wall velocities, given as ``face_lift(grid, boundary)(velocities)``."""
+
+    def __init__(self, settings: FlowSettings, sides: tuple) -> None:
+        grid = settings.grid
+        # An implicit viscosity would carry values on faces that are not free into the fluid.
+        self._lifted = mask(grid.faces, free_faces(grid, sides, settings.solid))(settings.walls)
+        has_inflow = any(condition == inflow for pair in sides for condition in pair or ())
+        if settings.convective and has_inflow:
+            self.constant = velocities_from_lift(settings.walls, grid, sides)
+
+    def laplacian_part(self, velocities: Any) -> Any:
+        """Return the given array; see `WallsAtRest`."""
+        return self._lifted
+
+    def laplacian_part_sum(self, before: Any, after: Any) -> Any:
+        """Return twice the given array; see `WallsAtRest`."""
+        return 2.0 * self._lifted
+
+
+class ChangingWalls(WallsAtRest):
+    """Wall velocities that are a function of params."""
+
+    changes = True
+
+    def __init__(self, settings: FlowSettings) -> None:
+        self._settings = settings
+
+    @cached_property
+    def _lift(self) -> Operator:
+        return face_lift(self._settings.grid, self._settings.boundary, self._settings.solid)
+
+    def velocities(self, params: Any, dtype: np.dtype) -> Any:
+        """Return the velocities for params in the dtype of the flow; see `WallsAtRest`."""
+        values = self._settings.walls(params)
+        check_walls("flow_step", values, self._lift.domain)
+        return cast(values, dtype)
+
+    def laplacian_part(self, velocities: Any) -> Any:
+        """Return the lift of the velocities; see `WallsAtRest`."""
+        return self._lift(velocities)
+
+    def laplacian_part_sum(self, before: Any, after: Any) -> Any:
+        """Return the lift of the sum of the velocities; see `WallsAtRest`."""
+        return self._lift(before + after)
+
+
+def velocities_from_lift(lifted: Any, grid: Grid, sides: tuple) -> Any:
+    """Return the wall velocities at inflows that `face_lift` mapped to an array on faces, and 0 at other walls.
+
+    Parameters
+    ----------
+    lifted : array
+        ``face_lift(grid, boundary)(velocities)``; may be traced.
+    grid : Grid
+    sides : tuple
+        The flow conditions as `resolve` returns them.
+
+    Returns
+    -------
+    array on the domain of `face_lift`
+
+    Raises
+    ------
+    ValueError
+        If a face at an inflow touches a second wall: the array holds only the sum of both parts.
+    """
+    lift = compose(Mask(free_faces(grid, sides, None)), wall_stresses(grid, sides)).explicit().tocsr()
+    walls = wall_velocities(grid, sides)
+    is_inflow = np.array([sides[axis][side] == inflow for axis, side, _ in wall_sides(grid, sides)], bool)
+    wanted = np.repeat(is_inflow, np.diff(walls.offsets))  # wall velocities at inflows
+    wall_count = np.diff(lift.indptr)  # number of wall velocities that each face depends on
+    at_inflow = abs(lift) @ wanted > 0
+    if np.any(gathered(plain(lifted))[at_inflow & (wall_count > 1)]):
+        raise ValueError(
+            "walls of flow_step got an array in which the velocities of walls that meet at an inflow are summed; write "
+            "walls=lambda params: values, with values on face_lift(grid, boundary).domain"
+        )
+    # Where a face depends on a single wall velocity, the velocity is the value on the face over the coefficient.
+    face, wall = lift.nonzero()
+    invertible = (wall_count[face] == 1) & wanted[wall]
+    coefficients = 1.0 / lift.data[invertible]
+    inverse = sp.csr_array((coefficients, (wall[invertible], face[invertible])), shape=lift.shape[::-1])
+    return Operator(Matrix(inverse), grid.faces, walls, "wall velocities")(lifted)

@@ -1,0 +1,41 @@
+"""The settings of a step of incompressible flow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sparsedp.grid.grid import Grid
+
+__all__ = ["FlowSettings"]
+
+
+@dataclass(frozen=True, eq=False)
+class FlowSettings:
+    """The arguments of `flow_step`; see there."""
+
+    grid: Grid
+    dt: float
+    viscosity: Any
+    force: Any
+    boundary: Any
+    solid: Any
+    implicit: bool
+    convective: bool
+    walls: Any
+    solid_boundary: Any
+    scalars: dict[str, dict[str, Any]] | None
+    unstable: str
+    friction: Any
+    inflow: Any
+
+    @property
+    def strict(self) -> bool:
+        """Whether a step that is too long for stability raises."""
+        return self.unstable == "raise"
+
+    @property
+    def may_be_implicit(self) -> bool:
+        """Whether `implicit` could be True: viscosity a number, and no friction."""
+        return self.friction is None and not callable(self.viscosity)
