@@ -123,7 +123,7 @@ BUGS = {
         "autodiff/derivative.py",
         "[np.argmin(finite)]",
         "[np.argmax(finite)]",
-        "tests/optimize/test_minimize_refusals.py",
+        "tests/optimize/test_minimize_errors.py",
     ),
     "a step back with the wrong sign": Bug(
         "integrators",
@@ -271,7 +271,7 @@ BUGS = {
         '            state = flatten(template)[1](content["state"])',
         '            state = flatten(template)[1](content["state"])\n'
         "            state = state._replace(**{state._fields[1]: template[1]})",
-        "tests/optimize/test_resume.py",
+        "tests/optimize/test_checkpoints.py",
     ),
     "a tolerance that the adjoint ignores": Bug(
         "solvers",
@@ -477,19 +477,19 @@ BUGS = {
         "optimize",
         "np.sqrt(mean_square / (1 - b2**count))",
         "np.sqrt(mean_square)",
-        "tests/optimize/test_minimize.py tests/optimize/test_minimize_inside.py",
+        "tests/optimize/test_minimize.py",
     ),
     "a wrong derivative that passes for rounding": Bug(
         "optimize",
         "lost_in_rounding = decreases[0] <= ROUNDINGS",
         "lost_in_rounding = decreases[-1] <= ROUNDINGS",
-        "tests/optimize/test_minimize_refusals.py",
+        "tests/optimize/test_minimize_errors.py",
     ),
     "a step across a bound": Bug(
         "optimize",
         "np.clip(vector, self.lower, self.upper)",
         "np.maximum(vector, self.lower)",
-        "tests/optimize/test_minimize_inside.py",
+        "tests/optimize/test_constraints.py",
     ),
     "central differences over one step for two": Bug(
         "interop/blackbox.py",

@@ -43,7 +43,7 @@ def setting(rng, widths, cells, samples=3, inputs=2, outputs=4):
 
 @pytest.mark.parametrize("padding", PADDINGS)
 @pytest.mark.parametrize("widths, cells", SHAPES)
-def test_convolution_against_its_twin(rng, widths, cells, padding):
+def test_convolution_against_a_sum_of_shifted_fields(rng, widths, cells, padding):
     p, x = setting(rng, widths, cells)
     y, pull = pullback(lambda a: nn.convolution(a[0], a[1], padding), (p, x))
     known, pull_known = pullback(lambda a: twin(a[0], a[1], padding), (p, x))
@@ -118,7 +118,7 @@ def test_relu_takes_the_mean_at_its_kink():
     assert np.array_equal(slope, [0.0, 0.5, 1.0])
 
 
-def test_a_residual_network_and_its_updates(rng):
+def test_training_a_residual_network(rng):
     p = [nn.convolution_weights(rng, 1, 4, 3), nn.residual_weights(rng, 4, 3), nn.convolution_weights(rng, 4, 1, 3)]
     x = rng.standard_normal((4, 1, 16))
 
@@ -140,7 +140,7 @@ def test_the_gain_keeps_the_size_of_a_signal():
     assert np.std(nn.convolution(p, rng.standard_normal((20, 8, 9, 9)))) == pytest.approx(1, abs=0.15)
 
 
-def test_files(tmp_path, rng):
+def test_saved_parameters_are_loaded(tmp_path, rng):
     tree = {"net": [nn.dense_weights(rng, 2, 3), (np.float32(1.5), None)], "name": "a", "steps": 3, "rate": 1e-3}
     path = tmp_path / "net.npz"
     nn.save(path, tree)

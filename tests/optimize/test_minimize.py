@@ -85,7 +85,7 @@ def test_methods(method, options, reached):
     assert best.value == min(record.value for record in best.history)
 
 
-def test_plain_gradient_descent_and_adam_are_what_the_books_say():
+def test_first_step_of_gradient_descent_and_adam_against_the_formula():
     x = np.array([1.0, 2.0])
     best = dp.minimize(bowl, x, "gd", maxiter=1, rate=0.1, tolerance=0)
     assert np.array_equal(best.x, x - 0.1 * (2 * (x - 3.0)))
@@ -95,7 +95,7 @@ def test_plain_gradient_descent_and_adam_are_what_the_books_say():
 
 @pytest.mark.parametrize("scale", [2.0**-660, 1e-12, 1e12, 2.0**660])
 @pytest.mark.parametrize("method, options", [("lbfgs", {}), ("gd", {}), ("adam", {"rate": 0.1})])
-def test_the_size_of_the_loss_does_not_matter(scale, method, options):
+def test_methods_are_invariant_to_the_scale_of_the_loss(scale, method, options):
     x = np.array([-1.2, 1.0, 0.5])
     plain_run = dp.minimize(valley, x, method, maxiter=20, **options)
     scaled = dp.minimize(lambda u: scale * valley(u), x, method, maxiter=20, **options)
@@ -104,7 +104,7 @@ def test_the_size_of_the_loss_does_not_matter(scale, method, options):
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1e-3, 1e6])
-def test_the_size_of_x_does_not_matter(scale):
+def test_lbfgs_is_invariant_to_the_scale_of_x(scale):
     best = dp.minimize(lambda u: valley(u / scale), scale * np.array([-1.2, 1.0, 0.5]))
     assert best.converged and np.allclose(best.x / scale, 1, atol=1e-5)
 
@@ -121,7 +121,7 @@ def test_single_precision_and_complex_leaves():
     assert np.allclose(own.x, target)
 
 
-def test_a_foreign_loss_with_its_own_gradient():
+def test_an_untraced_loss_with_a_user_gradient():
     best = dp.minimize(lambda x: float(np.sum((x - 3.0) ** 2)), np.ones(4), gradient=lambda x: 2 * (x - 3.0))
     assert best.converged and np.allclose(best.x, 3)
 
@@ -146,14 +146,14 @@ def test_a_large_offset_ends_in_rounding():
 
 
 @pytest.mark.parametrize("error", [UnstableStepError, ConvergenceError, NonFiniteError])
-def test_the_search_goes_past_refused_points(error):
+def test_refused_trial_points_are_avoided(error):
     best = dp.minimize(walled(valley, 1.0005, error), np.zeros(5))
     assert best.converged and np.allclose(best.x, 1, atol=1e-4)
     assert refused(best) and set(refused(best)) == {(error.__name__, "beyond 1.0005")}
     assert "refused: " + error.__name__ in str(best) or len(best.history) > 13
 
 
-def test_many_walls(rng):
+def test_random_barriers(rng):
     for _ in range(5):
         reach = 1 + 10 ** rng.uniform(-3, -0.5)
         best = dp.minimize(walled(valley, reach), rng.uniform(-0.9, 0.9, 6), maxiter=300)
@@ -161,7 +161,7 @@ def test_many_walls(rng):
 
 
 @pytest.mark.parametrize("method, options", [("lbfgs", {}), ("gd", {}), ("gd", {"rate": 0.3}), ("adam", {"rate": 0.1})])
-def test_a_minimum_behind_the_wall(method, options):
+def test_a_minimum_in_a_refused_region(method, options):
     best = dp.minimize(walled(bowl, 1.0), np.zeros(3), method, maxiter=60, **options)
     assert np.all(best.x <= 1.0) and np.allclose(best.x, 1, atol=1e-3)
     assert not best.converged and refused(best)
@@ -176,7 +176,7 @@ def test_nan_without_an_error_is_refused_too():
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "gd"])
-def test_a_wrong_gradient_is_hinted_at(method):
+def test_message_of_a_wrong_gradient(method):
     best = dp.minimize(bowl, np.ones(5), method, gradient=lambda x: -2 * (x - 3.0))
     assert not best.converged and np.array_equal(best.x, np.ones(5))
     assert "dp.check.gradient(loss, x) tells whether the gradient is right" in best.message
@@ -197,7 +197,7 @@ def test_history_and_text():
     assert repr(best) == text
 
 
-def test_tolerance_as_number_and_as_rule():
+def test_tolerance_as_number_and_as_function():
     loose, tight = (dp.minimize(valley, np.array([-1.2, 1.0]), tolerance=t) for t in (1e-2, 1e-10))
     assert loose.converged and tight.converged and loose.evaluations < tight.evaluations
     rule = dp.minimize(valley, np.array([-1.2, 1.0]), tolerance=lambda record, first: record.value < 0.1 * first.value)
@@ -240,3 +240,33 @@ def test_states_are_values_that_can_be_resumed():
         again = method.advance(states[3], objective)
         assert all(np.array_equal(a, b) for a, b in zip(again[1:], states[4][1:]))
         assert np.array_equal(again.current.point, states[4].current.point)
+
+
+def test_history_counts_forward_and_adjoint_solves(tmp_path):
+    solve = dp.inverse(-dp.laplacian(dp.Grid((6, 5)), dp.dirichlet))
+    target = np.arange(30.0).reshape(6, 5)
+
+    def run(maxiter, **options):
+        return dp.minimize(lambda b: anp.sum((solve(b) - target) ** 2), 0 * target, maxiter=maxiter, **options)
+
+    best = run(6)
+    assert [record.solves for record in best.history] == [2 * record.evaluations for record in best.history]
+    assert dp.minimize(lambda x: anp.sum(x**2), np.ones(2)).history[-1].solves == 0
+    run(3, checkpoint=tmp_path)
+    again = run(6, checkpoint=tmp_path)
+    assert again.resumed.startswith("resumed") and again.history[-1].solves == best.history[-1].solves
+
+
+def test_convergence_plot():
+    pytest.importorskip("matplotlib")
+    from sparsedp.report.plots import figure
+
+    best = dp.minimize(lambda x: anp.sum((x - 1.0) ** 2) - 2.0, np.zeros(2), "gd", rate=0.25, maxiter=4)
+    ax = dp.report.convergence(best, figure().add_subplot(), against="evaluations")
+    assert [line.get_label() for line in ax.lines] == ["loss - least loss", "gradient norm"]
+    assert list(ax.lines[1].get_ydata()) == [record.gradient_norm for record in best.history]
+    assert ax.get_yscale() == "log" and ax.get_xlabel() == "evaluations"
+    with pytest.raises(
+        ValueError, match="against of convergence must be one of iteration, seconds, evaluations, solves, got 'time'"
+    ):
+        dp.convergence(best, against="time")

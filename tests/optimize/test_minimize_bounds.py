@@ -14,7 +14,7 @@ from sparsedp.optimize.lbfgs import quasi_newton_step
 
 
 @pytest.mark.parametrize("k", [1, 2, 7])
-def test_a_step_is_that_of_the_dense_formula(rng, k):
+def test_quasi_newton_step_against_the_dense_formula(rng, k):
     """The B that the BFGS formula makes of steps and changes with s.y > 0, one pair after the other."""
     root = rng.standard_normal((12, 12))
     steps = rng.standard_normal((k, 12))
@@ -26,7 +26,7 @@ def test_a_step_is_that_of_the_dense_formula(rng, k):
     assert np.allclose(quasi_newton_step(g, steps, changes, 1.0), -np.linalg.solve(dense, g), rtol=1e-9)
 
 
-def test_pairs_without_curvature_and_no_memory_at_all():
+def test_quasi_newton_step_without_curvature_or_memory():
     g = np.array([3.0, -4.0])
     s = np.array([[1.0, 0.0], [0.0, 1.0]])
     assert np.array_equal(quasi_newton_step(g, s[:0], s[:0], 0.5), -g / 2)
@@ -65,7 +65,7 @@ LONG = {"deconvolution", "tomography"}
     "problem",
     [pytest.param(one, id=one.__name__, marks=[pytest.mark.whole] * (one.__name__ in LONG)) for one in PROBLEMS],
 )
-def test_evaluations_beside_scipy(problem):
+def test_number_of_evaluations_against_scipy(problem):
     """At most 1.5 times what SciPy takes to the loss that it ends at."""
     best, ours, scipys = compared(problem)
     lower, upper = (
@@ -92,7 +92,7 @@ def test_bounds_at_all_scales(rng):
         assert np.array_equal(scaled.x / length, plain_run.x) and plain_run.converged
 
 
-def test_refused_trials_beside_bounds(rng):
+def test_refused_trial_points_with_bounds(rng):
     """A wall on one side and bounds on the other: the search goes back from the wall and along the bounds."""
 
     def walled(x):
@@ -107,7 +107,7 @@ def test_refused_trials_beside_bounds(rng):
     assert any(record.failed for record in best.history)
 
 
-def test_fixed_entries_corners_and_no_room():
+def test_equal_bounds_and_corners():
     best = dp.minimize(valley, np.zeros(4), bounds=(np.array([-1.0, 0.3, -1.0, -1.0]), np.array([2.0, 0.3, 2.0, 2.0])))
     known = minimize(valley, [0, 0.3, 0, 0], jac=rosen_der, bounds=[(-1, 2), (0.3, 0.3), (-1, 2), (-1, 2)])
     assert best.x[1] == 0.3 and best.value == pytest.approx(known.fun, rel=1e-6)
@@ -176,7 +176,7 @@ METHODS = [
 
 
 @pytest.mark.parametrize("method, options", METHODS)
-def test_random_bounded_problems_end_where_scipy_does(method, options):
+def test_random_bounded_problems_against_scipy(method, options):
     squares = method in ("gauss_newton", "levenberg_marquardt")
     first_order = method in ("gd", "adam")
     for seed in range(3 if first_order else 10):

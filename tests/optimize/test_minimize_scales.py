@@ -77,7 +77,7 @@ def test_losses_of_any_magnitude(method, options, exponent):
 
 
 @pytest.mark.parametrize("exponent", [-1000, -550, 550])
-def test_half_inverse_depends_on_the_scale_and_claims_nothing(exponent):
+def test_half_inverse_far_from_the_minimum_is_not_converged(exponent):
     """Its steps have the square root of the scale of the residuals; a point far from the minimum is not converged."""
     with np.errstate(over="ignore"):
         best = dp.minimize(lambda x: 2.0**exponent * residuals(x), np.zeros(3), "half_inverse", maxiter=5)
@@ -97,7 +97,7 @@ def test_half_inverse_takes_the_same_steps_beyond_the_range_of_squares():
 
 @pytest.mark.parametrize("bounds", [None, (-0.3, 0.5)])
 @pytest.mark.parametrize("method", ["gd", "newton_cg"])
-def test_a_kink_is_no_rounding(method, bounds, rng):
+def test_stopping_at_a_kink_is_not_convergence(method, bounds, rng):
     """Steps became so short that no change of the loss was seen, far from the minimum."""
     matrix = rng.normal(size=(8, 5))
     data = rng.normal(size=8)
@@ -129,7 +129,7 @@ def test_the_hint_of_least_squares_sums_the_residuals():
 
 
 @pytest.mark.parametrize("exponent", [-1000, -550, 550, 1000])
-def test_a_rule_as_tolerance_sees_losses_that_it_can_compare(exponent):
+def test_a_tolerance_function_gets_comparable_losses(exponent):
     """Records of residuals near 1e-300 hold a loss and a gradient of 0: a rule called the start converged."""
     rule = lambda record, first: record.gradient_norm <= 1e-6 * first.gradient_norm
     factor = 2.0**exponent

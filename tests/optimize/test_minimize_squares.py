@@ -34,7 +34,7 @@ TIMES = np.linspace(0, 2, 30)
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_few_unknowns_go_forward_and_few_residuals_in_reverse(rng, method):
+def test_jacobian_by_columns_for_few_unknowns_and_by_rows_for_few_residuals(rng, method):
     tall = Counted()
     data = 3 * np.exp(-1.3 * TIMES) + 0.1 * rng.standard_normal(30)
     best = dp.minimize(lambda x: x[0] * tall.rule(-x[1] * TIMES) - data, np.ones(2), method)
@@ -75,7 +75,7 @@ def test_lotka_volterra(rng):
     assert len(passes) <= 2 + best.evaluations + 3 * len(best.history)
 
 
-def test_rejected_points_take_no_derivative():
+def test_rejected_points_need_no_jacobian():
     rule = Counted()
     loss = lambda x: rule.rule(x * TIMES) - np.exp(TIMES)
     best = dp.minimize(loss, np.array([-2.0]), "levenberg_marquardt")  # the first steps are far too long
@@ -88,7 +88,7 @@ def test_rejected_points_take_no_derivative():
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("scale", [1.0, 1e-9])
-def test_covariance_by_hand_and_as_curve_fit_has_it(rng, method, scale):
+def test_covariance_against_the_formula_and_curve_fit(rng, method, scale):
     sizes = np.array([1.0, scale, 1.0 / scale])
     model = lambda t, a, b, c: a / sizes[0] * np.exp(-b / sizes[1] * t) + c / sizes[2]
     data = model(TIMES, *(np.array([3.0, 1.3, 0.5]) * sizes)) + 0.1 * rng.standard_normal(30)
@@ -139,7 +139,7 @@ def test_covariance_where_it_is_not_known(rng):
 
 
 @pytest.mark.parametrize("method", [*METHODS, "half_inverse"])
-def test_absolute_sigma_is_that_of_curve_fit(rng, method):
+def test_absolute_sigma_against_curve_fit(rng, method):
     """Residuals divided by known standard deviations: the posterior covariance of a linear model is exact."""
     matrix = rng.standard_normal((20, 3))
     sigma = rng.uniform(0.5, 2.0, 20)

@@ -39,7 +39,7 @@ def by_hand(grid, u, eps, solid):
     return total, smooth
 
 
-def test_obstacles_are_left_out():
+def test_obstacles_are_excluded():
     grid = dp.Grid((5, 4))
     rng = np.random.default_rng(0)
     solid = np.zeros(grid.shape, bool)
@@ -131,7 +131,7 @@ def test_admm_is_optimal_for_jumps(inner):
     np.testing.assert_allclose(s[:-1][steep], np.sign(jumps[steep]), atol=1e-2)
 
 
-def test_admm_keeps_bounds_and_takes_another_prox():
+def test_admm_with_bounds_and_with_another_prox():
     y = np.array([3.0, -0.2, 0.5, -2.0])
     loss = lambda x: 0.5 * anp.sum((x - y) ** 2)
     best = dp.minimize(loss, 0 * y, "admm", tolerance=1e-8, weight=0.1, bounds=(0.0, 2.0))
@@ -185,7 +185,7 @@ def test_admm_refuses_a_penalty_that_is_no_float(size):
         dp.minimize(lambda x: anp.sum((x / size - 1.0) ** 2), np.full(2, size), "admm", weight=1.0 / size)
 
 
-def test_admm_stops_when_asked():
+def test_admm_stops_at_maxiter_and_by_its_callback():
     loss = lambda x: anp.sum((x - 1) ** 2)
     seen = []
     best = dp.minimize(loss, np.zeros(3), "admm", maxiter=3, tolerance=0.0, weight=0.1)
@@ -223,7 +223,7 @@ def test_admm_refuses():
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e-9, 1e-100])
-def test_total_variation_of_small_slopes_has_all_its_digits(scale):
+def test_total_variation_of_small_slopes_is_accurate(scale):
     """Slopes far below eps count by their square."""
     u = np.random.default_rng(0).standard_normal(GRIDS[1].shape)
     tv = dp.total_variation(GRIDS[1], 1.0)
@@ -248,7 +248,7 @@ def test_values_of_admm_with_another_prox_are_those_of_the_loss():
     assert best.x == pytest.approx(np.ones(4), rel=1e-3) and best.value == loss(best.x)
 
 
-def test_admm_refuses_bounds_that_nobody_keeps():
+def test_admm_refuses_bounds_beside_a_user_defined_inner_step():
     inner = lambda target, rho, x: (3.0 + rho * target) / (1 + rho)
     with pytest.raises(TypeError, match="admm with a function as inner does not use bounds; leave them out, or keep"):
         dp.minimize(lambda x: 0.5 * anp.sum((x - 3.0) ** 2), np.ones(4), "admm", weight=1.0, inner=inner, bounds=(0, 1))

@@ -46,7 +46,7 @@ def test_the_family_against_the_svd(rng, shape, power, method):
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("power", [0.5, 1])
 @pytest.mark.parametrize("method", ["dense", "krylov"])
-def test_a_cotangent_that_no_direction_reaches(rng, shape, power, method):
+def test_a_cotangent_outside_the_range_of_the_jacobian(rng, shape, power, method):
     """Outside of the range of J: misses of more outputs than unknowns have such a part."""
     matrix = jacobian(rng, shape)
     g = rng.standard_normal(shape[0])
@@ -76,7 +76,7 @@ def test_singular_values_from_gram_matrices(rng, decades, digits, scale):
     assert gap((left @ (shares * (left.T @ b))) @ (matrix / s[0]), known) <= 10.0**-digits
 
 
-def test_singular_values_of_nothing_and_of_zeros():
+def test_singular_values_of_empty_and_zero_matrices():
     assert np.array_equal(left_singular(np.zeros((3, 5)))[1], np.zeros(3))
     matrix = np.ones((3, 5))
     left, values = left_singular(matrix)
@@ -126,7 +126,7 @@ def test_a_rank_deficient_jacobian(rng):
         assert np.allclose(matrix @ found.step, matrix @ x, rtol=1e-9)
 
 
-def test_nothing_to_do():
+def test_directions_of_zero_and_empty_jacobians():
     for method in ("dense", "krylov"):
         assert np.array_equal(dp.update_direction(lambda u: 0.0 * u, np.ones(3), method=method).step, np.zeros(3))
         assert np.array_equal(dp.update_direction(lambda u: u[:0], np.ones(3), method=method).step, np.zeros(3))
@@ -193,7 +193,7 @@ def test_a_singular_jacobian_takes_the_shortest_step():
     assert np.allclose(best.x, 1.0)
 
 
-def test_the_two_variables_of_the_literature():
+def test_the_published_example_of_two_variables():
     """y = (x0, x1^2), L = |y|^2 from (3, 3). Source: Holl, Koltun, Thuerey, 2022; figures of case C1."""
     start = np.array([3.0, 3.0])
     y = lambda x: anp.stack([x[0], x[1] ** 2])
@@ -207,7 +207,7 @@ def test_the_two_variables_of_the_literature():
     assert np.array_equal(dp.minimize(square, start, "physical_gradient", rate=0.5, **options, maxiter=1).x, [0, 0])
 
 
-def test_half_inverse_equalises_the_directions():
+def test_half_inverse_balances_directions_of_different_scale():
     scales = np.array([1.0, 1e-4])
     best = dp.minimize(lambda x: scales * (x - 1.0), np.zeros(2), "half_inverse", maxiter=60, tolerance=0)
     descent = dp.minimize(lambda x: anp.sum((scales * (x - 1.0)) ** 2), np.zeros(2), "gd", maxiter=60)

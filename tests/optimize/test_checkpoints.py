@@ -47,7 +47,7 @@ def same(a, b):
 
 
 @pytest.mark.parametrize("method, loss, options", RUNS)
-def test_a_run_in_pieces_is_the_run(tmp_path, monkeypatch, method, loss, options):
+def test_a_run_in_pieces_has_the_bits_of_an_uninterrupted_run(tmp_path, monkeypatch, method, loss, options):
     monkeypatch.setattr("sparsedp.optimize.checkpoint.SHARE", np.inf)  # every state is written
     whole = dp.minimize(loss, START, method, maxiter=12, tolerance=0, **options)
     for stop in (3, 4, 9, 12):
@@ -59,14 +59,14 @@ def test_a_run_in_pieces_is_the_run(tmp_path, monkeypatch, method, loss, options
     assert same(again, whole)
 
 
-def test_what_a_finished_run_says_when_called_again(tmp_path):
+def test_a_finished_run_called_again(tmp_path):
     first = dp.minimize(valley, START, checkpoint=tmp_path)
     assert first.converged and first.resumed == f"nothing to resume in {tmp_path}"
     again = dp.minimize(valley, START, checkpoint=tmp_path)
     assert same(again, first) and again.resumed in str(again)
 
 
-def test_what_stopped_a_run_does_not_stop_the_next(tmp_path):
+def test_a_run_stopped_by_its_callback_continues(tmp_path):
     """A callback stops one run; more iterations and a smaller tolerance go on from there, to the same bits."""
     options = {"maxiter": 30, "tolerance": 1e-6}
     whole = dp.minimize(valley, START, **options)
@@ -106,7 +106,7 @@ def test_a_new_state_stays_beside_damaged_newer_ones(tmp_path, monkeypatch):
         assert best.resumed.startswith(f"resumed from iteration {begin} in")
 
 
-def test_a_single_changed_byte_is_seen(tmp_path):
+def test_a_single_changed_byte_is_detected(tmp_path):
     """Wherever it is: the state is skipped, or it is the same."""
     whole = dp.minimize(valley, START, maxiter=3, tolerance=0, checkpoint=tmp_path)
     [state] = tmp_path.glob("state-*3.npz")
@@ -170,7 +170,7 @@ TREE = {"x": START, "n": 2, "word": "a", "none": None, "flag": True, "pair": (1.
         {"more": 1},
     ],
 )
-def test_another_leaf_that_is_not_an_unknown_is_refused(tmp_path, leaf):
+def test_other_static_leaves_are_refused(tmp_path, leaf):
     """Also where the loss at the start is the same: it is asked for the unknowns alone."""
     loss = lambda tree: valley(tree["x"]) + tree["pair"][0] ** 2
     refused(tmp_path, "start", {"start": TREE}, {"start": {**TREE, **leaf}}, loss=loss)
@@ -200,7 +200,7 @@ def test_other_batches_are_refused(tmp_path, begun, given):
     refused(tmp_path, "list of batches", {"batches": begun}, {"batches": given}, **run)
 
 
-def test_batches_that_were_not_seen_yet_may_be_others(tmp_path):
+def test_batches_of_later_iterations_may_change(tmp_path):
     run = {"loss": residuals, "start": START, "method": "half_inverse", "rate": 0.1, "tolerance": 0}
     dp.minimize(**run, batches=BATCHES, maxiter=2, checkpoint=tmp_path)
     other = [*BATCHES[:3], BATCHES[0]]
@@ -208,14 +208,14 @@ def test_batches_that_were_not_seen_yet_may_be_others(tmp_path):
     assert again.resumed.startswith("resumed") and same(again, dp.minimize(**run, batches=other, maxiter=6))
 
 
-def test_each_batch_is_asked_for_once():
+def test_each_batch_is_computed_once():
     asked = []
     run = {"loss": residuals, "start": START, "method": "half_inverse", "rate": 0.1, "tolerance": 0, "maxiter": 4}
     dp.minimize(**run, batches=lambda i: asked.append(i) or BATCHES[i])
     assert asked == [0, 1, 2, 3, 4]
 
 
-def test_bounds_that_print_alike_are_others(tmp_path):
+def test_bounds_with_equal_text_are_distinguished(tmp_path):
     """NumPy prints the ends of a long array and eight digits."""
     start = np.full(2000, 0.5)
     lower = np.full(2000, -1.0)
@@ -229,14 +229,14 @@ def test_bounds_that_print_alike_are_others(tmp_path):
         refused(folder, "pair of bounds", begun, given, loss=valley, start=start)
 
 
-def test_a_loss_that_is_another_one_away_from_the_start(tmp_path):
+def test_a_loss_that_differs_away_from_the_start_is_refused(tmp_path):
     """The same value and gradient at the start, others at the last point."""
     other = lambda x: valley(x) + anp.sum((x - START) ** 4)
     assert other(START) == valley(START)
     refused(tmp_path, "loss at the last point", {"loss": valley}, {"loss": other}, start=START)
 
 
-def test_functions_among_the_options_do_not_hinder_the_next_process(tmp_path):
+def test_a_run_with_functions_as_options_is_resumed(tmp_path):
     """They have no address in the folder."""
     run = lambda maxiter, **more: dp.minimize(
         lambda y: anp.sum((y - 2.0) ** 2),
@@ -253,7 +253,7 @@ def test_functions_among_the_options_do_not_hinder_the_next_process(tmp_path):
     assert same(run(6, checkpoint=tmp_path), run(6))
 
 
-def test_a_tolerance_with_a_memory_takes_no_checkpoint(tmp_path):
+def test_certified_takes_no_checkpoint(tmp_path):
     with pytest.raises(
         ValueError,
         match="checkpoint cannot be used with a tolerance of dp.certified, whose solutions are not saved; leave "
@@ -331,7 +331,7 @@ def killed_on_its_way(run, folder, delay):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("bounds", [[], ["bounds"]])
-def test_killed_at_ten_random_instants(tmp_path, rng, bounds):
+def test_a_run_killed_at_ten_random_times(tmp_path, rng, bounds):
     """kill -9 while it runs, ten times: result and all values on the way have the bits of an undisturbed run."""
     run = [sys.executable, "-c", SCRIPT]
     subprocess.run([*run, str(tmp_path / "whole"), str(tmp_path / "whole.npy"), *bounds], check=True)
@@ -380,7 +380,7 @@ def pressed(words, *arguments):
     return out, err, process.returncode
 
 
-def test_an_interrupted_run_returns_its_best_point_and_can_go_on(tmp_path):
+def test_an_interrupted_run_returns_its_best_point_and_is_resumed(tmp_path):
     out, err, code = pressed(["running"], tmp_path / "parts")
     message, converged, many, value, right = out.split()
     assert (code, err) == (0, "") and (message, converged, right) == ("interrupted", "False", "True")
