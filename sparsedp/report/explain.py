@@ -1,10 +1,15 @@
 """explain: what one run of a loss and its gradient computed, and what it skipped. Counted, not estimated."""
 
+from __future__ import annotations
+
 import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from importlib.util import find_spec
 from time import perf_counter
+from typing import Any
 
-from sparsedp._utils.counters import recording
+from sparsedp._utils.counters import Calls, recording
 from sparsedp._utils.pytree import leaves
 from sparsedp._utils.validation import check_function
 from sparsedp.autodiff.derivative import unwarned, value_and_grad, witnessed
@@ -12,31 +17,42 @@ from sparsedp.autodiff.tape import is_variable
 from sparsedp.check.evaluations import solvers_of
 from sparsedp.check.nodes import bytes_held
 from sparsedp.check.summary import Result
-from sparsedp.check.table import table_of
+from sparsedp.check.table import Table, table_of
 from sparsedp.operators.operator import Operator
 
 __all__ = ["Plan", "explain", "total"]
 
 EXTRAS = {"numba": "compiled kernels", "pyamg": "multigrid", "matplotlib": "pictures", "tqdm": "bars"}
 COLUMNS = ("forward", "vjp", "jvp", "solve", "adjoint", "setup", "reused", "iterations", "assembled")
-TOTALS = {
-    "applications": "forward vjp jvp",
-    "forward solves": "solve",
-    "adjoint solves": "adjoint",
-    "set-ups built": "setup",
-    "set-ups reused": "reused",
-    "hierarchies built": "hierarchy",
-    "matrices assembled": "assembled",
-    "solves skipped": "skipped",
-    "steps recomputed": "recomputed",
-    "exchanges between ranks": "exchange",
-    "bytes in them": "sent",
-    "reductions": "reduction",
+TOTALS = {  # name of a sum: kinds of calls
+    "applications": ("forward", "vjp", "jvp"),
+    "forward solves": ("solve",),
+    "adjoint solves": ("adjoint",),
+    "set-ups built": ("setup",),
+    "set-ups reused": ("reused",),
+    "hierarchies built": ("hierarchy",),
+    "matrices assembled": ("assembled",),
+    "solves skipped": ("skipped",),
+    "steps recomputed": ("recomputed",),
+    "exchanges between ranks": ("exchange",),
+    "bytes in them": ("sent",),
+    "reductions": ("reduction",),
 }
 
 
-def explain(loss, x, gradient=True):
-    """Loss and point -> the plan: what one run of value and gradient calls, and what it leaves out.
+@dataclass
+class _ForwardPass:
+    """What is known at the end of the forward pass."""
+
+    end: float  # when it ended [s]
+    nodes: int
+    tape_bytes: int
+    calls: Calls
+    resumed: float  # when the bytes were counted [s]
+
+
+def explain(loss: Callable[[Any], Any], x: Any, gradient: bool = True) -> Plan:
+    """Count what one run of a loss and its gradient calls, and what it skips.
 
     Parameters
     ----------
@@ -82,33 +98,47 @@ def explain(loss, x, gradient=True):
     (1, 1, 64)
     """
     check_function("explain", loss, "lambda x: np.sum(x**2)")
-    nodes: list = []
-    forward: list = []  # what is known when the forward pass ends: time, nodes, bytes, calls, time after counting
+    nodes: list[Any] = []
+    passes: list[_ForwardPass] = []
 
-    def watched(tree):
+    def watched_loss(tree: Any) -> Any:
         value = loss(tree)
-        forward[:] = perf_counter(), len(nodes), bytes_held(nodes), calls.copy(), perf_counter()
+        end = perf_counter()
+        passes.append(_ForwardPass(end, len(nodes), bytes_held(nodes), calls.copy(), perf_counter()))
         nodes.clear()
         return value
 
     start = perf_counter()
     with recording() as calls, witnessed(lambda node, *_: nodes.append(node)), unwarned():
-        value = value_and_grad(watched)(x)[0] if gradient else watched(x)
-    end, tape_nodes, tape_bytes, before, begin = forward
-    seconds = end - start, perf_counter() - begin
-    totals = {word: total(calls, *kinds.split()) for word, kinds in TOTALS.items()}
+        if gradient:
+            value, _ = value_and_grad(watched_loss)(x)
+        else:
+            value = watched_loss(x)
+    forward = passes[-1]
+    seconds = (forward.end - start, perf_counter() - forward.resumed)
+    totals = {name: total(calls, *kinds) for name, kinds in TOTALS.items()}
     steps = sum(calls[name, "forward"] for name, kind in list(calls) if kind == "recomputed")
+    skipped = [
+        *_skipped_derivatives_of_x(x, gradient),
+        *_skipped_work(calls, forward.calls, gradient),
+        *_skipped_extras(),
+    ]
     return Plan(
-        value=float(value), counts=calls, totals=totals, rows=_rows(calls), seconds=seconds, tape_nodes=tape_nodes,
-        skipped=list(dict.fromkeys([*_gradient(x, gradient), *_skipped(calls, before, gradient), *_extras()])),
-        tape_bytes=tape_bytes + total(calls, "bytes"),
+        value=float(value),
+        counts=calls,
+        totals=totals,
+        rows=_rows(calls),
+        seconds=seconds,
+        tape_nodes=forward.nodes,
+        skipped=list(dict.fromkeys(skipped)),
+        tape_bytes=forward.tape_bytes + total(calls, "bytes"),
         recomputation=1.0 + totals["steps recomputed"] / steps if steps else 1.0,
-    )  # fmt: skip
+    )
 
 
-def total(calls, *kinds):
-    """Calls (or their seconds) by (name, kind) -> the sum of these kinds, whoever was called."""
-    return sum(many for (_, kind), many in calls.items() if kind in kinds)
+def total(calls: Any, *kinds: str) -> Any:
+    """Return the sum of the counts (or seconds) of these kinds over all names."""
+    return sum(count for (_, kind), count in calls.items() if kind in kinds)
 
 
 class Plan(Result):
@@ -135,18 +165,18 @@ class Plan(Result):
 
     _plain = ("value", "totals", "skipped", "rows", "tape_nodes", "tape_bytes", "recomputation", "seconds")
 
-    def to_dict(self):
-        """The plan as plain numbers, strings, lists and dicts; counts nested by name and kind."""
-        counts: dict = {}
-        for (name, kind), many in self.counts.items():
-            counts.setdefault(name, {})[kind] = many
+    def to_dict(self) -> dict[str, Any]:
+        """Return the plan as plain numbers, strings, lists and dicts; counts nested by name and kind."""
+        counts: dict[str, dict[str, int]] = {}
+        for (name, kind), count in self.counts.items():
+            counts.setdefault(name, {})[kind] = count
         return super().to_dict() | {"counts": counts}
 
-    def parts(self):
-        """The sums, a row for each name, and what was left out."""
+    def parts(self) -> list[str | Table]:
+        """Return the sums, a row for each name, and what was skipped."""
         forward, backward = self.seconds
         rows = [{name: value or None for name, value in row.items()} for row in self.rows]
-        sums = ", ".join(f"{many} {word}" for word, many in self.totals.items() if many)
+        sums = ", ".join(f"{count} {name}" for name, count in self.totals.items() if count)
         return [
             f"value {self.value:.6g}: {forward:.2g} s forward, {backward:.2g} s backward; tape: {self.tape_nodes} "
             f"calls that keep {self.tape_bytes} bytes, recomputation factor {self.recomputation:.2f}",
@@ -156,86 +186,99 @@ class Plan(Result):
         ]
 
 
-def _rows(calls):
-    """One dict for each name that was called, in the order of first use."""
+def _rows(calls: Calls) -> list[dict[str, Any]]:
+    """Return one dict for each name that was called, in the order of first use."""
     rows = []
     for name in dict.fromkeys(name for name, _ in calls):
-        kinds = {kind: calls[name, kind] for kind in COLUMNS}
-        if any(kinds.values()):
+        counts = {kind: calls[name, kind] for kind in COLUMNS}
+        if any(counts.values()):
             seconds = sum(spent for (other, _), spent in calls.seconds.items() if other == name)
-            rows.append({"name": name, **kinds, "seconds": seconds, "how": _how(calls, name)})
+            rows.append({"name": name, **counts, "seconds": seconds, "how": _form_or_method(calls, name)})
     return rows
 
 
-def _how(calls, name):
-    """Form or method, and why."""
+def _form_or_method(calls: Calls, name: str) -> str:
+    """Return the form of an operator, or the method of a solve with its reason."""
     words = list(calls.notes.get((name, "method"), ()))
     for actor in calls.actors.get(name, {}).values():
         if hasattr(actor, "engine"):
             words.append(f"{actor.engine.method}: {actor.reason}")
-        elif _applied(actor):
+        elif _is_applied(actor):
             words.append(actor.form)
     return "; ".join(dict.fromkeys(words)) or "rule"
 
 
-def _applied(actor):
-    """Whether it is an operator that is applied and not solved with."""
+def _is_applied(actor: Any) -> bool:
+    """Return whether an actor is an operator that is applied, not solved with."""
     return isinstance(actor, Operator) and not hasattr(actor, "solver")
 
 
 # ---------------------------------------------------------------- skipped work, in sentences
 
 
-def _gradient(x, asked):
-    fixed = sum(not is_variable(leaf) for leaf in leaves(x))
-    if not asked:
+def _skipped_derivatives_of_x(x: Any, gradient: bool) -> Iterator[str]:
+    """Say which derivatives of the loss were not computed."""
+    constants = sum(not is_variable(leaf) for leaf in leaves(x))
+    if not gradient:
         yield "the gradient: not asked, nothing taped"
-    elif fixed:
-        yield f"derivatives in {fixed} leaves of x, which are not floating"
+    elif constants:
+        yield f"derivatives in {constants} leaves of x, which are not floating"
 
 
-def _skipped(calls, forward, gradient):
-    """Derivatives, matrices, hierarchies and solves that nobody needed."""
+def _skipped_work(calls: Calls, forward_calls: Calls, gradient: bool) -> Iterator[str]:
+    """Say which derivatives, matrices, hierarchies and solves were not needed."""
     for (name, what), facts in calls.notes.items():
         if what == "not asked":
             yield f"derivative of {name} in {', '.join(map(str, facts))}: not asked"
-        if what == "skipped":
-            yield from (f"{name}: {reason} ({many} times)" for reason, many in facts.items())
-    for name, kind in forward if gradient else ():
-        back = calls[name, "vjp"] + calls[name, "jvp"] + calls[f"{name}.T", "forward"]  # the last: without a tape
-        if kind == "forward" and not back:
-            yield f"VJP of {name}: never called, its argument does not depend on x ({calls[name, kind]} calls)"
-    if gradient and not total(calls, "jvp"):
-        yield "JVPs: forward mode was not asked"
+        elif what == "skipped":
+            for reason, count in facts.items():
+                yield f"{name}: {reason} ({count} times)"
+    if gradient:
+        yield from _skipped_pullbacks(calls, forward_calls)
+        if not total(calls, "jvp"):
+            yield "JVPs: forward mode was not asked"
     for name, actors in calls.actors.items():
         for actor in actors.values():
-            yield from (_solver(calls, name, actor) if hasattr(actor, "engine") else _operator(calls, name, actor))
+            if hasattr(actor, "engine"):
+                yield from _skipped_by_solver(calls, name, actor)
+            elif _is_applied(actor):
+                yield from _skipped_by_operator(calls, name, actor)
     if not solvers_of(calls):
         yield "solves: none, so no hierarchy, no factors, no set-up"
-    for (name, kind), many in calls.items():
+    for (name, kind), count in calls.items():
         if kind == "skipped":
-            yield f"{many} solves of {name}: the right-hand side is 0, so is the solution"
+            yield f"{count} solves of {name}: the right-hand side is 0, so is the solution"
 
 
-def _operator(calls, name, actor):
-    if _applied(actor) and actor.form == "matrix-free" and not calls[name, "assembled"]:
+def _skipped_pullbacks(calls: Calls, forward_calls: Calls) -> Iterator[str]:
+    """Say whose VJP was never called."""
+    for name, kind in forward_calls:
+        transposed = calls[f"{name}.T", "forward"]  # a VJP of an operator that is not on a tape
+        if kind == "forward" and not calls[name, "vjp"] + calls[name, "jvp"] + transposed:
+            yield f"VJP of {name}: never called, its argument does not depend on x ({calls[name, kind]} calls)"
+
+
+def _skipped_by_operator(calls: Calls, name: str, operator: Operator) -> Iterator[str]:
+    """Say what an operator did not assemble or compute."""
+    if operator.form == "matrix-free" and not calls[name, "assembled"]:
         yield f"matrix of {name}: not assembled, applied without one"
-    if _applied(actor) and actor.structure.is_identity:
+    if operator.structure.is_identity:
         yield f"arithmetic of {name}: an identity, {calls[name, 'forward']} copies"
 
 
-def _solver(calls, name, actor):
-    """What it did not build or solve."""
-    if not actor.engine.hierarchical:
-        yield f"multigrid hierarchy for {name}: not built, {actor.engine.method} needs none"
+def _skipped_by_solver(calls: Calls, name: str, solver: Any) -> Iterator[str]:
+    """Say what a solver did not build or solve."""
+    if not solver.engine.hierarchical:
+        yield f"multigrid hierarchy for {name}: not built, {solver.engine.method} needs none"
     if not calls[name, "setup"]:
         yield f"set-up of {name}: made before, {calls[name, 'reused']} solves reuse it"
     if calls[name, "solve"] > 0 == calls[name, "adjoint"]:
         yield f"adjoint solve of {name}: nothing asks for it"
 
 
-def _extras():
-    """Extras that this process has not loaded."""
+def _skipped_extras() -> Iterator[str]:
+    """Say which extras this process has not imported."""
     for name, use in EXTRAS.items():
         if name not in sys.modules:
-            yield f"not imported: {name} ({use}){'' if find_spec(name) else ', which is not installed'}"
+            missing = "" if find_spec(name) else ", which is not installed"
+            yield f"not imported: {name} ({use}){missing}"
