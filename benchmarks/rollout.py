@@ -17,7 +17,7 @@ import numpy as np
 import sparsedp as dp
 from benchmarks.triad import best_times
 from sparsedp import kernels
-from sparsedp.trajectory.memory_budget import advances, slots_within
+from sparsedp.trajectory.checkpoint_plan import advances, slots_within
 
 LIMITS = {1: 35.0, 2: 30.0}  # times faster than autograd over slices, by dimension
 

@@ -462,8 +462,8 @@ BUGS = {
     ),
     "cotangents of a trajectory at the step before": Bug(
         "trajectory",
-        "block[self._rows[state.i]] for block in rows",
-        "block[self._rows[state.i] - 1] for block in rows",
+        "[block[row] for block in blocks]",
+        "[block[row - 1] for block in blocks]",
         "tests/trajectory/test_rollout.py tests/trajectory/test_rollout_kinds.py",
     ),
     "a field that counts as unused where it has a zero": Bug(

@@ -690,7 +690,8 @@ class _Run:
             change = inner(of_state, rates) + of_time
             row = [np.ravel(leaf) for leaf in (*leaves(of_state), *leaves(of_params), of_time) if leaf is not None]
             rows.append(np.concatenate(row) / (change or 1.0))
-        return rows[0].shape == rows[1].shape and np.allclose(*rows, rtol=1e-6, atol=0.0)
+        one, other = rows
+        return one.shape == other.shape and np.allclose(one, other, rtol=1e-6, atol=0.0)
 
     def _at_the_end(self, side, stop):
         """An event within rounding of the end of the interval, or None."""

@@ -26,7 +26,7 @@ from mpi4py import MPI
 from sparsedp._utils.counters import count
 from sparsedp._utils.pytree import labels, leaves
 from sparsedp.autodiff.tape import plain
-from sparsedp.trajectory.layout import folded
+from sparsedp.trajectory.specification import folded
 
 __all__ = ["Agreement", "course", "end_all"]
 

@@ -1,13 +1,15 @@
-"""What is left of a rollout afterwards: how often steps were run, and how the cotangent grew on its way back.
+"""What a rollout reports after each pass: how many steps were run, and how the cotangent grew.
 
-A cotangent that grows by exp(rate) a step is that of a chaotic run: the gradient is exact for these very steps, but
-a change of the start by rounding changes it by about amplification * 1e-16. Nothing is clipped. Beyond LIMIT the
+A cotangent that grows by exp(rate) a step belongs to a chaotic run: the gradient is exact for these very steps, but
+a change of the start by rounding changes it by about amplification * 1e-16. Nothing is clipped. Beyond `LIMIT` the
 gradient says little about the physics, and a GrowthWarning says so.
 """
 
+from __future__ import annotations
+
 import warnings
 from math import inf, log, nan
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,15 +17,15 @@ from sparsedp._utils.counters import thread
 from sparsedp.autodiff.tape import plain
 from sparsedp.errors import GrowthWarning
 
-__all__ = ["APART", "Record", "SAMPLES", "growth", "largest"]
+__all__ = ["Record", "backward_record", "largest", "sampling_interval"]
 
-LIMIT = 1e8  # half of the digits are gone
+LIMIT = 1e8  # amplification that costs half of the digits
 SAMPLES = 32  # measurements of the cotangent in a long run
-APART = 16  # least number of steps between two of them: they cost a pass over the cotangent
+APART = 16  # least number of steps between two of them: each one reads the whole cotangent
 
 
 class Record(NamedTuple):
-    """One run over all steps, as `rollout` hands it to `record`.
+    """One pass over all steps, as `rollout` passes it to `record`.
 
     Attributes
     ----------
@@ -31,13 +33,13 @@ class Record(NamedTuple):
         "forward" or "backward".
     steps : int
     kept : int
-        States kept for the way back.
+        Number of states kept for the backward pass.
     recomputed : int
-        Steps run again on the way back.
+        Steps run again in the backward pass.
     norms : tuple of (int, float)
         Index of a state and the largest entry of its cotangent, from the last state to the first.
     growth : float
-        Rate a step: the norm behaves like exp(growth * number of steps back); NaN when it was not measured.
+        Rate per step: the norm behaves like exp(growth * number of steps back); NaN when it was not measured.
     amplification : float
         Largest norm over the first one.
     """
@@ -51,50 +53,70 @@ class Record(NamedTuple):
     amplification: float = nan
 
     @property
-    def factor(self):
-        """Plain steps over steps, the first run included: 1 when nothing was run again."""
+    def factor(self) -> float:
+        """Return the runs of steps over the number of steps, the first run included; 1 if none was run again."""
         return 1 + self.recomputed / max(self.steps, 1)
 
     @property
-    def flagged(self):
-        """Whether the cotangent grew beyond what makes a gradient useful."""
+    def flagged(self) -> bool:
+        """Return whether the cotangent grew beyond the limit at which a gradient is useful."""
         return self.amplification > LIMIT
 
 
-def growth(loop, norms, recomputed):
-    """Loop, (number of a state, largest entry of its cotangent), steps run again -> the Record of the way back.
+def sampling_interval(n: int) -> int:
+    """Return after how many steps of n the cotangent is measured again."""
+    return max(n // SAMPLES, APART)
 
-    It warns when the cotangent grew too much.
+
+def backward_record(n: int, kept: int, recomputed: int, norms: list[tuple[int, float]], last_cut: int) -> Record:
+    """Return the record of a backward pass, and warn if the cotangent grew too much.
+
+    Parameters
+    ----------
+    n, kept, recomputed : int
+        As the attributes of `Record`.
+    norms : list of (int, float)
+        Index of a state and the largest entry of its cotangent.
+    last_cut : int
+        The last state at which truncation sets the cotangent to zero, or -1.
     """
-    first = next((norm for _, norm in norms if norm > 0), nan)
-    grown = max((norm / first for _, norm in norms), default=nan)
-    cut = max(loop.cuts, default=-1)  # beyond it the cotangent begins anew
-    whole = [(i, log(norm)) for i, norm in norms if 0 < norm < inf and i > cut]
-    steps = whole[0][0] - whole[-1][0] if whole else 0
-    rate = (whole[-1][1] - whole[0][1]) / steps if steps else nan
-    result = Record("backward", loop.n, loop.kept, recomputed, tuple(norms), rate, grown)
-    if result.flagged:
+    reference = nan
+    amplification = nan
+    logarithms = []
+    for i, norm in norms:
+        if norm > 0 and not reference > 0:
+            reference = norm
+        if 0 < norm < inf and i > last_cut:  # at a cut the cotangent begins anew
+            logarithms.append((i, log(norm)))
+    if norms:
+        amplification = max(norm for _, norm in norms) / reference
+    rate = nan
+    if logarithms:
+        (latest, first), (earliest, last) = logarithms[0], logarithms[-1]
+        if latest > earliest:
+            rate = (last - first) / (latest - earliest)
+    record = Record("backward", n, kept, recomputed, tuple(norms), rate, amplification)
+    if amplification > LIMIT:
         thread.grown += 1
         warnings.warn(
             GrowthWarning(
-                f"the cotangent grew by {grown:.0e} over {loop.n} steps of rollout, {rate:.2g} a step in the "
+                f"the cotangent grew by {amplification:.0e} over {n} steps of rollout, {rate:.2g} a step in the "
                 "logarithm; the gradient is exact and of little use, take fewer steps or truncate"
             ),
             stacklevel=2,
         )
-    return result
+    return record
 
 
-def largest(cotangents):
-    """Largest entry of some cotangents, plain or traced, of which None counts for nothing."""
-    return max((_largest(plain(g)) for g in cotangents if g is not None), default=0.0)
-
-
-def _largest(g):
-    """Largest entry, without a temporary array; NaN and infinity come through."""
-    if not np.size(g):
-        return 0.0
-    if np.iscomplexobj(g):
-        return float(np.max(np.abs(g)))
-    low, high = float(np.minimum.reduce(g, axis=None)), float(np.maximum.reduce(g, axis=None))
-    return max(high, -low) if low == low else low
+def largest(arrays: Any) -> float:
+    """Return the largest entry of some arrays, plain or traced; None counts as empty, NaN and infinity as they are."""
+    total = 0.0
+    for array in arrays:
+        if array is None or not np.size(array := plain(array)):
+            continue
+        if np.iscomplexobj(array):
+            size = float(np.max(np.abs(array)))
+        else:  # without a temporary array
+            size = max(float(np.maximum.reduce(array, axis=None)), -float(np.minimum.reduce(array, axis=None)))
+        total = size if size > total or size != size else total
+    return total

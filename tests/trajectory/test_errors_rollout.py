@@ -302,32 +302,32 @@ TABLE = [
     (
         slope(lambda u, p: anp.tanh(1e160 * u * p), 0.0 * U, 1.0),
         FINITE,
-        "the way back through 3 steps of rollout makes the gradient in params NaN or infinite; "
+        "the backward pass through 3 steps of rollout makes the gradient in params NaN or infinite; "
         "take fewer steps, or cut it with truncate",
     ),
     (
         slope(root, 0.0 * U),
         FINITE,
-        "on the way back through step 2 of rollout: the derivative of sqrt is NaN or infinite where its argument is "
-        "0; keep it away from there",
+        "in the backward pass through step 2 of rollout: the derivative of sqrt is NaN or infinite where its argument "
+        "is 0; keep it away from there",
     ),
     (
         slope(root, 0.0 * U, memory=150),
         FINITE,
-        "on the way back through step 2 of rollout: the derivative of sqrt is NaN or infinite where its argument is "
-        "0; keep it away from there",
+        "in the backward pass through step 2 of rollout: the derivative of sqrt is NaN or infinite where its argument "
+        "is 0; keep it away from there",
     ),
     (
         grad(lambda p: anp.sum(dp.rollout(by_length, 0.0 * U, p * U, 3))),
         FINITE,
-        "on the way back through step 2 of rollout: the derivative of norm is NaN or infinite where its argument is "
-        "0; keep it away from there",
+        "in the backward pass through step 2 of rollout: the derivative of norm is NaN or infinite where its argument "
+        "is 0; keep it away from there",
     ),
     (
         grad(lambda p: anp.sum(dp.rollout(lambda u, p: law(u) * p, U, p, 3))),
         FINITE,
-        "on the way back through step 2 of rollout: the derivative of law is NaN or infinite where its argument is "
-        "4; keep it away from there",
+        "in the backward pass through step 2 of rollout: the derivative of law is NaN or infinite where its argument "
+        "is 4; keep it away from there",
     ),
 ]
 

@@ -10,7 +10,7 @@ import pytest
 import sparsedp as dp
 from sparsedp._utils.pytree import flatten, leaves
 from sparsedp.autodiff.derivative import pullback, pushforward
-from sparsedp.trajectory.memory_budget import advances, stride
+from sparsedp.trajectory.checkpoint_plan import advances, stride
 
 N = 9
 START = {"u": np.array([0.3, -1.2, 0.8, 0.1, 2.0]), "v": np.array([1.0, 0.2, -0.4, 0.9, -0.7]), "turn": 0, "name": "a"}
@@ -232,7 +232,7 @@ def test_steps_may_write_into_arrays_of_their_own(memory, period):
 
 def test_masked_arrays_are_refused():
     u = np.arange(3.0)
-    end = "; fill it first, and hand the mask along as an array of its own"
+    end = "; fill it first, and pass the mask as an array of its own"
     masked = np.ma.masked_array(u, u > 1)
     for message, call in {
         "rollout takes plain arrays, got a masked array as state['b'][1]": lambda: (same, {"b": (u, masked)}, None),
@@ -243,7 +243,7 @@ def test_masked_arrays_are_refused():
         with pytest.raises(TypeError, match=re.escape(message + end)):
             dp.rollout(*call(), 2)
     with pytest.raises(
-        TypeError, match="keep returned a masked array; fill it first, and hand the mask along as an array of its own"
+        TypeError, match="keep returned a masked array; fill it first, and pass the mask as an array of its own"
     ):
         dp.rollout(same, u, None, 2, keep=lambda i, u: np.ma.masked_array(u))
 

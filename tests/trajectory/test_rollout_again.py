@@ -11,7 +11,7 @@ import pytest
 import sparsedp as dp
 from sparsedp.autodiff.derivative import pullback, pushforward
 from sparsedp.errors import DerivativeError
-from sparsedp.trajectory.layout import fingerprint
+from sparsedp.trajectory.specification import fingerprint
 
 N = 12
 U = np.array([0.3, -0.5, 0.8, 0.1])

@@ -10,7 +10,7 @@ import sparsedp as dp
 from sparsedp._utils.counters import recording
 from sparsedp.autodiff.tape import Rule
 from sparsedp.errors import BudgetWarning
-from sparsedp.trajectory.memory_budget import advances, budget_within_reach, slots_within, stride
+from sparsedp.trajectory.checkpoint_plan import advances, budget_within_reach, slots_within, stride
 
 
 def shift(wrong=None):
@@ -159,7 +159,7 @@ def peak(call):
 @pytest.mark.parametrize("keep", ["last", "all"])
 def test_peak_is_the_trajectory(step, keep, monkeypatch):
     """Where tapes have no room beside it."""
-    monkeypatch.setattr("sparsedp.trajectory.rollout.ROOM", 2**22)
+    monkeypatch.setattr("sparsedp.trajectory.rollout.TAPE_BYTES", 2**22)
     u = np.random.default_rng(0).random(20_000)
     n = 100
     c = np.full(u.shape, 0.5)
@@ -317,7 +317,7 @@ def test_constants_of_a_step_leave_its_tapes_where_they_are():
 @pytest.mark.parametrize("given", ["16 MB", None])
 def test_tapes_of_large_steps_keep_to_their_room(given, monkeypatch):
     """A step that makes arrays far larger than the state, as between all pairs of bodies: few of them stay on tapes."""
-    monkeypatch.setattr("sparsedp.trajectory.rollout.ROOM", 2**24)
+    monkeypatch.setattr("sparsedp.trajectory.rollout.TAPE_BYTES", 2**24)
     x = np.random.default_rng(0).random((120, 3))
     pairs = 120**2 * 8
 

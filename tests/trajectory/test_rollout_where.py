@@ -36,6 +36,6 @@ def test_backward():
 
     rule = differentiable("stuck", lambda u: u + 1.0, stuck)
     start = np.zeros(2)
-    with pytest.raises(ConvergenceError, match="^on the way back through step 2 of rollout: stuck$") as caught:
+    with pytest.raises(ConvergenceError, match="^in the backward pass through step 2 of rollout: stuck$") as caught:
         dp.value_and_grad(lambda u: dp.rollout(lambda u, _: rule(u), u, None, 5)[0])(start)
     assert caught.value.info == "record" and np.array_equal(caught.value.best, [2.0, 2.0])

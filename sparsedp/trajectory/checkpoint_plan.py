@@ -1,0 +1,196 @@
+"""Which states of a rollout to keep: binomial checkpointing, optimal for a known number of steps.
+
+With s kept states (the first one included) and at most r runs over any step,
+
+    beta(s, r) = (s + r)! / (s! r!)
+
+steps can be reversed. For n steps with beta(s, r-1) < n <= beta(s, r) the least number of plain steps is
+
+    t(n, s) = r n - beta(s + 1, r - 1),
+
+the first run over n - 1 steps included. It is reached by any rule that puts the next kept state m steps ahead, where
+both parts stay in the range of their own r: beta(s, r-2) <= m <= beta(s, r-1) and
+beta(s-1, r-1) <= n - m <= beta(s-1, r).
+
+References
+----------
+A. Griewank, A. Walther, ACM Trans. Math. Softw. 26 (2000) 19-45.
+"""
+
+from __future__ import annotations
+
+import re
+from bisect import bisect_left
+from dataclasses import dataclass
+from math import comb
+from typing import TYPE_CHECKING
+
+from sparsedp._utils.validation import is_number
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+__all__ = [
+    "CheckpointPlan",
+    "advances",
+    "budget_within_reach",
+    "checkpoints",
+    "slots_within",
+    "stride",
+    "tape_bytes_within",
+]
+
+UNITS = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
+WORKING = 4  # states in use beside the kept ones: the present, its cotangent and the one before, the result
+OWN = 5  # states reserved for the memory that a step needs by itself, where there is room for that
+SLOW = 3  # ratio of the runs of steps to those with at most twice the memory, from which on there is a warning
+
+
+@dataclass(frozen=True)
+class CheckpointPlan:
+    """Which states a rollout keeps for its backward pass, and which steps keep their tape.
+
+    Parameters
+    ----------
+    n : int
+        Number of steps.
+    slots : int or None
+        How many states may be kept; None: all of them.
+    tape_bytes : int
+        Memory for tapes of steps that are kept from the forward pass.
+    is_reversing : bool
+        Whether no state is kept, and the backward pass reverses the steps.
+    """
+
+    n: int
+    slots: int | None
+    tape_bytes: int
+    is_reversing: bool = False
+
+    def stored_indices(self) -> set[int]:
+        """Return the indices of the states that the forward pass keeps, the last one included."""
+        if self.is_reversing:
+            return {self.n}
+        return {*checkpoints(self.n, self.slots), self.n}
+
+    def next_index(self, start: int, stop: int, kept: int) -> int:
+        """Return the index of the next state to keep on the way from one state to another one.
+
+        Parameters
+        ----------
+        start, stop : int
+            Index of the state reached, and of the state that is wanted.
+        kept : int
+            Number of states kept so far.
+        """
+        free = 1 if self.slots is None else max(self.slots - kept + 1, 1)
+        return start + stride(stop + 1 - start, free)
+
+
+def beta(s: int, r: int) -> int:
+    """Return the number of steps that s kept states and r runs can reverse; 0 where r or s is negative."""
+    return comb(s + r, r) if s >= 0 <= r else 0
+
+
+def repetitions(n: int, s: int) -> int:
+    """Return the least r with beta(s, r) >= n."""
+    if s == 1:
+        return n - 1
+    r = 0
+    reach = 1
+    while reach < n:
+        r += 1
+        reach = reach * (s + r) // r
+    return r
+
+
+def advances(n: int, s: int) -> int:
+    """Return the least number of plain steps that reversing n steps takes with s kept states.
+
+    The first run over n - 1 steps is included.
+    """
+    if n <= 1:
+        return 0
+    r = repetitions(n, s)
+    return r * n - beta(s + 1, r - 1)
+
+
+def stride(n: int, s: int) -> int:
+    """Return after how many steps the next state is kept, of n > 1 steps ahead and s states that may be kept."""
+    if s == 1:
+        return n - 1  # no further state is kept: go to the last one
+    r = repetitions(n, s)
+    return min(beta(s, r - 1), n - beta(s - 1, r - 1))
+
+
+def checkpoints(n: int, s: int | None) -> Iterator[int]:
+    """Yield the indices of the states to keep in the forward pass, where s states may be kept; None: all."""
+    i = 0
+    kept = 0
+    while i < n:
+        yield i
+        kept += 1
+        if s is None or n - i == 1:
+            i += 1
+        else:
+            i += stride(n - i, s - kept + 1)
+
+
+def slots_within(memory: float | str, state_bytes: int, n: int, beside: int = 0) -> int:
+    """Return how many states of a size fit into a memory beside those in use, at most n.
+
+    Parameters
+    ----------
+    memory : number of bytes, or text such as "200 MB"
+    state_bytes : int
+    n : int
+        Number of steps.
+    beside : int
+        Bytes of params and inputs and their gradients.
+
+    Raises
+    ------
+    ValueError
+        If not even the first state fits, or memory is not a positive number of bytes.
+    """
+    size = max(state_bytes, 1)
+    slots = (_bytes(memory) - beside) // size - WORKING
+    if slots < 1:
+        raise ValueError(
+            f"rollout cannot work within memory={memory!r}: {WORKING + 1} states of {size} bytes and {beside} bytes "
+            f"for params and inputs are needed; write memory={(WORKING + 1) * size + beside}"
+        )
+    slots -= min(OWN, slots // 16)
+    return min(slots, max(n, 1))
+
+
+def budget_within_reach(memory: float | str, state_bytes: int, n: int, beside: int = 0) -> int | None:
+    """Return the least number of bytes with which n steps take a third of the runs, if twice the memory is enough.
+
+    Examples
+    --------
+    >>> budget_within_reach(500, 100, 100), budget_within_reach(5000, 100, 100)
+    (600, None)
+    """
+    runs = advances(n, slots_within(memory, state_bytes, n, beside)) + 1
+    slots = bisect_left(range(n), True, lo=1, key=lambda s: SLOW * (advances(n, s) + 1) <= runs)
+    budget = beside + (slots + min(OWN, slots // 15) + WORKING) * state_bytes
+    if slots < n and budget <= 2 * _bytes(memory):
+        return budget
+    return None
+
+
+def tape_bytes_within(memory: float | str, state_bytes: int, n: int, beside: int = 0) -> int:
+    """Return the bytes for tapes of steps where all n states are kept; negative where these do not fit."""
+    return _bytes(memory) - beside - (n + WORKING + OWN) * state_bytes
+
+
+def _bytes(memory: float | str) -> int:
+    """Return a memory, a number of bytes or a text such as "200 MB", in bytes."""
+    if isinstance(memory, str):
+        match = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)\s*([A-Za-z]+)\s*", memory)
+        if match and match[2].upper() in UNITS:
+            return int(float(match[1]) * UNITS[match[2].upper()])
+    elif is_number(memory) and 0 < memory < float("inf"):
+        return int(memory)
+    raise ValueError(f'rollout needs memory as bytes > 0 or a text, got {memory!r}; write for example "200 MB"')

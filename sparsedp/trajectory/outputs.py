@@ -1,0 +1,311 @@
+"""What a rollout returns: the last state, selected or all states, or the results of a function of each.
+
+Each kind takes the states of a forward pass as they come (`start`, `see`, `finish`) and builds the user's tree from the
+arrays of the last run (`tree`). In the backward pass `sources` says which cotangents enter at which state.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sparsedp._utils.pytree import flatten, leaves, mapped, paired
+from sparsedp._utils.validation import is_whole
+from sparsedp.autodiff.backend import as_field, is_distributed
+from sparsedp.autodiff.derivative import linearised
+from sparsedp.autodiff.tape import dtype_of, is_variable, isbox, plain, split_boxes, traces_of
+from sparsedp.autodiff.tape_constants import constant
+from sparsedp.errors import DerivativeError
+from sparsedp.trajectory.specification import fingerprint, owned, refuse_mask, stacked
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from sparsedp.trajectory.specification import Layout
+    from sparsedp.trajectory.step_runner import State, StepRunner
+
+__all__ = ["AllStates", "FunctionOfStates", "LastState", "SelectedStates", "make_outputs"]
+
+NOT_REPEATABLE = "keep returns something else when it is called again; it must depend on its arguments only"
+
+
+def make_outputs(keep: Any, layout: Layout, n: int) -> LastState:
+    """Return the kind of output that `keep` of a rollout of n steps asks for; refuse anything else."""
+    if isinstance(keep, str) and keep == "last":
+        return LastState(layout)
+    if isinstance(keep, str) and keep == "all":
+        return AllStates(layout, range(n + 1))
+    if callable(keep):
+        return FunctionOfStates(layout, keep)
+    if not isinstance(keep, (list, tuple, range, np.ndarray)):
+        raise ValueError(f'keep must be "last", "all", a list of states or a function of (index, state), got {keep!r}')
+    numbers = list(keep)
+    if not numbers or not all(is_whole(number, 0) for number in numbers):
+        raise ValueError(f"keep needs at least one state, numbers from 0 on, got {keep!r}")
+    if numbers[-1] > n or any(later <= number for number, later in pairwise(numbers)):
+        raise ValueError(f"keep needs rising numbers of states from 0 to n = {n}, got {keep!r}")
+    return SelectedStates(layout, numbers)
+
+
+class LastState:
+    """The last state.
+
+    Parameters
+    ----------
+    layout : Layout
+    """
+
+    enters_everywhere = False  # whether cotangents may enter at any state, not at the last one alone
+    is_exact = True  # whether the states of the backward pass have the same bits as those of the forward pass
+    holds_all_states = False  # whether every state is returned, and thereby kept
+
+    def __init__(self, layout: Layout) -> None:
+        self.layout = layout
+        self._statics: Any = None
+
+    def start(self, runner: StepRunner) -> None:
+        """Begin a run."""
+
+    def see(self, state: State) -> State:
+        """Take a state of the run; return the same state, perhaps in other memory."""
+        return state
+
+    def finish(self, last: State) -> tuple:
+        """End a run; return the arrays of the result."""
+        self._statics = last.statics
+        return tuple(map(owned, last.values))
+
+    def tree(self, arrays: Sequence) -> Any:
+        """Return the user's result, from arrays as `finish` returns them."""
+        values = []
+        for value, is_python_float in zip(arrays, self.layout.is_float, strict=True):
+            values.append(float(value) if is_python_float and not isbox(value) else value)
+        return self.layout.build(values, self._statics)
+
+    def sources(self, n: int, cotangents: list) -> Callable[[State], list | None]:
+        """Return a function from a state to the cotangents that enter there, or None; n is the last state."""
+        if len(cotangents) > 1:
+            cotangents = [None if _is_zero(g) else g for g in cotangents]
+
+        def source(state: State) -> list | None:
+            return cotangents if state.i == n else None
+
+        return source
+
+
+def _is_zero(back: Any) -> bool:
+    """Whether a cotangent is zero: nothing is propagated from a field that the result does not use."""
+    return type(back) is np.ndarray and not back.any()
+
+
+class SelectedStates(LastState):
+    """The states of given numbers, stacked along a new first axis; on ranks a tuple of them.
+
+    Parameters
+    ----------
+    layout : Layout
+    numbers : sequence of int
+        Rising.
+    """
+
+    enters_everywhere = True
+
+    def __init__(self, layout: Layout, numbers: Sequence[int]) -> None:
+        super().__init__(layout)
+        self._rows = {number: row for row, number in enumerate(numbers)}
+        self._places: list = []  # of each variable: the place of its stack, or the slice of its states
+
+    def start(self, runner: StepRunner) -> None:
+        """Begin a run: a block for each variable, or a list where its states are traced or not NumPy arrays."""
+        n = len(self._rows)
+        self._blocks: list = []
+        self._statics = []
+        self._is_stored = bool(runner.specification.differentiated)
+        for shape, dtype, value in zip(self.layout.shapes, self.layout.dtypes, runner.first.values, strict=True):
+            if runner.outer or is_distributed(value):
+                self._blocks.append([None] * n)
+            else:
+                self._blocks.append(np.empty((n, *shape), dtype))
+
+    def see(self, state: State) -> State:
+        """Store a state; where all are returned, the state moves to the memory of the result."""
+        row = self._rows.get(state.i)
+        if row is None:
+            return state
+        self._statics.append(state.statics)
+        values = list(state.values)
+        for k, block in enumerate(self._blocks):
+            if is_distributed(values[k]) and not isinstance(block, list):
+                block = self._blocks[k] = [*block]  # the first state was a NumPy array, this one is in blocks
+            block[row] = owned(values[k]) if isinstance(block, list) else values[k]
+            if np.ndim(values[k]) and self.holds_all_states:
+                values[k] = block[row]
+        return state.with_values(values)
+
+    def finish(self, last: State) -> tuple:
+        """End a run; where all states are returned, the backward pass uses these very arrays."""
+        arrays: list = []
+        self._places = []
+        for block in self._blocks:
+            if isinstance(block, list) and is_distributed(block[-1]):
+                self._places.append(slice(len(arrays), len(arrays) + len(block)))
+                arrays += block
+            else:
+                self._places.append(len(arrays))
+                arrays.append(stacked(block) if isinstance(block, list) else block)
+        self._blocks = []
+        for block in arrays:
+            if type(block) is np.ndarray:
+                block.flags.writeable = not (self.holds_all_states and self._is_stored)
+        return tuple(arrays)
+
+    def _grouped(self, arrays: Sequence) -> list:
+        """Return for each variable its stack, or the tuple of its states."""
+        groups: list = []
+        for place in self._places:
+            groups.append(arrays[place] if isinstance(place, int) else tuple(arrays[place]))
+        return groups
+
+    def tree(self, arrays: Sequence) -> Any:
+        """Return the user's result, from arrays as `finish` returns them."""
+        statics = [_along_trajectory(leaf) for leaf in zip(*self._statics, strict=True)]
+        return self.layout.build(self._grouped(arrays), statics)
+
+    def sources(self, n: int, cotangents: list) -> Callable[[State], list | None]:
+        """Return a function from a state to the cotangents that enter there, or None."""
+        blocks = self._grouped(cotangents)
+
+        def source(state: State) -> list | None:
+            row = self._rows.get(state.i)
+            return None if row is None else [block[row] for block in blocks]
+
+        return source
+
+
+class AllStates(SelectedStates):
+    """All n + 1 states."""
+
+    holds_all_states = True
+
+
+def _along_trajectory(leaf: tuple) -> Any:
+    """Stack the numbers and arrays of a static leaf in all states; take the first one of anything else."""
+    return np.stack(leaf) if isinstance(leaf[0], (bool, int, np.ndarray, np.generic)) else leaf[0]
+
+
+class _StackedResult:
+    """Stands for a floating result in a tree: the number of its stack, and its row there; None where it is alone."""
+
+    def __init__(self, stack: int, row: int | None) -> None:
+        self.stack = stack
+        self.row = row
+
+    def of(self, stacks: Sequence) -> Any:
+        """Return the result itself, or its cotangent."""
+        stack = stacks[self.stack]
+        return stack if self.row is None else stack[self.row]
+
+
+class FunctionOfStates(LastState):
+    """The results of function(index, state) for each state; floating results of one shape are kept in one stack.
+
+    Parameters
+    ----------
+    layout : Layout
+    function : callable
+    """
+
+    enters_everywhere = True
+
+    def __init__(self, layout: Layout, function: Callable) -> None:
+        super().__init__(layout)
+        self.function = function
+        self._fingerprints: list = []  # of the results, to compare with those of further calls
+        self._trees: list = []  # the results, with a _StackedResult in place of each floating leaf
+        self._first_trees: list = []  # those of the first run, which decide the order of entries
+
+    def start(self, runner: StepRunner) -> None:
+        """Begin a run."""
+        self._stacks: dict = {}
+        self._first_trees = self._first_trees or self._trees
+        self._trees = []
+        self._runner = runner
+
+    def see(self, state: State) -> State:
+        """Call the function; return the same state."""
+        result = self.function(state.i, self._runner.state_tree(state))
+        if state.i < len(self._first_trees):
+            first = self._first_trees[state.i]
+            result = flatten(first)[1](self._paired(result, first, state.i))
+        self._trees.append(mapped(self._stored, result))
+        if self._runner.specification.differentiated:
+            self._compare(state.i, leaves(result))
+        return state
+
+    def _paired(self, result: Any, first: Any, i: int) -> list:
+        """Return the leaves of a result in the order of that of another call."""
+        return paired(result, first, f"keep({i}, state)", advice=f"; {NOT_REPEATABLE}", error=DerivativeError)
+
+    def _stored(self, leaf: Any) -> Any:
+        """Store a floating result; return its place in the stacks, or a constant for anything else."""
+        refuse_mask("keep returned a masked array", plain(leaf))
+        if not is_variable(leaf):
+            return constant(leaf)
+        (leaf,), _ = split_boxes([leaf], self._runner.number)
+        if not traces_of([leaf]) <= self._runner.outer:
+            raise DerivativeError(
+                "keep uses a traced value that is not part of the state, and its derivative would be lost; "
+                "return what it needs of the state, and combine the two outside of rollout"
+            )
+        is_alone = is_distributed(leaf)  # a field on ranks has a stack of its own
+        key = len(self._stacks) if is_alone else (np.shape(leaf), dtype_of(leaf).char)
+        stack = self._stacks.setdefault(key, [])
+        stack.append(owned(leaf))
+        return _StackedResult(list(self._stacks).index(key), None if is_alone else len(stack) - 1)
+
+    def _compare(self, i: int, results: Sequence) -> None:
+        """Refuse a function that returns something else for a state than before."""
+        values = [as_field(plain(leaf)) for leaf in results if is_variable(leaf)]
+        fingerprints = [(value.shape, value.dtype, fingerprint([value])) for value in values]
+        if i == len(self._fingerprints):
+            self._fingerprints.append(fingerprints)
+        elif self.is_exact and self._fingerprints[i] != fingerprints:
+            raise DerivativeError(NOT_REPEATABLE)
+
+    def finish(self, last: State) -> tuple:
+        """End a run; return one array for each shape and dtype."""
+        arrays = []
+        for key, stack in self._stacks.items():
+            arrays.append(stack[0] if isinstance(key, int) else stacked(stack))
+        self._stacks = {}
+        return tuple(arrays)
+
+    def tree(self, arrays: Sequence) -> tuple:
+        """Return the tuple of what the function returned."""
+
+        def take(leaf: Any) -> Any:
+            return leaf.of(arrays) if isinstance(leaf, _StackedResult) else leaf
+
+        return tuple(mapped(take, tree) for tree in self._trees)
+
+    def sources(self, n: int, cotangents: list) -> Callable[[State], list | None]:
+        """Return a function from a state to the cotangents that enter there."""
+
+        def source(state: State) -> list:
+            tree = self.layout.build(state.values, state.statics)
+            first = self._trees[state.i]
+
+            def function(tree: Any) -> list:
+                return self._paired(self.function(state.i, tree), first, state.i)
+
+            results, _, pull = linearised(function, tree, map(is_variable, leaves(tree)))
+            self._compare(state.i, results)
+            entering = []
+            for leaf in leaves(first):
+                entering.append(leaf.of(cotangents) if isinstance(leaf, _StackedResult) else None)
+            pulled = pull(entering)
+            return [pulled[place] for place in self.layout.places]
+
+        return source

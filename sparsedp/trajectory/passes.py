@@ -1,0 +1,360 @@
+"""The forward and the backward pass of a rollout, and the rule with which the tape calls them.
+
+A rollout is one node on the tape of the innermost trace of its arguments, if that is a reverse-mode trace. Every other
+trace goes through the steps themselves, in both passes: a forward derivative is the loop with tangents, and derivatives
+of higher order are those of the calls that the passes execute.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from operator import is_
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sparsedp._utils.counters import count
+from sparsedp._utils.progress import shown_steps
+from sparsedp.autodiff.derivative import is_finite, judged, zero_like
+from sparsedp.autodiff.tape import Rule, backward, fit, innermost, through
+from sparsedp.errors import DerivativeError, NonFiniteError
+from sparsedp.trajectory.record import Record, backward_record, largest, sampling_interval
+from sparsedp.trajectory.specification import RolloutSpecification, refuse_foreign_trace, stacked
+from sparsedp.trajectory.step_runner import State, StepRunner
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from sparsedp.trajectory.checkpoint_plan import CheckpointPlan
+    from sparsedp.trajectory.outputs import LastState
+
+__all__ = ["RolloutRule"]
+
+NODE_BYTES = 800  # of a node, its closures and tuples: 350 to 1200 were measured
+
+
+# ---- forward ---------------------------------------------------------------------------------------------------------
+
+
+def run_forward(
+    runner: StepRunner, plan: CheckpointPlan, outputs: LastState, stored: set[int], progress: bool | str
+) -> tuple[State, list[State]]:
+    """Run all steps; return the last state and the states kept for the backward pass, the last one included."""
+    is_differentiated = bool(runner.specification.differentiated)
+    recorder = runner.recorder
+    room = plan.tape_bytes
+    tape_bytes = 0
+    outputs.start(runner)
+    state = outputs.see(runner.first)
+    kept = [state]
+    for i in shown_steps(progress, range(plan.n), "forward"):
+        start = state
+        is_taped = is_differentiated and (i == 0 or tape_bytes <= room)
+        recorder.bytes = 0 if i < 2 else None
+        state = runner.step(start, is_taped)
+        if not runner.copies and True in map(is_, state.values, start.values) and _share_an_array(state, start):
+            runner.copies = True  # run from the start again: this step may have read an array that it wrote into
+            return run_forward(runner, plan, outputs, stored, progress)
+        if is_taped:
+            if i < 2:  # the first two tapes tell the memory of a step
+                size = recorder.bytes + len(start.tape[1]) * NODE_BYTES - runner.specification.state.nbytes
+                tape_bytes = max(size, 0)
+            room -= tape_bytes
+            if i == 0 and room < 0:
+                start.tape = None
+                state.boxes = None
+        if outputs.enters_everywhere:
+            state = outputs.see(state)
+        if i + 1 in stored:
+            if not is_taped and not outputs.holds_all_states:
+                state = state.owned()
+            kept.append(state)
+    return state, kept
+
+
+def _share_an_array(state: State, start: State) -> bool:
+    pairs = zip(state.values, start.values, strict=True)
+    return any(a is b and isinstance(a, np.ndarray) for a, b in pairs)
+
+
+def refuse_nonfinite_step(runner: StepRunner) -> None:
+    """Name the first step that makes NaN or infinity; they persist, so the forward pass looks at the last state."""
+    specification = runner.specification
+    state = runner.first
+    for i in range(specification.n):
+        state = runner.step(state, False)
+        specification.state.check_finite(state.values, f"step {i} of rollout", "needs a smaller time step")
+
+
+# ---- backward --------------------------------------------------------------------------------------------------------
+
+
+def run_backward(
+    runner: StepRunner,
+    plan: CheckpointPlan,
+    outputs: LastState,
+    kept: list[State],
+    cotangents: list,
+    progress: bool | str,
+) -> tuple[list, list[tuple[int, float]], int]:
+    """Run one backward pass over all steps.
+
+    Parameters
+    ----------
+    runner, plan, outputs
+        As in the forward pass.
+    kept : list of State
+        The states kept, the last one included; they are removed from the list.
+    cotangents : list
+        Of the arrays of the result.
+    progress : bool or str
+
+    Returns
+    -------
+    cotangents : list
+        Of the variables of all arguments, None where there is none.
+    norms : list of (int, float)
+        Index of a state and the largest entry of its cotangent.
+    recomputed : int
+        Number of steps that were run again.
+    """
+    specification = runner.specification
+    n = plan.n
+    interval = sampling_interval(n)
+    source = outputs.sources(n, cotangents)
+    sums: dict = {}  # root of params: (sum so far, whether it may be written to)
+    rows: list[list] = []  # cotangents of the rows of each block of inputs
+    for block, root in zip(runner.inputs, runner.input_roots, strict=True):
+        rows.append(list(zero_like(block)) if root else [])
+    recomputed = 0
+    state = kept.pop()
+    last = state if plan.is_reversing else None
+    total = source(state)
+    norms = [] if total is None else [(n, largest(total))]
+    for i in shown_steps(progress, range(n - 1, -1, -1), "backward"):
+        if total is None and not outputs.enters_everywhere:
+            break  # cut by truncation
+        is_taped = kept and kept[-1].tape
+        fingerprint = [] if is_taped else state.fingerprint()
+        if plan.is_reversing:
+            state = runner.reversed_step(state)
+        else:
+            state, repeated = _state_at(i, runner, plan, kept)
+            recomputed += repeated
+        if total is not None:
+            if not is_taped:
+                state = state.with_values(state.values)  # the tape is freed with it
+                repeated_end = runner.step(state, True).fingerprint()
+                if not plan.is_reversing:
+                    check_repeated(specification, repeated_end, fingerprint)
+            total = _pulled_back(total, runner, state, sums, rows)
+            if not is_taped:
+                state.tape = None
+        if i % interval == 0 and total is not None:
+            norms.append((i, largest(total)))
+        if outputs.enters_everywhere and i >= specification.first_traced:
+            total = _sum(total, source(state))
+    if last is not None and state.i == 0:
+        runner.check_drift(state, last)
+    backs = list(total or [None] * len(specification.state.places))
+    for root, value in zip(runner.param_roots, runner.params, strict=True):
+        back = sums[root][0] if root in sums else None
+        backs.append(None if back is None else fit("the step", value, back, back))
+    for row in rows:
+        backs.append(stacked(row) if row else None)
+    return backs, norms, recomputed
+
+
+def _pulled_back(g: list, runner: StepRunner, state: State, sums: dict, rows: list[list]) -> list | None:
+    """Return the cotangents of a taped state, from those of the state after it; None if there are none."""
+    roots, nodes, ends = state.tape
+    runner.current = state
+    backward(nodes, ends, g, sums)
+    backs: list = []
+    is_reached = False
+    for root, value in zip(roots, state.values):
+        back = sums.pop(root)[0] if root in sums else None
+        if back is not None:
+            back = fit("the step", value, back, back)
+            is_reached = True
+        backs.append(back)
+    for row, root in zip(rows, roots[len(backs) :]):
+        if root in sums:
+            row[state.i] = sums.pop(root)[0]
+    if not sums.keys() <= runner.lasting_nodes:  # a node of another step
+        refuse_foreign_trace("the step")
+    return backs if is_reached else None
+
+
+def _state_at(i: int, runner: StepRunner, plan: CheckpointPlan, kept: list[State]) -> tuple[State, int]:
+    """Return state i, run from the nearest kept state, and the number of steps that this took."""
+    state = kept.pop()
+    repeated = 0
+    while state.i < i:
+        kept.append(state)
+        stop = plan.next_index(state.i, i, len(kept))
+        repeated += stop - state.i
+        while state.i < stop:
+            state = runner.step(state, False)
+        state = state.owned()
+    return state, repeated
+
+
+def _sum(total: list | None, entering: list | None) -> list | None:
+    """Return the sum of two lists of cotangents, each of which may be or hold None."""
+    if entering is None:
+        return total
+    if total is None:
+        return entering
+    sums = []
+    for a, b in zip(total, entering, strict=True):
+        if a is None or b is None:
+            sums.append(b if a is None else a)
+        else:
+            sums.append(a + b)
+    return sums
+
+
+def check_repeated(specification: RolloutSpecification, fingerprints: list, earlier: list) -> None:
+    """Refuse a state that differs from the same state of an earlier run; both as fingerprints."""
+    if fingerprints == earlier:
+        return
+    layout = specification.state
+    names = [*layout.names, *[layout.root] * len(fingerprints)]
+    name = next(name for name, a, b in zip(names, fingerprints, earlier, strict=False) if a != b)
+    raise DerivativeError(f"the step gives another {name} when it is run again; it must depend on its arguments only")
+
+
+# ---- the rule --------------------------------------------------------------------------------------------------------
+
+
+class RolloutRule(Rule):
+    """A rollout as a rule of its variables, and the states that it keeps for the backward pass.
+
+    Parameters
+    ----------
+    specification : RolloutSpecification
+    plan : CheckpointPlan
+    outputs : LastState, SelectedStates, AllStates or FunctionOfStates
+    progress : bool or str
+    record : callable or None
+
+    Attributes
+    ----------
+    count : int
+        How many arrays are returned.
+    truncate : int or None
+        Of the specification: a check of the gradient names it.
+    """
+
+    name = "rollout"
+    jvp = None
+    keywords = ()
+
+    def __init__(
+        self,
+        specification: RolloutSpecification,
+        plan: CheckpointPlan,
+        outputs: LastState,
+        progress: bool | str,
+        record: Callable[[Record], Any] | None,
+    ) -> None:
+        self.specification = specification
+        self.truncate = specification.truncate
+        self.plan = plan
+        self.outputs = outputs
+        self.progress = progress
+        self.record = record
+        self.stored = plan.stored_indices() if specification.differentiated else {0}
+        self._runs: list[tuple[StepRunner, list[State]]] = []  # for the backward pass
+        self._last_fingerprint: list = []
+
+    def forward(self, *args: Any) -> Any:
+        """Run all steps; return the array or the arrays of the result."""
+        specification = self.specification
+        runner = StepRunner(specification, args)
+        with runner.errors_named():
+            last, kept = run_forward(runner, self.plan, self.outputs, self.stored, self.progress)
+        for value in last.values:
+            if not is_finite(value):
+                refuse_nonfinite_step(runner)
+        runner.recorder.ended = True
+        if specification.differentiated:
+            self._last_fingerprint = last.fingerprint()
+            self._runs = [(runner, kept)]
+        n_kept = len(self.stored) - 1
+        count("rollout.step", "forward", specification.n)
+        count("rollout", "bytes", n_kept * specification.state.nbytes)
+        if self.record is not None:
+            self.record(Record("forward", specification.n, n_kept, 0))
+        results = self.outputs.finish(last)
+        self.count = len(results)
+        return results if self.count != 1 else results[0]
+
+    def again(self, *args: Any) -> Any:
+        """Run the same steps from other values, which may be on any trace, without `progress` and `record`."""
+        old = self.specification
+        specification = RolloutSpecification(old.step, old.layouts, old.n, old.truncate, innermost(args))
+        rule = RolloutRule(specification, self.plan, copy(self.outputs), False, None)
+        return through(rule, specification.differentiated, *args)
+
+    def parts(self, values: Any) -> list:
+        """Return the results of `forward`, or their cotangents, as a list."""
+        if self.count == 1:
+            return [values]
+        return [values[k] for k in range(self.count)]
+
+    def vjp(self, nums: Sequence[int], ans: Any, *args: Any) -> Callable:
+        """Return the function from the cotangents of the result to those of the differentiated arguments."""
+        runs = self._take_runs()
+
+        def pull(g: Any) -> tuple:
+            return self._cotangents(args, self.parts(g), runs)
+
+        return pull
+
+    def _take_runs(self) -> list:
+        """Return and clear the last run; the rule does not hold it, which would keep its states in memory."""
+        runs = self._runs
+        self._runs = []
+        return runs
+
+    def _cotangents(self, args: tuple, g: list, runs: list) -> tuple:
+        """Return the cotangents of the differentiated arguments, which must be finite."""
+        backs = self._backward_pass(args, g, runs)
+        for position, back in zip(self.specification.differentiated, backs, strict=True):
+            if not is_finite(back) and all(map(is_finite, g)):
+                with judged():  # a second run names the call that made it, if one did
+                    self._backward_pass(args, g, [])
+                raise NonFiniteError(
+                    f"the backward pass through {self.specification.n} steps of rollout makes the gradient in "
+                    f"{self.specification.names[position]} NaN or infinite; take fewer steps, or cut it with truncate"
+                )
+        return backs
+
+    def _backward_pass(self, args: tuple, g: list, runs: list) -> tuple:
+        """Return the cotangents, finite or not. With limited memory a run is freed while it is used, and run again."""
+        specification = self.specification
+        if not runs:
+            last_fingerprint = self._last_fingerprint
+            self.forward(*args)
+            check_repeated(specification, self._last_fingerprint, last_fingerprint)
+            runs.extend(self._take_runs())
+        runner, kept = runs[0] if self.plan.slots is None else runs.pop()
+        if runs:
+            kept = list(kept)
+        runner.recorder.ended = False
+        with runner.errors_named("in the backward pass through step"):
+            backs, norms, recomputed = run_backward(runner, self.plan, self.outputs, kept, g, self.progress)
+        runner.recorder.ended = True
+        count("rollout.step", "vjp", specification.n)
+        count("rollout.step", "recomputed", recomputed)
+        last_cut = max(specification.cuts, default=-1)
+        record = backward_record(specification.n, len(self.stored) - 1, recomputed, norms, last_cut)
+        if self.record is not None:
+            self.record(record)
+        cotangents = []
+        for position in specification.differentiated:
+            back = backs[position]
+            cotangents.append(zero_like(args[position]) if back is None else back)
+        return tuple(cotangents)

@@ -1,0 +1,390 @@
+"""What a rollout computes: its step, the forms of its arguments, and which of them are differentiated.
+
+A `Layout` says where the numbers of a tree are, and whether another tree has the same form. A `RolloutSpecification`
+holds the layouts of state, params and inputs; it does not change while the rollout runs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import autograd.numpy as anp
+import numpy as np
+
+from sparsedp._utils.pytree import described, flatten, keys, labels, leaves, paired
+from sparsedp._utils.validation import check_finite, check_leaves, check_native, hidden_leaves
+from sparsedp.autodiff.backend import array_types, as_field, is_distributed
+from sparsedp.autodiff.derivative import is_finite
+from sparsedp.autodiff.tape import cast, dtype_of, is_variable, isbox, plain, split_boxes, traces_of
+from sparsedp.autodiff.tape_constants import constant
+from sparsedp.errors import DerivativeError, ShapeError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+__all__ = [
+    "Layout",
+    "RolloutSpecification",
+    "contiguous",
+    "fingerprint",
+    "folded",
+    "owned",
+    "refuse_foreign_trace",
+    "refuse_mask",
+    "stacked",
+]
+
+FOLD = 509  # words in a line of a fingerprint: a prime, so that a field that was shifted has another one
+OTHER_FOLD = 521  # where an axis of the array is a multiple of the first
+WHOLE = 8192  # bytes up to which a fingerprint is that of all bytes
+
+
+class Layout:
+    """The form of a tree: which leaves are variables (floating numbers and arrays) and which are static.
+
+    Parameters
+    ----------
+    tree : any nesting of arrays, tuples, lists and dicts
+    root : str
+        Its name in messages.
+
+    Attributes
+    ----------
+    places : list of int
+        Positions of the variables among the leaves.
+    statics : tuple
+        All leaves, None in place of the variables.
+    is_leaf, is_flat : bool
+        The tree is one variable and nothing else, or a tuple of variables.
+    is_open : bool
+        Some branch is a dict or a list, whose entries could be changed.
+    shapes, dtypes, is_float : list
+        Of the variables; `is_float`: whether it is a float of Python.
+    nbytes : int
+        Of all of them.
+    rounds : bool
+        Whether a step may widen float32 to float64, and its result is rounded: beside numbers of Python, which are
+        traced as float64, autograd widens what NumPy does not.
+    """
+
+    rounds = False
+
+    def __init__(self, tree: Any, root: str) -> None:
+        entries, rebuild = flatten(tree)
+        self.root = root
+        self.places: list[int] = []
+        self.shapes: list[tuple] = []
+        self.dtypes: list[np.dtype] = []
+        self.is_float: list[bool] = []
+        self.nbytes = 0
+        statics = []
+        for place, leaf in enumerate(entries):
+            if not is_variable(leaf):
+                statics.append(constant(leaf))
+                continue
+            statics.append(None)  # a layout that is kept must not hold a trace or a large array
+            value = plain(leaf)
+            self.places.append(place)
+            self.shapes.append(np.shape(value))
+            self.dtypes.append(dtype_of(value))
+            self.is_float.append(type(value) is float)
+            self.nbytes += as_field(value).nbytes
+        self.statics = tuple(statics)
+        self._template = rebuild(self.statics)
+        self.is_leaf = bool(self.places) and keys(tree) is None
+        self.is_flat = type(tree) is tuple and len(self.places) == len(entries) == len(tree)
+        if self.is_flat:
+            for branch in tree:
+                self.is_flat = self.is_flat and keys(branch) is None
+        self._check(tree, entries)
+        self.is_open = _is_open(tree)
+
+    def _check(self, tree: Any, entries: list) -> None:
+        for place, leaf in enumerate(entries):
+            if isinstance(leaf, np.ma.MaskedArray):
+                refuse_mask(f"rollout takes plain arrays, got a masked array as {self.labels[place]}", leaf)
+        check_native("rollout", *entries)
+        check_leaves(self.root, tree, containers=False)
+        for place, leaf in enumerate(entries):
+            for hidden in hidden_leaves(leaf):
+                if isbox(hidden):
+                    raise DerivativeError(
+                        f"{labels(tree, self.root)[place]} of rollout is a {type(leaf).__name__} with a traced value, "
+                        "which is not a tree; write a dict or a NamedTuple"
+                    )
+
+    @cached_property
+    def labels(self) -> list[str]:
+        """Return the names of all leaves, as one would write them: ``state["ink"][0]``."""
+        return labels(self._template, self.root)
+
+    @property
+    def names(self) -> list[str]:
+        """Return the names of the variables."""
+        return [self.labels[place] for place in self.places]
+
+    def variables(self, tree: Any) -> list:
+        """Return the variables of the tree from which the layout was built, contiguous."""
+        entries = leaves(tree)
+        values = []
+        for place in self.places:
+            values.append(contiguous(entries[place]))
+        return values
+
+    def build(self, variables: Sequence, statics: Sequence | None = None) -> Any:
+        """Return the tree of variables, of which there may be more than needed, and of the other leaves."""
+        if self.is_leaf:
+            return variables[0]
+        if self.is_flat:
+            return tuple(variables[: len(self.places)])
+        entries = list(self.statics if statics is None else statics)
+        for place, value in zip(self.places, variables):
+            entries[place] = value
+        return self._rebuild(entries)
+
+    @cached_property
+    def _rebuild(self) -> Callable:
+        return flatten(self._template)[1]
+
+    def take(self, tree: Any, origin: str, number: int, outer: set[int]) -> tuple:
+        """Take a tree of the same form apart.
+
+        Parameters
+        ----------
+        tree : any nesting of arrays, tuples, lists and dicts
+        origin : str
+            What returned the tree, for messages.
+        number : int
+            The trace of the rollout.
+        outer : set of int
+            The other traces that the variables may be on.
+
+        Returns
+        -------
+        variables : list or None
+            As they were returned; None where an array had to be converted.
+        values : list
+            The same without the trace of the rollout, contiguous.
+        nodes : list
+            Their nodes on that trace, or None.
+        statics : tuple
+            The other leaves.
+
+        Raises
+        ------
+        ShapeError
+            If the form, a shape or a dtype differs.
+        """
+        variables: Any
+        if self.is_leaf and not isinstance(tree, (tuple, list, dict)):
+            variables = [tree]
+            statics = self.statics
+        elif self.is_flat and type(tree) is tuple and len(tree) == len(self.places):
+            variables = tree
+            statics = self.statics
+        else:
+            variables, statics = self._separated(tree, origin)
+        values, nodes = split_boxes(variables, number)
+        for k, value in enumerate(values):
+            if not (
+                type(value) is np.ndarray
+                and value.shape == self.shapes[k]
+                and value.dtype == self.dtypes[k]
+                and value.flags.c_contiguous
+            ):
+                values[k] = self._converted(k, value, origin, outer)
+                if values[k] is not value:
+                    variables = None
+        return variables, values, nodes, statics
+
+    def _separated(self, tree: Any, origin: str) -> tuple[list, tuple]:
+        """Return the variables and the other leaves of a tree of the same form."""
+        advice = "; return a state like the first one"
+        entries = paired(tree, self._template, self.root, f" after {origin}", advice)
+        variables = [entries[place] for place in self.places]
+        if len(variables) == len(entries):
+            return variables, self.statics
+        for place in self.places:
+            entries[place] = None
+        statics = tuple(map(constant, entries))
+        for leaf, first in zip(statics, self.statics, strict=True):
+            refuse_mask(f"{origin} made a masked array of {self.root}", leaf)
+            if is_variable(leaf):
+                raise ShapeError(
+                    f"{self.root} must keep its form: {origin} made a floating value of {_brief(first)}; "
+                    "start with a floating value, for example state.astype(float)"
+                )
+        return variables, statics
+
+    def _converted(self, k: int, value: Any, origin: str, outer: set[int]) -> Any:
+        """Return a variable as a contiguous array or number of its shape and dtype; refuse other ones."""
+        name = self.names[k]
+        dtype = self.dtypes[k]
+        if not traces_of([value]) <= outer:
+            refuse_foreign_trace(origin)
+        refuse_mask(f"{origin} made a masked array of {name}", plain(value))
+        if not isinstance(plain(value), (np.generic, float, complex, *array_types())):
+            raise ShapeError(_changed(name, "one array", described(value), origin))
+        if np.shape(value) != self.shapes[k]:
+            raise ShapeError(_changed(name, f"shape {self.shapes[k]}", f"shape {np.shape(value)}", origin))
+        if self.rounds and dtype_of(value) == np.result_type(dtype, np.float64):
+            value = cast(value, dtype)
+        if dtype_of(value).kind == "O":
+            raise ShapeError(
+                f"{name} must keep its form: {origin} made an array of objects; use autograd.numpy as np in it"
+            )
+        if dtype_of(value) != dtype:
+            raise ShapeError(_changed(name, f"dtype {dtype}", f"dtype {dtype_of(value)}", origin))
+        return contiguous(value)
+
+    def check_finite(self, values: Sequence, owner: str, needs: str = "must be finite") -> None:
+        """Refuse NaN and infinity in variables; the message names the leaf, the first index and the count."""
+        for k, value in enumerate(values):
+            if not is_finite(value):
+                check_finite(f"{self.names[k]} of {owner}", plain(value), needs)
+
+
+@dataclass(eq=False)
+class RolloutSpecification:
+    """The step of a rollout, its arguments, and which of them are differentiated.
+
+    Parameters
+    ----------
+    step : callable
+    layouts : list of Layout
+        Of state, params and, where there are any, inputs.
+    n : int
+        Number of steps.
+    truncate : int or None
+    differentiated : list of int
+        Positions of the variables, of all arguments in this order, that need a cotangent.
+
+    Attributes
+    ----------
+    state, params, inputs : Layout
+        `inputs` is None where there are none.
+    cuts : range
+        Indices of the states that truncation makes constants for the steps after them.
+    first_traced : int
+        Index of the first state that depends on something differentiated.
+    is_open : bool
+        Whether a step gets dicts or lists, whose entries it could change.
+    """
+
+    step: Callable
+    layouts: list[Layout]
+    n: int
+    truncate: int | None
+    differentiated: list[int]
+    state: Layout = field(init=False)
+    params: Layout = field(init=False)
+    inputs: Layout | None = field(init=False)
+    cuts: range = field(init=False)
+    first_traced: int = field(init=False)
+    is_open: bool = field(init=False, default=False)
+
+    def __post_init__(self) -> None:
+        self.state = self.layouts[0]
+        self.params = self.layouts[1]
+        self.inputs = self.layouts[2] if len(self.layouts) == 3 else None
+        self.cuts = range(self.n - self.truncate, 0, -self.truncate) if self.truncate else range(0)
+        self.state.rounds = False
+        for layout in self.layouts:
+            self.is_open = self.is_open or layout.is_open
+            self.state.rounds = self.state.rounds or True in layout.is_float
+        if not self.differentiated:
+            self.first_traced = self.n + 1
+        elif self.differentiated[0] < len(self.state.places):
+            self.first_traced = 0
+        else:
+            self.first_traced = 1
+
+    @property
+    def names(self) -> list[str]:
+        """Return the names of all variables."""
+        return [name for layout in self.layouts for name in layout.names]
+
+    def split(self, variables: Sequence) -> tuple[list, list, list]:
+        """Return the variables of state, params and inputs, from those of all arguments."""
+        first = len(self.state.places)
+        second = first + len(self.params.places)
+        return list(variables[:first]), list(variables[first:second]), list(variables[second:])
+
+
+# ---- arrays of a state -----------------------------------------------------------------------------------------------
+
+
+def contiguous(value: Any) -> Any:
+    """Return a contiguous array, or a NumPy scalar of a value without axes; traced values are returned as they are."""
+    if isbox(value) or is_distributed(value):
+        return value
+    if np.ndim(value):
+        return np.ascontiguousarray(value)
+    return np.asarray(value)[()]
+
+
+def owned(value: Any) -> Any:
+    """Return a contiguous copy; traced values, into which nothing writes, are returned as they are."""
+    if isbox(value) or is_distributed(value):
+        return value
+    return contiguous(np.array(value, order="C"))
+
+
+def stacked(parts: Sequence) -> Any:
+    """Stack arrays of one shape, traced or not, along a new first axis."""
+    return (anp if any(map(isbox, parts)) else np).stack(parts)
+
+
+def fingerprint(values: Sequence, statics: Sequence = ()) -> list:
+    """Return 64 bits for each variable of a state, and for each whole number, text and array of its other leaves."""
+    marks = []
+    for value in values:
+        value = plain(value)
+        marks.append(value.fingerprint() if is_distributed(value) else hash(folded(contiguous(value))))
+    for leaf in statics:
+        if isinstance(leaf, (int, str)):
+            marks.append(hash(leaf))
+        elif isinstance(leaf, (np.ndarray, np.generic)) and not leaf.dtype.hasobject:
+            marks.append(hash(folded(leaf)))
+    return marks
+
+
+def folded(value: Any) -> bytes:
+    """Return bytes that depend on all bits of an array; a large one is cut into lines, added as whole numbers."""
+    if value.nbytes < WHOLE:
+        return value.tobytes()
+    fold = OTHER_FOLD if any(size % FOLD == 0 for size in value.shape) else FOLD
+    flat = value.reshape(-1).view(np.uint8)
+    end = flat.size - flat.size % (8 * fold)
+    return flat[:end].view(np.uint64).reshape(-1, fold).sum(axis=0).tobytes() + flat[end:].tobytes()
+
+
+# ---- refusals --------------------------------------------------------------------------------------------------------
+
+
+def refuse_mask(message: str, leaf: Any) -> None:
+    """Refuse an array with a mask, which a rollout would lose."""
+    if isinstance(leaf, np.ma.MaskedArray):
+        raise TypeError(f"{message}; fill it first, and pass the mask as an array of its own")
+
+
+def refuse_foreign_trace(origin: str) -> None:
+    """Refuse a result on a trace that the backward pass does not follow."""
+    raise DerivativeError(
+        f"{origin} uses a traced value that is not one of its arguments, and its derivative would be lost; "
+        "pass it in params or make it a part of the state"
+    )
+
+
+def _is_open(tree: Any) -> bool:
+    return isinstance(tree, (dict, list)) or (isinstance(tree, tuple) and any(map(_is_open, tree)))
+
+
+def _brief(value: Any) -> str:
+    return f"an array of dtype {value.dtype}" if isinstance(value, np.ndarray) else repr(value)
+
+
+def _changed(name: str, expected: str, result: str, origin: str) -> str:
+    return f"{name} must keep its form: {origin} made {result} of {expected}; return a state like the first one"

@@ -1,0 +1,308 @@
+"""The steps of a rollout, on plain values or on a tape, and in which of them an error arose."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sparsedp._utils.pytree import copied, flatten, leaves
+from sparsedp._utils.validation import advise
+from sparsedp.autodiff.tape import Recorder, boxed, dtype_of, isbox, new_trace, plain, traces_of, untaped_root
+from sparsedp.autodiff.tape_constants import frozen
+from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, UnstableStepError
+from sparsedp.trajectory.record import largest
+from sparsedp.trajectory.specification import fingerprint, owned
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from sparsedp.trajectory.specification import RolloutSpecification
+
+__all__ = ["State", "StepRunner"]
+
+# Of the size of each field, in double and in single precision: a gradient by reversed steps has about as many digits.
+DRIFT = 1e-8
+SINGLE_DRIFT = 1e-4
+REMEDIES = {
+    "state": "return another dict or list",
+    "params": "make what changes a part of the state",
+    "inputs": "make what changes a part of the state",
+}
+
+
+class State:
+    """State i of a run.
+
+    Attributes
+    ----------
+    i : int
+    values : list
+        Its variables.
+    statics : tuple
+        Its other leaves.
+    depends : list or None
+        True where a variable depends on something traced, None where it does not; None in place of the list: all do.
+    boxes : (variables, nodes) or None
+        Its variables as they were returned, and their nodes, if the next step can continue from those; until that
+        step begins.
+    tape : (roots, nodes, ends) or None
+        Of the step from it: the roots of the variables of state and inputs, None where a constant is; all calls, in
+        order, so that the backward pass need not sort a graph; the nodes of the state after it, None where that does
+        not depend on anything traced.
+    """
+
+    __slots__ = ("boxes", "depends", "i", "statics", "tape", "values")
+
+    def __init__(self, i: int, values: list, statics: Sequence, depends: list | None = None) -> None:
+        self.i = i
+        self.values = values
+        self.statics = statics
+        self.depends = depends
+        self.tape: Any = None
+        self.boxes: Any = None
+
+    def with_values(self, values: list) -> State:
+        """Return the same state in other memory, without a tape."""
+        return State(self.i, values, self.statics, self.depends)
+
+    def owned(self) -> State:
+        """Return a copy: a step may write again into the arrays that it has returned."""
+        return self.with_values(list(map(owned, self.values)))
+
+    def fingerprint(self) -> list:
+        """Return fingerprints of all leaves."""
+        return fingerprint(self.values, self.statics)
+
+
+class StepRunner:
+    """Runs the steps of a rollout from given arguments.
+
+    Parameters
+    ----------
+    specification : RolloutSpecification
+    args : list of arrays
+        Variables of state, params and inputs; traced ones belong to outer traces, which record every call, too.
+
+    Attributes
+    ----------
+    first : State
+    params, inputs : lists
+        Variables of the two.
+    param_roots, input_roots : lists
+        One for each variable of params, the same in all steps, and of inputs; None where no cotangent is needed.
+    outer : set of int
+        The traces of the arguments.
+    current : State or None
+        The state from which the last step began.
+    copies : bool
+        Whether states are copied: the step writes into arrays that it has returned.
+    """
+
+    copies = False
+
+    def __init__(self, specification: RolloutSpecification, args: Sequence) -> None:
+        self.specification = specification
+        self.recorder = Recorder()
+        self.number = new_trace()
+        self.outer = traces_of(args)
+        self.current: State | None = None
+        self.continues = not (specification.cuts or specification.inputs)
+        values, self.params, self.inputs = specification.split(args)
+        self.first = State(0, values, specification.state.statics)
+        roots: list = [None] * len(args)
+        for position in specification.differentiated:
+            roots[position] = self.recorder.root()
+        _, self.param_roots, self.input_roots = specification.split(roots)
+        self.lasting_nodes = {None, *self.param_roots}
+
+    @cached_property
+    def _taped_params(self) -> Any:
+        return self._build_params(self.param_roots)
+
+    @cached_property
+    def _untaped_params(self) -> Any:
+        return self._build_params([root and self._untaped for root in self.param_roots])
+
+    @cached_property
+    def _untaped(self) -> Any:
+        """The root of all values without a tape: a value that a step stores is traced in any case."""
+        return untaped_root(self.recorder)
+
+    def step(self, state: State, is_taped: bool) -> State:
+        """Return the state after one step; if the step is taped, the given state gets its tape."""
+        specification = self.specification
+        number = self.number
+        boxes = state.boxes
+        self.current = state
+        state.boxes = None
+        if is_taped and boxes:
+            values, roots = boxes
+        else:
+            values = self._step_values(state)
+            roots = ()
+            if specification.differentiated:
+                roots = self._new_roots(state, is_taped)
+                values = boxed(values, roots, number)
+        params = self._taped_params if is_taped else self._untaped_params
+        arguments = self._arguments(state, values, params)
+        entries = [leaves(argument) for argument in arguments] if specification.is_open else None
+        result = specification.step(*arguments)
+        if entries is not None:
+            _check_entries(arguments, entries)
+        variables, values, nodes, statics = specification.state.take(result, "the step", number, self.outer)
+        following = State(state.i + 1, values, statics)
+        if None in nodes:
+            following.depends = [node and True for node in nodes]
+        if is_taped:
+            state.tape = roots, self.recorder.taken(), nodes
+            if self.continues and variables and self._are_separate(nodes):
+                following.boxes = variables, nodes
+                for value in values:
+                    if type(value) is np.ndarray:
+                        value.flags.writeable = False
+        # A value that is on no tape may be an array that the step writes into again.
+        if self.copies or (is_taped and following.depends):
+            return following.owned()
+        return following
+
+    def _are_separate(self, nodes: list) -> bool:
+        """Whether each variable of a state has a sum of cotangents of its own, apart from those of params."""
+        return len({*nodes}) == len(nodes) and self.lasting_nodes.isdisjoint(nodes)
+
+    def reversed_step(self, state: State) -> State:
+        """Return the state before a state, by the reversed step: the same to rounding."""
+        earlier = State(state.i - 1, state.values, state.statics)
+        self.current = earlier
+        result = self.specification.step.back(*self._plain_arguments(earlier))  # type: ignore[attr-defined]
+        layout = self.specification.state
+        _, values, _, statics = layout.take(result, "the reversed step", self.number, self.outer)
+        return State(earlier.i, values, statics)
+
+    def state_tree(self, state: State) -> Any:
+        """Return the tree of a state, for a function that is called again on a tape."""
+        root = self._untaped if state.i >= self.specification.first_traced else None
+        values = boxed(map(frozen, state.values), [root] * len(state.values), self.number)
+        return self.specification.state.build(values, state.statics)
+
+    def _new_roots(self, state: State, is_taped: bool) -> list:
+        """Return a root for each variable of state and inputs, None for a constant."""
+        specification = self.specification
+        if state.i < specification.first_traced or state.i in specification.cuts:
+            depends: list = [None] * len(state.values)
+        else:
+            depends = state.depends or [True] * len(state.values)
+        roots = []
+        for is_traced in (*depends, *self.input_roots):
+            if is_traced:
+                roots.append(self.recorder.root() if is_taped else self._untaped)
+            else:
+                roots.append(None)
+        return roots
+
+    def _build_params(self, roots: list) -> Any:
+        """Return the params of a step. Floats of Python stay such: as float64 they would widen a state of float32."""
+        layout = self.specification.params
+        values = []
+        for value, is_python_float in zip(self.params, layout.is_float, strict=True):
+            if is_python_float and not isbox(value):
+                values.append(float(value))
+            else:
+                values.append(frozen(value))
+        return layout.build(boxed(values, roots, self.number))
+
+    def _step_values(self, state: State) -> list:
+        """Return the variables of state and inputs that a step gets; constants where the derivative is cut."""
+        values = map(plain, state.values) if state.i in self.specification.cuts else state.values
+        values = list(map(frozen, values))
+        for block in self.inputs:
+            values.append(frozen(block[state.i]))
+        return values
+
+    def _arguments(self, state: State, values: Sequence, params: Any) -> tuple:
+        """Return the arguments of a step, from the variables of state and inputs."""
+        inputs = self.specification.inputs
+        tree = self.specification.state.build(values, state.statics)
+        if inputs is None:
+            return tree, params
+        statics = [leaf[state.i] if isinstance(leaf, np.ndarray) else leaf for leaf in inputs.statics]
+        return tree, params, inputs.build(values[len(state.values) :], statics)
+
+    def _plain_arguments(self, state: State) -> tuple:
+        """Return the arguments of the step from a state, on no trace of the rollout."""
+        return self._arguments(state, self._step_values(state), self._build_params([None] * len(self.params)))
+
+    def check_drift(self, state: State, last: State) -> None:
+        """Refuse a backward pass by reversed steps, from the last state, that missed the first state."""
+        drift = DRIFT
+        for value in self.first.values:
+            if np.finfo(dtype_of(plain(value))).eps > np.finfo(float).eps:
+                drift = SINGLE_DRIFT
+        for values in zip(state.values, self.first.values, last.values, strict=True):  # a large field hides no other
+            back, first, end = map(plain, values)
+            error = largest([back - first])
+            size = largest([first, end])
+            if not error <= drift * size:
+                raise DerivativeError(
+                    f"reversed steps end {error:.1e} away from the first state, beside states of size {size:.1e}: "
+                    "rounding grew on the way; give rollout a memory in bytes"
+                )
+
+    @contextmanager
+    def errors_named(self, place: str = "in step") -> Iterator[None]:
+        """Say in which step an error arose, and name the argument where NumPy refuses to write into one."""
+        try:
+            yield
+        except (ConvergenceError, NonFiniteError, UnstableStepError) as error:
+            if self.current:
+                error.args = f"{place} {self.current.i} of rollout: {error}", *error.args[1:]
+            raise
+        except (ValueError, TypeError) as error:
+            refuses = _refuses_writing(error)
+            change = self._changed_argument()
+            if change is None and refuses:
+                change = "keep changes the state"
+            if change is None:
+                advise(error, self.current and self._plain_arguments(self.current)[1])
+                raise
+            raise ValueError(f"{change} in place; write u = u + du instead of u += du, or work on a copy") from (
+                error if refuses else None
+            )
+        finally:
+            self.recorder.taken()  # the calls of a step that raised
+
+    def _changed_argument(self) -> str | None:
+        """Return which array the step writes into: the one that stops it when all others are writeable.
+
+        The step is run on plain values: with traced ones the message would be another one.
+        """
+        if self.current is None:
+            return None
+        entries, rebuild = flatten(self._plain_arguments(self.current))
+        names = [name for layout in self.specification.layouts for name in layout.labels]
+        for position, name in enumerate(names):
+            if not isinstance(entries[position], np.ndarray):
+                continue
+            copies = copied(list(map(plain, entries)))
+            copies[position].flags.writeable = False
+            try:
+                self.specification.step(*rebuild(copies))
+            except Exception as error:
+                if _refuses_writing(error):
+                    return f"the step changes {name}"
+        return None
+
+
+def _refuses_writing(error: Exception) -> bool:
+    message = str(error)
+    return isinstance(error, (ValueError, TypeError)) and ("read-only" in message or "readonly" in message)
+
+
+def _check_entries(arguments: tuple, entries: list) -> None:
+    """Refuse a step that changes the dicts and lists that it got, which a tape would not see."""
+    for name, argument, earlier in zip(REMEDIES, arguments, entries, strict=False):
+        after = leaves(argument)
+        if len(after) != len(earlier) or any(a is not b for a, b in zip(after, earlier, strict=True)):
+            raise ValueError(f"the step changes the entries of {name}; {REMEDIES[name]}")
