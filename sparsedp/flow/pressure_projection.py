@@ -5,27 +5,48 @@ With K, D, G and A = -D G as in projection_setup.py,
     P v = K v + G p,          A p = D K v,          so that D P v = D K v - A p = 0,
     P^T g = K (g + D^T q),    A^T q = G^T g,        so that G^T P^T g = 0.
 
-On uniform grids without openings G = -K D^T: P is an orthogonal projection, and both lines are the
-same arithmetic. On stretched grids W P is symmetric, with W the volumes of the faces.
-Source: Chorin, Math. Comp. 22 (1968); the mesh of Harlow and Welch, Phys. Fluids 8 (1965).
+On uniform grids without openings G = -K D^T: P is an orthogonal projection, and both lines are the same arithmetic. On
+stretched grids W P is symmetric, with W the volumes of the faces.
+
+References
+----------
+A. J. Chorin, Math. Comp. 22 (1968) 745-762.
+F. H. Harlow, J. E. Welch, Phys. Fluids 8 (1965) 2182-2189 (the staggered grid).
 """
 
+from __future__ import annotations
+
 from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sparsedp.flow.projection_setup import Setup
+from sparsedp._utils.reconstruction import Frozen
+from sparsedp.flow.projection_setup import ProjectionSetup
 from sparsedp.grid.boundary_conditions import no_slip
 from sparsedp.grid.grid import check_grid
 from sparsedp.operators.operator import Operator
 from sparsedp.operators.structure.base import Turning
 from sparsedp.solvers.choose_method import check_settings
 
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from sparsedp.grid.grid import Grid
+
 __all__ = ["Projection", "projection"]
 
 
-def projection(grid, solid=None, boundary=no_slip, method="auto", rtol=1e-10, maxiter=None, **options):
-    """Grid -> the Operator faces -> faces that takes the divergence out of a velocity.
+def projection(
+    grid: Grid,
+    solid: ArrayLike | None = None,
+    boundary: Any = no_slip,
+    method: str = "auto",
+    rtol: float = 1e-10,
+    maxiter: int | None = None,
+    **options: Any,
+) -> Projection:
+    """Return the operator that removes the divergence from a velocity on faces.
 
     Parameters
     ----------
@@ -33,26 +54,26 @@ def projection(grid, solid=None, boundary=no_slip, method="auto", rtol=1e-10, ma
     solid : bool array, shape `grid.shape`, optional
         Obstacles. Faces that touch one get 0.
     boundary : flow condition or dict
-        no_slip, free_slip (both closed here), inflow (keeps the value that is given) or outflow
-        (pressure 0), for all bounded sides or as {"x": (lower, upper), ...}; axes that are not named are
-        no_slip. An inflow is the value that the faces of that side already have.
+        no_slip, free_slip (both closed here), inflow (keeps the given velocity) or outflow (pressure 0), for all
+        bounded sides or as {"x": (lower, upper), ...}; axes that are not named are no_slip. The velocity at an inflow
+        is the value that the faces of that side already have.
     method, rtol, maxiter, **options
         Of the pressure solve, as in `inverse`.
 
     Returns
     -------
     Projection
-        in: faces [velocity]; out: faces [velocity], of divergence 0 to `rtol`. ``P.pressure(v)`` is the
-        potential p [velocity length] with P(v) = v + G(p) inside; ``P.info`` holds the records of the solves.
+        in: faces [velocity]; out: faces [velocity], with a divergence of 0 to `rtol`. ``P.pressure(v)`` is the
+        potential p [velocity length] with P(v) = v + G(p) in the interior; ``P.info`` holds the records of the solves.
 
     Raises
     ------
     ShapeError
         If `solid` has another shape than the grid.
     ValueError
-        If an axis is named that is periodic or not there, or an inflow enters a region without an outflow.
+        If an axis is named that is periodic or does not exist, or an inflow enters a region without an outflow.
     TypeError
-        If `boundary` holds what is no flow condition.
+        If `boundary` is not a flow condition.
     NonFiniteError
         On use, if the velocity holds NaN or infinity anywhere, walls included.
     ConvergenceError
@@ -60,10 +81,13 @@ def projection(grid, solid=None, boundary=no_slip, method="auto", rtol=1e-10, ma
 
     Notes
     -----
-    Null space: the pressure of a closed region is known up to a constant, which is taken out, region by
-    region. Transpose: ``P.T(g)`` equals ``P(g)`` bit for bit on uniform grids without openings.
+    Null space: the pressure of a closed region is determined up to a constant, which is removed for each region.
+    Transpose: ``P.T(g)`` equals ``P(g)`` bit for bit on uniform grids without openings.
     Cost: one pressure solve, forward and backward; one node on the tape.
-    Source: Chorin, Mathematics of Computation 22 (1968).
+
+    References
+    ----------
+    A. J. Chorin, Mathematics of Computation 22 (1968) 745-762.
 
     Examples
     --------
@@ -74,62 +98,78 @@ def projection(grid, solid=None, boundary=no_slip, method="auto", rtol=1e-10, ma
     """
     check_grid("projection", grid)
     settings = check_settings(method, rtol, maxiter, "project", options)
-    return Projection(Setup(grid, solid, boundary, settings))
+    return Projection(ProjectionSetup(grid, solid, boundary, settings))
 
 
-class Projected(Turning):
-    """P or P^T on flat face fields, of a Setup. It solves in double precision, and rounds once."""
+class ProjectionStructure(Turning):
+    """P or P^T on flat face fields, for a `ProjectionSetup`; solved in double precision and rounded once."""
 
-    def act(self, x, out):
+    def act(self, x: NDArray, out: NDArray) -> None:
+        """Set `out` to the projection of x."""
         self.inner.split(x, out, self.transposed)
 
 
-class Potential(Turning):
-    """Face field -> the p with P v = v + G p, one of average 0 where only its slope is known; or the transpose."""
+class PressureStructure(Turning):
+    """The map from a face field to the p with P v = v + G p, or its transpose.
 
-    def act(self, x, out):
-        setup, scale = self.inner, 2.0**self.inner.exponent
+    Where only the slope of p is determined, its average is 0.
+    """
+
+    def act(self, x: NDArray, out: NDArray) -> None:
+        """Set `out` to the pressure of x."""
+        setup = self.inner
+        scale = 2.0**setup.exponent
         if self.transposed:
-            setup.pressed(scale * x, out)
+            setup.pressure_transpose(scale * x, out)
         else:
             p = setup.split(x, np.empty(x.size))
             np.multiply(scale, setup.inverse.solver.system.null_space.project(p), out=out)
 
 
 class Projection(Operator):
-    """The Operator that `projection` makes, with its pressure and its records."""
+    """The operator that `projection` returns, with its pressure and its records.
 
-    setup: Setup
+    Parameters
+    ----------
+    setup : ProjectionSetup
+    """
 
-    def __init__(self, setup):
+    setup: ProjectionSetup
+
+    def __init__(self, setup: ProjectionSetup) -> None:
         faces = setup.grid.faces
-        structure = (
-            Projected(setup, (faces.size,) * 2) if faces.backend.whole_fields else setup.operators()[0].structure
-        )
+        structure: Any
+        if faces.backend.whole_fields:
+            structure = ProjectionStructure(setup, (faces.size, faces.size))
+        else:
+            structure = setup.operators()[0].structure
         super().__init__(structure, faces, faces, "projection", "matrix-free")
-        vars(self)["setup"] = setup
+        Frozen.__init__(self, setup=setup)
 
-    def recipe(self):
-        """The call that makes it again: see _utils/reconstruction.py."""
+    def recipe(self) -> tuple:
+        """Return the call that builds an equal object, for pickling and copying."""
         return Projection, (self.setup,)
 
     @property
-    def info(self):
+    def info(self) -> Any:
         """SolveLog of the pressure solves: .forward, .adjoint, .setup_seconds."""
         return self.setup.info
 
     @property
-    def method(self):
-        """The word of the pressure solver in use."""
+    def method(self) -> str:
+        """Name of the method of the pressure solve."""
         return self.setup.inverse.method
 
     @cached_property
-    def pressure(self):
-        """Operator faces -> cells: the p with P(v) = v + G(p) on the faces where the flow is free [velocity length]."""
-        setup, cells = self.setup, self.setup.grid.cells
-        shape = cells.size, self.domain.size
-        structure = Potential(setup, shape) if cells.backend.whole_fields else setup.operators()[1].structure
+    def pressure(self) -> Operator:
+        """Operator from faces to cells: the p with P(v) = v + G(p) on free faces [velocity length]."""
+        cells = self.setup.grid.cells
+        structure: Any
+        if cells.backend.whole_fields:
+            structure = PressureStructure(self.setup, (cells.size, self.domain.size))
+        else:
+            structure = self.setup.operators()[1].structure
         return Operator(structure, self.domain, cells, "pressure")
 
-    def __str__(self):
+    def __str__(self) -> str:
         return str(self.setup.inverse)

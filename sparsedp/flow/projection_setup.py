@@ -1,22 +1,26 @@
-"""What a projection is made of, set up once, and the solve itself: forward and transposed.
+"""The parts of a projection, set up once, and its solve, forward and transposed.
 
-With K the mask of the faces that are not closed, D the divergence, G the gradient of the pressure
-(0 on closed and on given faces), and A = -D G,
+With K the mask of the faces that are not closed, D the divergence, G the gradient of the pressure (0 on closed faces
+and on faces with a given velocity), and A = -D G,
 
     A p   = D K x,      w = K x + G p,
     A^T q = G^T g,      z = K (g + D^T q).
 
-The second line is the transpose of x -> w; that of x -> p takes a source s on cells in the place of G^T g, and g = 0.
+The second line is the transpose of x -> w. The transpose of x -> p has a source s on cells instead of G^T g, and g = 0.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sparsedp._utils.reconstruction import Remade
 from sparsedp._utils.validation import check_finite, place
 from sparsedp.errors import NonFiniteError
-from sparsedp.flow.passes import Products, compiled
+from sparsedp.flow.projection_passes import CompiledPasses, OperatorPasses, compiled_passes
 from sparsedp.grid.boundary_conditions import inflow, no_slip, resolve
 from sparsedp.grid.grid import Grid
 from sparsedp.operators.difference import divergence, gradient
@@ -24,158 +28,234 @@ from sparsedp.operators.masks_and_lift import check_solid, diagonal, solid_faces
 from sparsedp.solvers.inverse import build
 from sparsedp.solvers.scaling import exponent_of, in_range, largest, shifted
 
-__all__ = ["Setup", "faces_that", "pressure_conditions"]
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
 
-FEW = 1024  # cells below which transforms are tried even where `inverse` would factor
+    from sparsedp.operators.operator import Operator
+
+__all__ = ["ProjectionSetup", "faces_that", "pressure_conditions"]
+
+FEW_CELLS = 1024  # below, transforms are tried even where `inverse` would factor
 
 
-class Setup(Remade):
-    """What a projection needs: the faces that are closed, D, G, and the inverse of A = -D G.
+class ProjectionSetup(Remade):
+    """The closed faces, D, G and the inverse of A = -D G of a projection.
 
-    The grid is one of lengths near 1: P does not depend on the unit of length, while squares of
-    lengths may leave the range of floats.
+    The operators belong to a grid with lengths near 1: P does not depend on the unit of length, but squares of lengths
+    may leave the range of floats.
+
+    Parameters
+    ----------
+    grid : Grid
+    solid, boundary
+        As `projection` takes them.
+    settings : dict
+        Of the pressure solve, from `check_settings`.
+
+    Attributes
+    ----------
+    sides : tuple
+        The flow conditions as `resolve` returns them.
+    open : bool array on faces
+        K.
+    exponent : int
+        Lengths of `grid` are 2**exponent times those of the grid of the operators.
+    inverse : Inverse
+        The inverse of A.
+    products : tuple of two OperatorPasses
+        The passes of the forward and of the transposed projection.
+    passes : tuple
+        The passes that are used: compiled loops, or `products`.
     """
 
-    def __init__(self, grid, solid, boundary, settings):
-        self.grid, self.sides = grid, resolve(grid, boundary, no_slip)
+    passes: tuple[OperatorPasses | CompiledPasses, ...]
+
+    def __init__(self, grid: Grid, solid: ArrayLike | None, boundary: Any, settings: dict[str, Any]) -> None:
+        self.grid = grid
+        self.sides = resolve(grid, boundary, no_slip)
         self.solid = None if solid is None else check_solid(grid, solid).copy()
-        named = {axis: pair for axis, pair in zip(grid.axes, self.sides, strict=True) if pair}
-        self.made = Setup, (grid, self.solid, named, settings)  # nothing that the caller may change
+        self.settings = settings
         self.pressure_conditions = pressure_conditions(grid, self.sides)
         self.open = faces_that(grid, self.sides, self.solid, lambda condition: not condition.closed)
         self.exponent = exponent_of(max((float(h.max(initial=0.0)) for h in grid.widths), default=1.0))
-        near = Grid(grid.shape, spacing=[np.ldexp(h, -self.exponent) for h in grid.widths], periodic=grid.periodic)
-        near = grid.backend.place(near)
-        self._maps = D, G = divergence(near), gradient(near, self.pressure_conditions, self.solid)
-        self.inverse = _inverse(-D @ G, settings)
-        self._refuse_lost_inflow()
+        spacing = [np.ldexp(h, -self.exponent) for h in grid.widths]
+        scaled_grid = grid.backend.place(Grid(grid.shape, spacing=spacing, periodic=grid.periodic))
+        D = divergence(scaled_grid)
+        G = gradient(scaled_grid, self.pressure_conditions, self.solid)
+        self._divergence = D
+        self._gradient = G
+        self.inverse = _pressure_inverse(-D @ G, settings)
+        self._check_inflow_can_leave()
         if not grid.backend.whole_fields:
             return
-        maps = (D.structure, G.structure), (G.T.structure, D.T.structure)
-        self._reach = [largest(first.magnitude()(np.ones(grid.faces.size))) for first, _ in maps]
-        # Of the forward solve, and of the adjoint one.
-        self.products = self.passes = [Products(*pair, self.open.astype(float)) for pair in maps]
-        if self._exact:
-            passes = [compiled(grid, products) for products in self.products]
-            self.passes = passes if all(passes) else self.products
+        kept = self.open.astype(float)
+        self.products = (
+            OperatorPasses(D.structure, G.structure, kept),
+            OperatorPasses(G.T.structure, D.T.structure, kept),
+        )
+        ones = np.ones(grid.faces.size)
+        self._magnitudes = [largest(products.first.magnitude()(ones)) for products in self.products]
+        self.passes = self.products
+        if self._is_separable:
+            forward, transposed = (compiled_passes(grid, products) for products in self.products)
+            if forward is not None and transposed is not None:
+                self.passes = (forward, transposed)
+
+    def recipe(self) -> tuple:
+        """Return the call that builds an equal object, for pickling and copying."""
+        conditions = {axis: pair for axis, pair in zip(self.grid.axes, self.sides, strict=True) if pair}
+        return ProjectionSetup, (self.grid, self.solid, conditions, self.settings)
 
     @property
-    def info(self):
+    def info(self) -> Any:
         """SolveLog of the pressure solves."""
         return self.inverse.info
 
-    def operators(self):
-        """(P, its pressure) as products: so they act on ranks, where no pass sees the whole field."""
-        D, G = self._maps
-        K = diagonal(G.codomain, self.open)  # 0 times NaN is NaN: the solve refuses it
-        p = self.inverse @ D @ K
-        P = K + G @ p
-        return 0.0 * P if self.still else P, 2.0**self.exponent * p
+    def operators(self) -> tuple[Operator, Operator]:
+        """Return P and its pressure as products of operators.
+
+        On ranks they replace the passes, which need the whole field.
+        """
+        K = diagonal(self._gradient.codomain, self.open)  # 0 times NaN is NaN, so the solve detects NaN everywhere
+        p = self.inverse @ self._divergence @ K
+        P = K + self._gradient @ p
+        if self.nothing_flows:
+            P = 0.0 * P
+        return P, 2.0**self.exponent * p
 
     @property
-    def _exact(self):
+    def _is_separable(self) -> bool:
         return self.inverse.method == "separable" and self.grid.cells.size > 0
 
-    def split(self, x, out, transposed=False):
-        """Flat face field -> p (q); w (z) is written into `out`."""
+    def split(self, x: NDArray, out: NDArray, transposed: bool = False) -> NDArray:
+        """Set `out` to w (transposed: z) for a flat face field, and return p (q)."""
         p = self._split(x, out, transposed)
-        if self.still:
+        if self.nothing_flows:
             out[:] = 0.0
         return p
 
-    def _split(self, x, out, transposed):
-        turned, solver = transposed and not self.symmetric, self.inverse.solver
-        passes, reach, b = self.passes[transposed], self._reach[transposed], np.empty(self.grid.cells.size)
+    def _split(self, x: NDArray, out: NDArray, transposed: bool) -> NDArray:
+        solver = self.inverse.solver
+        solve_transposed = transposed and not self.symmetric
+        passes = self.passes[transposed]
+        b = np.empty(self.grid.cells.size)
 
-        def residual(p):
-            """The net flow of the result is what the solve left: the contract need not look for it."""
+        def residual_norm(p):
+            """Return the norm of the residual of the solve, which is the net flow of the result."""
             passes.push(x, p, out)
             return passes.net_flow(out, b)[0]
 
-        data, size = passes.net_flow(x, b)
-        if in_range(reach * size):
-            p = solver.solve_once(b, data, reach * size, residual, transposed, turned) if self._exact else None
-            if p is not None:
-                return p
-            passes.net_flow(x, b)
-        elif 0 < (top := largest(x)) < np.inf and not in_range(top):  # beyond the middle of the range of floats
-            exponent = exponent_of(top)
-            p = self._split(shifted(x, -exponent), out, transposed)
-            out[:] = shifted(out, exponent)
-            return shifted(p, exponent)
+        b_norm, x_norm = passes.net_flow(x, b)
+        scale = self._magnitudes[transposed] * x_norm
+        if in_range(scale):
+            if self._is_separable:
+                p = solver.solve_once(b, b_norm, scale, residual_norm, transposed, solve_transposed)
+                if p is not None:
+                    return p
+                passes.net_flow(x, b)
+        else:
+            largest_entry = largest(x)
+            if 0 < largest_entry < np.inf and not in_range(largest_entry):  # squares would leave the range of floats
+                exponent = exponent_of(largest_entry)
+                p = self._split(shifted(x, -exponent), out, transposed)
+                out[:] = shifted(out, exponent)
+                return shifted(p, exponent)
+        forward_record = self.info.forward
         try:
-            before = self.info.forward
-            p = solver.solve(b, turned, checked=False)
+            p = solver.solve(b, solve_transposed, checked=False)
         except NonFiniteError:
-            self._refuse(x, transposed)
+            self._check_faces(x, transposed)
             raise
         if transposed and self.symmetric:
-            self.info.adjoint, self.info.forward = self.info.forward, before
+            self.info.adjoint = self.info.forward
+            self.info.forward = forward_record
         passes.push(x, p, out)
         return p
 
-    def pressed(self, source, out):
-        """The transpose of x -> p: a flat source s on cells gives z = K D^T q with A^T q = s, written into `out`."""
+    def pressure_transpose(self, source: NDArray, out: NDArray) -> None:
+        """Set `out` to z = K D^T q with A^T q = s for a flat source s on cells: the transpose of x -> p."""
         q = self.inverse.solver.solve(source, True, checked=False)
         self.passes[True].push(np.zeros(out.size), q, out)
 
-    def _refuse(self, x, transposed):
-        """Name the face whose velocity, or cotangent, is not finite."""
+    def _check_faces(self, x: NDArray, transposed: bool) -> None:
+        """Raise NonFiniteError with the first face whose velocity, or cotangent, is not finite."""
         space = self.grid.faces
 
-        def where(index):
+        def place_of_face(index):
             axis = int(np.searchsorted(space.offsets, index, side="right")) - 1
             return f"{self.grid.axes[axis]}-face {place(index - space.offsets[axis], space.parts[axis])}"
 
-        check_finite(f"{'the cotangent of' if transposed else 'the velocity in'} projection", x, where=where)
+        name = "the cotangent of projection" if transposed else "the velocity in projection"
+        check_finite(name, x, where=place_of_face)
 
     @cached_property
-    def still(self):
-        """Whether nothing can flow without divergence: one closed line of cells. P is 0, beside rounding."""
-        shut = all(pair and all(condition.closed for condition in pair) for pair in self.sides)
-        return shut and sum(n > 1 for n in self.grid.shape) <= 1
+    def nothing_flows(self) -> bool:
+        """Whether no flow is free of divergence: a closed line of cells. P is then 0, except for rounding errors."""
+        closed = all(pair and all(condition.closed for condition in pair) for pair in self.sides)
+        return closed and sum(n > 1 for n in self.grid.shape) <= 1
 
     @cached_property
-    def symmetric(self):
+    def symmetric(self) -> bool:
         """Whether P is its own transpose."""
-        return all(self.grid.uniform) and all(condition.closed for pair in self.sides if pair for condition in pair)
+        return all(self.grid.uniform) and all(condition.closed for pair in self.sides for condition in pair or ())
 
-    def _refuse_lost_inflow(self):
-        """What enters must be able to leave, in every region apart."""
+    def _check_inflow_can_leave(self) -> None:
+        """Raise ValueError if an inflow enters a region without an outflow."""
         system = self.inverse.solver.system
         if not system.size:
             return
         closed = system.null_space.right != 0
-        if system.active is not None:  # a cell with no free face at all
+        if system.active is not None:  # inactive: cells without a free face
             closed = closed | ~system.active
-        closed = system.whole(closed).reshape(self.grid.shape) & (True if self.solid is None else ~self.solid)
+        closed = system.whole(closed).reshape(self.grid.shape)
+        if self.solid is not None:
+            closed = closed & ~self.solid
         for axis, pair in enumerate(self.sides):
             for side, condition in zip((0, -1), pair or (), strict=False):
                 if condition == inflow and np.take(closed, side, axis).any():
-                    where = f"{('lower', 'upper')[side]} {self.grid.axes[axis]} side"
-                    raise ValueError(f"the inflow on the {where} enters a region without an outflow; open a side of it")
+                    name = f"{('lower', 'upper')[side]} {self.grid.axes[axis]} side"
+                    raise ValueError(f"the inflow on the {name} enters a region without an outflow; open a side of it")
 
 
-def _inverse(op, settings):
-    """The inverse for the pressure. Transforms are preferred on small grids too: the passes go with them."""
-    if settings["method"] == "auto" and op.domain.size < FEW and op.separable and op.backend.whole_fields:
+def _pressure_inverse(op: Operator, settings: dict[str, Any]) -> Any:
+    """Return the inverse for the pressure.
+
+    Transforms are preferred on small grids too, because the compiled passes need them.
+    """
+    if settings["method"] == "auto" and op.domain.size < FEW_CELLS and op.separable and op.backend.whole_fields:
         try:
-            return _inverse(op, settings | {"method": "separable"})
-        except ValueError:  # an axis that cannot be diagonalised with all its digits
+            return _pressure_inverse(op, settings | {"method": "separable"})
+        except ValueError:  # an axis that cannot be diagonalised accurately
             pass
     return build(op, name="pressure solve", **settings)
 
 
-def pressure_conditions(grid, sides):
-    """Conditions of the pressure as `gradient` takes them: 0 at an outflow, no slope elsewhere."""
+def pressure_conditions(grid: Grid, sides: tuple) -> dict[str, tuple]:
+    """Return the conditions of the pressure as `gradient` takes them: 0 at an outflow, elsewhere no slope."""
     pairs = zip(grid.axes, sides, strict=True)
     return {axis: tuple(condition.pressure for condition in pair) for axis, pair in pairs if pair}
 
 
-def faces_that(grid, sides, solid, open_side):
-    """Flat face mask: inside, and on the sides whose condition is open; not beside an obstacle."""
+def faces_that(
+    grid: Grid, sides: tuple, solid: ArrayLike | None, open_side: Callable[[Any], bool]
+) -> NDArray[np.bool_]:
+    """Return the flat mask of the faces in the interior and on the sides whose condition is open.
+
+    Faces that touch an obstacle are not in the mask.
+
+    Parameters
+    ----------
+    grid : Grid
+    sides : tuple
+        The flow conditions as `resolve` returns them.
+    solid : bool array or None
+    open_side : callable
+        ``open_side(condition)``.
+    """
     flat = np.ones(grid.faces.size, dtype=bool)
     for axis, (pair, part) in enumerate(zip(sides, grid.split(flat), strict=True)):
         for side, condition in zip((0, -1), pair or (), strict=False):
             np.moveaxis(part, axis, 0)[side] = open_side(condition)  # a view of the flat mask
-    return flat if solid is None else flat & ~np.logical_or(*solid_faces(grid, check_solid(grid, solid)))
+    if solid is None:
+        return flat
+    return flat & ~np.logical_or(*solid_faces(grid, check_solid(grid, solid)))
