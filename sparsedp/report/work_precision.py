@@ -1,28 +1,33 @@
 """work_precision: error against run time, of values and of gradients, one row for each run."""
 
+from __future__ import annotations
+
 import csv
 import itertools
 import json
 import os
 import platform
 import tracemalloc
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from math import inf, isfinite, nan
 from pathlib import Path
 from time import perf_counter
 from timeit import repeat, timeit
+from typing import Any
 
 import numpy as np
 
-from sparsedp._utils.counters import recording
+from sparsedp._utils.calls import deprecated_attribute
+from sparsedp._utils.counters import Calls, recording
 from sparsedp._utils.pytree import leaves
 from sparsedp._utils.validation import check_function, check_whole
 from sparsedp.autodiff.backend import process_count
 from sparsedp.autodiff.derivative import value_and_grad
 from sparsedp.check.summary import Result
-from sparsedp.check.table import table_of
+from sparsedp.check.table import Table, table_of
 from sparsedp.errors import SparsedpError
 from sparsedp.io.atomic_files import path_errors, write_file
 from sparsedp.report import plots
@@ -31,27 +36,57 @@ from sparsedp.report.explain import total
 
 __all__ = ["COLUMNS", "Rows", "work_precision"]
 
+SHOWN = (
+    "unknowns",
+    "steps",
+    "tolerance",
+    "forward_error",
+    "gradient_error",
+    "seconds_setup",
+    "seconds_forward",
+    "seconds_backward",
+    "peak_bytes",
+    "solves_forward",
+    "solves_adjoint",
+    "iterations",
+    "status",
+)
 COLUMNS = (
-    "scene", "method", "unknowns", "steps", "tolerance", "forward_error", "gradient_error", "seconds_setup",
-    "seconds_forward", "seconds_backward", "peak_bytes", "solves_forward", "solves_adjoint", "iterations", "status",
-    "seed", "versions", "settings", "reference_error", "seconds_forward_median", "seconds_forward_max",
-    "seconds_backward_median", "seconds_backward_max",
-)  # fmt: skip
-KEY = ("scene", "method", "settings", "seed", "versions")  # what a row of an earlier run is found by
+    "scene",
+    "method",
+    *SHOWN,
+    "seed",
+    "versions",
+    "settings",
+    "reference_error",
+    "seconds_forward_median",
+    "seconds_forward_max",
+    "seconds_backward_median",
+    "seconds_backward_max",
+)
+KEY = ("scene", "method", "settings", "seed", "versions")  # identifies a row of an earlier run
 TEXTS = (*KEY, "status")  # the other columns are numbers
-SHOWN = COLUMNS[2:15]
-COUNTS = {"solves_forward": "solve", "solves_adjoint": "adjoint", "iterations": "iterations"}  # in the ledger
-SETTLED = 2.0  # a run that is not faster than the last one by more is warm
+COUNTS = {"solves_forward": "solve", "solves_adjoint": "adjoint", "iterations": "iterations"}  # column: kind of call
+SETTLED_RATIO = 2.0  # a run is warm when the run before it took at most this many times as long
 MOST_WARM_UPS = 7
-SHORT = 2e-3  # [s]: below, times differ for other reasons
-GOALS = 0.1, 0.01, 1e-3, 1e-4, 1e-6  # errors that a method is recommended for, as far as one reaches them
+SHORT = 2e-3  # [s]: shorter times differ for other reasons
+GOALS = (0.1, 0.01, 1e-3, 1e-4, 1e-6)  # errors that a method is recommended for, as far as one reaches them
 FAILURES = (SparsedpError, ArithmeticError, ValueError, MemoryError, np.linalg.LinAlgError)
 
 
 def work_precision(
-    problem, methods, over=None, reference=None, compare=None, repeats=3, file=None, scene=None, skip=None, seed=0
-):
-    """Problem and methods -> error against run time: a table, one row for each method and setting.
+    problem: Callable[..., Any],
+    methods: Mapping[str, Mapping[str, Any]],
+    over: Mapping[str, Iterable[Any]] | None = None,
+    reference: Any = None,
+    compare: Callable[[Any, Any], float] | None = None,
+    repeats: int = 3,
+    file: Any = None,
+    scene: str | None = None,
+    skip: Callable[[str, dict[str, Any]], str | None] | None = None,
+    seed: int = 0,
+) -> Rows:
+    """Measure error against run time: a table with one row for each method and setting.
 
     Parameters
     ----------
@@ -78,7 +113,7 @@ def work_precision(
     skip : callable, optional
         ``skip(method, settings)`` -> the reason why a run is left out, or None.
     seed : int
-        Noted in every row; handed to the problem by the caller.
+        Noted in every row; passed to the problem by the caller.
 
     Returns
     -------
@@ -117,52 +152,54 @@ def work_precision(
     repeats = check_whole("repeats of work_precision", repeats, 1, "; the default is 3")
     if not methods or not isinstance(methods, dict):
         raise ValueError("work_precision needs at least one method; write {'name': {settings}}")
-    for name, values in (over or {}).items():
+    over = over or {}
+    for name, values in over.items():
         if isinstance(values, str) or not isinstance(values, Iterable):
             raise TypeError(
                 f"over of work_precision takes a list of values for {name!r}, got {values!r}; write [{values!r}]"
             )
-    scene, over, now, rows = scene or getattr(problem, "__name__", "scene"), over or {}, _versions(), []
-    finished = {tuple(map(row.get, KEY)): row for row in _stored(file)}
-    compare, known = compare or distance, {}
-
-    def exact(shared):  # one for all methods
-        words = _text_of(shared)
-        if words not in known:
-            known[words] = _exact(problem, reference, compare, shared)
-        return known[words]
-
-    other = sum(row["versions"] != now for row in finished.values())
-    skipped = [f"{other} rows of {Path(file).name} from other versions: run again"] if other else []
+    scene = scene or getattr(problem, "__name__", "scene")
+    compare = compare or distance
+    versions = _versions()
+    references = _References(problem, reference, compare)
+    finished = {tuple(row.get(name) for name in KEY): row for row in _stored(file)}
+    skipped = []
+    outdated = sum(row["versions"] != versions for row in finished.values())
+    if outdated:
+        skipped.append(f"{outdated} rows of {Path(file).name} from other versions: run again")
+    rows = []
     for (method, choice), *values in itertools.product(methods.items(), *over.values()):
-        settings = dict(zip(over, values)) | choice
-        reason = skip and skip(str(method), settings)
+        settings = dict(zip(over, values)) | dict(choice)
+        reason = skip(str(method), settings) if skip else None
         if reason:
             skipped.append(f"{method} with {words_of(settings)}: {reason}")
             continue
-        key = scene, str(method), _text_of(settings), str(seed), now
+        key = (scene, str(method), _text_of(settings), str(seed), versions)
         if key not in finished:
-            figures = _measured(problem, settings, repeats)
+            figures = _measure(problem, settings, repeats)
             if "answer" in figures:
-                figures |= _errors(figures, partial(exact, {name: settings[name] for name in over}), compare)
-            finished[key] = {name: figures.get(name, nan) for name in COLUMNS} | dict(zip(KEY, key))
+                shared = {name: settings[name] for name in over}
+                figures |= _errors(figures, references, shared)
+            row = {name: figures.get(name, nan) for name in COLUMNS}
+            finished[key] = row | dict(zip(KEY, key))
             if file:
                 write_file(file, table_of([*_stored(file), finished[key]], COLUMNS).csv())
         rows.append(finished[key])
     return Rows(scene=scene, over=tuple(over), rows=rows, skipped=skipped)
 
 
-def words_of(settings):
-    """Settings in words."""
+def words_of(settings: Mapping[str, Any]) -> str:
+    """Return settings in words."""
     return ", ".join(f"{name}={value}" for name, value in settings.items()) or "no settings"
 
 
-def _text_of(settings):
+def _text_of(settings: Mapping[str, Any]) -> str:
+    """Return settings as they stand in a row."""
     return json.dumps(settings, sort_keys=True, default=str)
 
 
-def _versions():
-    """Python and the libraries that figures depend on, in words."""
+def _versions() -> str:
+    """Return the versions of Python and of the libraries that figures depend on."""
     words = [f"python {platform.python_version()}"]
     for name in ("sparsedp", "numpy", "scipy", "autograd", "pyamg", "numba"):
         try:
@@ -172,127 +209,199 @@ def _versions():
     return " ".join(words)
 
 
-# ---------------------------------------------------------------- one run: timed, weighed, counted
+# ---------------------------------------------------------------- one run: time, memory, counts
 
 
-def _prepared(problem, settings):
-    """Settings -> (runs of the value, and of value and gradient; facts; what the result of the last run answers)."""
-    given = problem(**settings)
-    if not isinstance(given, tuple) or len(given) not in (2, 3):
-        raise TypeError(
-            f"a problem gives (loss, x) or (loss, x, facts), got {type(given).__name__}; write return loss, x"
-        )
-    loss, x, facts = (*given, {})[:3]
-    alone = x is None  # the loss is the run itself, its result the answer
-    runs = [loss] if alone else [partial(loss, x), partial(value_and_grad(loss), x)]
+@dataclass
+class _Task:
+    """What a problem returned for some settings.
+
+    Attributes
+    ----------
+    runs : list of callable
+        Of the value, and of value and gradient; the value alone where the loss is the run itself.
+    x : tree or None
+    facts : dict
+        Columns.
+    output : callable or None
+        ``output(x)`` returns the array that the forward error is about.
+    """
+
+    runs: Sequence[Callable[[], Any]]
+    x: Any
+    facts: dict[str, Any]
+    output: Callable[[Any], Any] | None
+
+    def answer(self, result: Any) -> tuple[Any, Any]:
+        """Return what the forward error is about, and the gradient, from the result of the last run."""
+        value = result
+        gradient = None
+        if self.x is not None:
+            value, gradient = result
+        if self.output is not None:
+            value = self.output(self.x)
+        return np.asarray(value, float), gradient
+
+
+def _prepare(problem: Callable[..., Any], settings: Mapping[str, Any]) -> _Task:
+    """Call a problem with settings."""
+    parts = problem(**settings)
+    if not isinstance(parts, tuple) or len(parts) not in (2, 3):
+        kind = type(parts).__name__
+        raise TypeError(f"a problem gives (loss, x) or (loss, x, facts), got {kind}; write return loss, x")
+    loss, x = parts[:2]
+    facts = parts[2] if len(parts) == 3 else {}
     output = facts.get("output")
-
-    def answers(result):
-        """(What the forward error is about, gradient)."""
-        value, gradient = (result, None) if alone else result
-        return np.asarray(value if output is None else output(x), float), gradient
-
-    return runs, facts if alone else {"unknowns": sum(map(np.size, leaves(x))), **facts}, answers
+    if x is None:  # the loss is the run itself, its result the answer
+        return _Task([loss], x, facts, output)
+    unknowns = sum(map(np.size, leaves(x)))
+    runs = [partial(loss, x), partial(value_and_grad(loss), x)]
+    return _Task(runs, x, {"unknowns": unknowns, **facts}, output)
 
 
-def _measured(problem, settings, repeats):
-    """Settings of one run -> its figures, with answer and gradient. What fails has a status only."""
+def _measure(problem: Callable[..., Any], settings: Mapping[str, Any], repeats: int) -> dict[str, Any]:
+    """Return the figures of a run, with its answer and gradient; one that fails has a status only."""
     try:
-        clock = perf_counter()
-        runs, facts, answers = _prepared(problem, settings)
-        seconds = perf_counter() - clock
-        status, first, last = _warm(runs[-1])
-        times = _times(runs, repeats) if status == "ok" else {}
-        peak, result = _peak(runs[-1])
-        answer, gradient = answers(result)
+        start = perf_counter()
+        task = _prepare(problem, settings)
+        seconds = perf_counter() - start
+        status, first_calls, last_calls = _warm_up(task.runs[-1])
+        times = _times(task.runs, repeats) if status == "ok" else {}
+        peak_bytes, result = _peak_bytes(task.runs[-1])
+        answer, gradient = task.answer(result)
     except FAILURES as error:
-        return {"status": _failure(error)}
+        return {"status": _status_of(error)}
     return {
-        "answer": answer, "gradient": gradient, "unknowns": answer.size, **facts, "peak_bytes": peak, **times,
-        **{name: total(last, kind) for name, kind in COUNTS.items()},
-        "seconds_setup": seconds + total(first.seconds, "setup"),
+        "answer": answer,
+        "gradient": gradient,
+        "unknowns": answer.size,
+        **task.facts,
+        "peak_bytes": peak_bytes,
+        **times,
+        **{column: total(last_calls, kind) for column, kind in COUNTS.items()},
+        "seconds_setup": seconds + total(first_calls.seconds, "setup"),
         "status": status if np.all(np.isfinite(answer)) else "nonfinite",
-    }  # fmt: skip
+    }
 
 
-def _warm(run):
-    """Run until the time has settled: compiled code, caches -> (status, calls of the first run, of the last)."""
-    before, first = inf, None
+def _warm_up(run: Callable[[], Any]) -> tuple[str, Calls, Calls]:
+    """Run until the time no longer falls, since the first runs compile code and fill caches.
+
+    Returns
+    -------
+    status : "ok" or "not_warm"
+    first_calls, last_calls : Calls
+        Of the first and of the last run.
+    """
+    status = "not_warm"
+    last_seconds = inf
+    first_calls = None
     for _ in range(MOST_WARM_UPS):
         with recording() as calls:
-            now = timeit(run, number=1)
-        first = first or calls
-        if before <= SETTLED * now + SHORT:  # it does not fall any more
-            return "ok", first, calls
-        before = now
-    return "not_warm", first, calls
+            seconds = timeit(run, number=1)
+        first_calls = first_calls or calls
+        if last_seconds <= SETTLED_RATIO * seconds + SHORT:
+            status = "ok"
+            break
+        last_seconds = seconds
+    return status, first_calls or calls, calls
 
 
-def _times(runs, repeats):
-    """Runs of the value, and of value and gradient -> columns of their times.
+def _times(runs: Sequence[Callable[[], Any]], repeats: int) -> dict[str, float]:
+    """Return the columns of times.
 
-    The time of the gradient is that of both less the least of the value.
+    The time of the gradient is the time of value and gradient less the least time of the value.
     """
-    row: dict = {}
+    row: dict[str, float] = {}
     least = 0.0
     for name, run in zip(("seconds_forward", "seconds_backward"), runs):
         seconds = np.subtract(repeat(run, number=1, repeat=repeats), least)
-        times = np.quantile(np.maximum(seconds, 0.0), (0.0, 0.5, 1.0)).tolist()
-        row |= dict(zip((name, f"{name}_median", f"{name}_max"), times))
-        least = times[0]
+        minimum, median, maximum = np.quantile(np.maximum(seconds, 0.0), (0.0, 0.5, 1.0)).tolist()
+        row[name] = minimum
+        row[f"{name}_median"] = median
+        row[f"{name}_max"] = maximum
+        least = minimum
     return row
 
 
-def _peak(run):
-    """(Bytes that a run holds at most, beyond what there was before, as Python's allocator sees it; what it gives)."""
-    running = tracemalloc.is_tracing()
-    tracemalloc.start()  # nothing where it runs
+def _peak_bytes(run: Callable[[], Any]) -> tuple[int, Any]:
+    """Return the bytes that a run allocates at most, as Python's allocator sees them, and its result."""
+    was_tracing = tracemalloc.is_tracing()
+    tracemalloc.start()  # does nothing where it runs already
     try:
         tracemalloc.reset_peak()
-        before = tracemalloc.get_traced_memory()[0]
+        before, _ = tracemalloc.get_traced_memory()
         result = run()
-        return tracemalloc.get_traced_memory()[1] - before, result
+        _, peak = tracemalloc.get_traced_memory()
+        return peak - before, result
     finally:
-        if not running:
+        if not was_tracing:
             tracemalloc.stop()
 
 
-def _failure(error):
-    """Status of a run that failed: the word of the solve, or the name of the error."""
+def _status_of(error: BaseException) -> str:
+    """Return the status of a run that failed: the word of the solve, or the name of the error."""
     return getattr(getattr(error, "info", None), "status", None) or type(error).__name__
 
 
-# ---------------------------------------------------------------- exact answers
+# ---------------------------------------------------------------- reference
 
 
-def _errors(figures, exact, compare):
-    """The columns of errors of one run, beside the exact answer."""
+class _References:
+    """The reference in any of its forms, computed once for the settings that methods share."""
+
+    def __init__(self, problem: Callable[..., Any], reference: Any, compare: Callable[[Any, Any], float]) -> None:
+        self.problem = problem
+        self.reference = reference
+        self.compare = compare
+        self._computed: dict[str, tuple[Any, Any, float]] = {}
+
+    def at(self, shared: dict[str, Any]) -> tuple[Any, Any, float]:
+        """Return answer, gradient and the error of both."""
+        text = _text_of(shared)
+        if text not in self._computed:
+            self._computed[text] = self._compute(shared)
+        return self._computed[text]
+
+    def _compute(self, shared: dict[str, Any]) -> tuple[Any, Any, float]:
+        """Return answer, gradient and the error of both."""
+        reference = self.reference
+        if reference is None:
+            return None, None, nan
+        if callable(reference):
+            reference = reference(**shared)
+            return *reference, 0.0
+        if isinstance(reference, tuple):
+            return *reference, 0.0
+        refinements = [reference] if isinstance(reference, dict) else reference
+        answers = []
+        for refinement in refinements:
+            task = _prepare(self.problem, shared | refinement)
+            answers.append(task.answer(task.runs[-1]()))
+        *coarser, finest = answers
+        gaps = [self.compare(a, b) for rough in coarser for a, b in zip(rough, finest) if a is not None]
+        return *finest, max(gaps, default=nan)
+
+
+def _errors(figures: dict[str, Any], references: _References, shared: dict[str, Any]) -> dict[str, Any]:
+    """Return the columns of errors of one run."""
     try:
-        value, slope, error = exact()
-        pairs = {"forward_error": (figures["answer"], value), "gradient_error": (figures["gradient"], slope)}
-        gaps = {name: compare(a, b) for name, (a, b) in pairs.items() if a is not None and b is not None}
-        return gaps | {"reference_error": error}
-    except FAILURES as trouble:
-        return {"status": f"reference: {_failure(trouble)}"}
-
-
-def _exact(problem, given, compare, shared):
-    """The reference in any of its forms, at the settings that methods share -> (answer, gradient, error of both)."""
-    if given is None:
-        return None, None, nan
-    if callable(given) or isinstance(given, tuple):
-        return *(given(**shared) if callable(given) else given), 0.0
-    tasks = [_prepared(problem, shared | finer) for finer in ([given] if isinstance(given, dict) else given)]
-    *coarser, finest = [answers(runs[-1]()) for runs, _, answers in tasks]
-    gaps = [compare(a, b) for rough in coarser for a, b in zip(rough, finest) if a is not None]
-    return *finest, max(gaps, default=nan)
+        value, gradient, error = references.at(shared)
+        row = {"reference_error": error}
+        if value is not None:
+            row["forward_error"] = references.compare(figures["answer"], value)
+        if gradient is not None and figures["gradient"] is not None:
+            row["gradient_error"] = references.compare(figures["gradient"], gradient)
+        return row
+    except FAILURES as failure:
+        return {"status": f"reference: {_status_of(failure)}"}
 
 
 # ---------------------------------------------------------------- the table
 
 
 class Rows(Result):
-    """Error against run time. Made by `work_precision`.
+    """Error against run time. Returned by `work_precision`.
 
     Attributes
     ----------
@@ -302,95 +411,118 @@ class Rows(Result):
     rows : list of dict
         Keys are COLUMNS; NaN where a figure does not exist.
     skipped : list of str
-        Runs that were not made, with the reason.
+        Runs that were not done, with the reason.
     """
 
+    judged = deprecated_attribute("judged", "main_error", "0.5")
+
     @property
-    def stem(self):
-        """What the files of `save` are called."""
+    def stem(self) -> str:
+        """Name of the files of `save`, without a suffix."""
         return self.scene.replace("/", "-")
 
     @property
-    def judged(self):
-        """The error that methods are compared by: that of the gradient, where there is one."""
+    def main_error(self) -> str:
+        """Column that methods are compared by: the error of the gradient, where there is one."""
         return "gradient_error" if self.pareto() else "forward_error"
 
-    def seconds(self, row, error="gradient_error"):
-        """The run time that belongs to an error: of the value, or of value and gradient."""
-        return row["seconds_forward"] + (row["seconds_backward"] if error == "gradient_error" else 0.0)
+    def seconds(self, row: dict[str, Any], error: str = "gradient_error") -> float:
+        """Return the run time that belongs to an error: of the value, or of value and gradient."""
+        if error == "gradient_error":
+            return row["seconds_forward"] + row["seconds_backward"]
+        return row["seconds_forward"] + 0.0
 
-    def _points(self, error):
-        """(seconds, error, row) of the runs that have both."""
+    def _points(self, error: str) -> list[tuple[float, float, dict[str, Any]]]:
+        """Return (seconds, error, row) of the runs that have both."""
         points = [(self.seconds(row, error), row[error], row) for row in self.rows if row["status"] == "ok"]
         return [point for point in points if isfinite(point[0] + point[1])]
 
-    def pareto(self, error="gradient_error"):
-        """Rows that no other row beats in both time and error, the fastest first."""
+    def pareto(self, error: str = "gradient_error") -> list[dict[str, Any]]:
+        """Return the rows that no other row beats in both time and error, the fastest first."""
         return [row for *_, row in plots.unbeaten(self._points(error))]
 
-    def best(self, error, which="gradient_error"):
-        """The fastest row whose error is at most `error`, or None."""
+    def best(self, error: float, which: str = "gradient_error") -> dict[str, Any] | None:
+        """Return the fastest row whose error is at most `error`, or None."""
         return next((row for row in self.pareto(which) if row[which] <= error), None)
 
-    def parts(self):
-        """The figures, and the settings that tell those of a method apart; what was left out."""
-        error = self.judged
+    def parts(self) -> list[str | Table]:
+        """Return the figures, the settings that distinguish the rows of a method, and what was skipped."""
+        error = self.main_error
         best = [row for row in self.pareto(error) if row[error] < 1]
-        rows = [json.loads(row["settings"]) | row | {"best": "*" * (row in best)} for row in self.rows]
-        apart = [name for name in self.over if name not in COLUMNS]
-        errors = [row["reference_error"] for row in rows if row["reference_error"] >= 0]
-        return [
+        rows = []
+        for row in self.rows:
+            star = "*" if row in best else ""
+            rows.append(json.loads(row["settings"]) | row | {"best": star})
+        settings = [name for name in self.over if name not in COLUMNS]
+        parts: list[str | Table] = [
             f"{self.scene}: error against run time",
-            table_of(rows, ["method", *apart, *SHOWN, "best"]),
+            table_of(rows, ["method", *settings, *SHOWN, "best"]),
             *self.omissions(),
-            *self._recommended(error),
+            *self._recommendations(error),
             "A star: an error below 1, and no other row is both faster and more exact (the Pareto set).",
-            *([f"Error of the reference: {max(errors):.1e}."] if errors else []),
         ]
+        errors = [row["reference_error"] for row in rows if row["reference_error"] >= 0]
+        if errors:
+            parts.append(f"Error of the reference: {max(errors):.1e}.")
+        return parts
 
-    def _recommended(self, error):
-        """The fastest method for each value of GOALS of this error, in words."""
-        for goal in GOALS if self.pareto(error) else ():
-            words, row = f"a {error.replace('_', ' ')} of {100 * goal:g} %", self.best(goal, error)
+    def _recommendations(self, error: str) -> Iterator[str]:
+        """Say which method is the fastest for each of GOALS."""
+        if not self.pareto(error):
+            return
+        for goal in GOALS:
+            target = f"a {error.replace('_', ' ')} of {100 * goal:g} %"
+            row = self.best(goal, error)
             if row is None:
-                yield f"no method reaches {words}"
+                yield f"no method reaches {target}"
                 return
-            settings, seconds = words_of(json.loads(row["settings"])), self.seconds(row, error)
-            yield f"fastest at {words}: {row['method']} ({settings}), {seconds:.1e} s"
+            settings = words_of(json.loads(row["settings"]))
+            yield f"fastest at {target}: {row['method']} ({settings}), {self.seconds(row, error):.1e} s"
 
-    def plot(self, ax=None, error=None):
-        """Log-log picture: run time across, error up, one curve for each method, the Pareto set marked.
+    def plot(self, ax: Any = None, error: str | None = None) -> Any:
+        """Draw run time across and error up, log-log: one curve for each method, the Pareto set marked.
 
         Parameters
         ----------
         ax : matplotlib Axes, optional
             Default: the current axes of pyplot.
         error : "gradient_error" or "forward_error"
-            Default: that of the gradient, where there is one.
+            Default: the error of the gradient, where there is one.
 
         Returns
         -------
         matplotlib Axes
         """
-        ax, (lines, across, up) = plots.current(ax), self.curves(error)
-        if lines:  # nothing has no logarithm
-            plots.curves(lines, ax, across, up)
+        ax = plots.current(ax)
+        curves, xlabel, ylabel = self.curves(error)
+        if curves:  # empty axes have no logarithmic scale
+            plots.curves(curves, ax, xlabel, ylabel)
         ax.set_title(self.scene)
         return ax
 
-    def curves(self, error=None):
-        """The error over the run time, a curve for each method."""
-        lines: dict = {}
-        error = error or self.judged
-        for *point, row in sorted(self._points(error), key=lambda point: point[0]):
-            lines.setdefault(row["method"], []).append(point)
-        return lines, "run time [s]", error.replace("_", " ")
+    def curves(self, error: str | None = None) -> tuple[dict[str, list[Any]], str, str]:
+        """Return the error over the run time, a curve for each method."""
+        error = error or self.main_error
+        curves: dict[str, list[Any]] = {}
+        for seconds, size, row in sorted(self._points(error), key=lambda point: point[0]):
+            curves.setdefault(row["method"], []).append([seconds, size])
+        return curves, "run time [s]", error.replace("_", " ")
 
-    def save(self, folder):
-        """Write scene.md, scene.csv and, where matplotlib is installed, scene.png into a folder -> list of paths.
+    def save(self, folder: Any) -> list[Path]:
+        """Write scene.md, scene.csv and, where matplotlib is installed, scene.png into a folder.
 
-        A scene may have a name that is no name of a file: "/" becomes "-". A file that cannot be written is an
-        OSError.
+        Returns
+        -------
+        list of Path
+
+        Raises
+        ------
+        OSError
+            If a file cannot be written.
+
+        Notes
+        -----
+        "/" in the name of a scene becomes "-".
         """
         folder = Path(folder)
         with path_errors(folder):
@@ -401,8 +533,8 @@ class Rows(Result):
 # ---------------------------------------------------------------- a file that can be continued
 
 
-def _stored(file):
-    """CSV file -> its rows, without one that was cut off; none without a file."""
+def _stored(file: Any) -> list[dict[str, Any]]:
+    """Return the rows of a CSV file, without one that was cut off; none without a file."""
     if not file or not os.path.exists(file):
         return []
     with path_errors(file, reading=True):
@@ -411,9 +543,10 @@ def _stored(file):
         reader = csv.DictReader(stream)
         if reader.fieldnames not in (None, list(COLUMNS)):
             raise ValueError(f"{Path(file).name} is no table of work_precision; give another file name")
-        whole = [row for row in reader if row[COLUMNS[-1]] is not None]
-    return [{name: text if name in TEXTS else _number(text) for name, text in row.items()} for row in whole]
+        complete = [row for row in reader if row[COLUMNS[-1]] is not None]
+    return [{name: text if name in TEXTS else _number(text) for name, text in row.items()} for row in complete]
 
 
-def _number(text):
+def _number(text: str) -> float:
+    """Return a number from a cell; an empty one is NaN."""
     return int(text) if text.isdigit() else float(text or "nan")

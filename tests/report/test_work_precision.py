@@ -145,7 +145,7 @@ def test_caches_that_are_not_warm_are_refused(monkeypatch):
     """A run that goes on getting faster has no time; one that settles is warmed first."""
     clock = iter(2.0**-k for k in range(80))
     monkeypatch.setattr(work_precision, "timeit", lambda run, number: run() and next(clock))
-    monkeypatch.setattr(work_precision, "SETTLED", 1.5)
+    monkeypatch.setattr(work_precision, "SETTLED_RATIO", 1.5)
     monkeypatch.setattr(work_precision, "SHORT", 0.0)
     row = table().rows[0]
     assert row["status"] == "not_warm" and math.isnan(row["seconds_forward"]) and row["forward_error"] < 0.1
