@@ -1,4 +1,8 @@
-"""Cache: the last few values that were made from arrays, found again by the content of those arrays."""
+"""Cache: the last few values that were computed from arrays, looked up by the content of those arrays."""
+
+from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 
@@ -6,48 +10,54 @@ __all__ = ["Cache"]
 
 
 class Cache:
-    """Values keyed by content. Holds copies of the keys; keys must be plain, never traced.
+    """Values by the content of their keys. It holds copies of the keys; keys must be plain, never traced.
 
-    The list of entries is replaced, never changed: other threads may be looking through it.
+    The list of entries is replaced, never changed, because other threads may be reading it.
 
     Parameters
     ----------
     most : int
-        The value that was used longest ago is dropped first. Two serve a forward and a backward pass,
-        or two alternating sets of data.
+        Number of values that are kept; the least recently used one is dropped. Two serve a forward and a backward
+        pass, or two alternating sets of data.
     """
 
-    def __init__(self, most=2):
+    def __init__(self, most: int = 2) -> None:
         self.most = most
-        self._entries: list = []  # (key, value), last used first
+        self._entries: list[tuple[tuple, Any]] = []  # (key, value), the last used first
 
-    def find(self, key):
-        """The value of an equal key, or None."""
+    def find(self, key: tuple) -> Any:
+        """Return the value of an equal key, or None."""
         entries = self._entries
         for entry in entries:
-            if len(entry[0]) == len(key) and all(map(_same, entry[0], key)):
+            entry_key, value = entry
+            if len(entry_key) == len(key) and all(map(_are_equal, entry_key, key)):
                 self._entries = [entry, *(other for other in entries if other is not entry)]
-                return entry[1]
+                return value
         return None
 
-    def put(self, key, value):
-        """Keep a value; returns it."""
+    def put(self, key: tuple, value: Any) -> Any:
+        """Keep a value, and return it."""
         key = tuple(np.array(part) if isinstance(part, np.ndarray) else part for part in key)
         self._entries = [(key, value), *self._entries[: self.most - 1]]
         return value
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self._entries)
 
     @property
-    def last(self):
+    def last(self) -> Any:
         """The value that was used last, or None."""
-        return next((value for _, value in self._entries), None)
+        entries = self._entries
+        if not entries:
+            return None
+        _, value = entries[0]
+        return value
 
 
-def _same(one, other):
+def _are_equal(one: Any, other: Any) -> bool:
+    """Return whether two parts of keys are equal, in type and dtype too."""
     if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
-        # By type and dtype too: float32 and float64 data of equal value have different derivatives.
+        # float32 and float64 data of equal value have different derivatives.
         return getattr(one, "dtype", None) == getattr(other, "dtype", None) and np.array_equal(one, other)
     if one is other:
         return True

@@ -44,7 +44,11 @@ METHODS: dict[str, Any] = {
     "krylov": krylov_engine,
 }
 # Functions that refuse values of options of a method that has nothing to solve.
-OPTION_CHECKS = {"direct": check_precision, "structured": check_precision, "multigrid": check_multigrid_options}
+OPTION_CHECKS: dict[str, Any] = {
+    "direct": check_precision,
+    "structured": check_precision,
+    "multigrid": check_multigrid_options,
+}
 # Names that other libraries use for the methods.
 SYNONYMS = {
     "cg": "krylov",
@@ -191,7 +195,7 @@ def _engine(system: System, choice: Choice, options: dict[str, Any], near: Engin
         return Near(system, getattr(near, "lu", near))
     if choice.engine is not None and not options:
         return choice.engine
-    build = system.engine_builder or METHODS[method]
+    build: Any = system.engine_builder or METHODS[method]
     return build(system, **options)
 
 
@@ -281,10 +285,10 @@ def _choose_by_entries(system: System, solves: str, dimension: int, others: str)
     if not system.sign:
         return Choice("direct", f"{size}; the diagonal has no single sign, which rules multigrid out")
     try:
-        engine = multigrid_engine(system)
+        multigrid = multigrid_engine(system)
     except ConvergenceError:
         return Choice("direct", f"{size}; but multigrid does not coarsen it")
-    return Choice("multigrid", f"{size}; the diagonal has one sign", engine)
+    return Choice("multigrid", f"{size}; the diagonal has one sign", multigrid)
 
 
 def _choose_for_complex_entries(system: System, dimension: int, kind: str, others: str) -> Choice:

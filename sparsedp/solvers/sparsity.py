@@ -38,7 +38,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.operators.structure.base import rows_of
-from sparsedp.solvers.amg import coloured_graph
+from sparsedp.solvers.amg import colour_graph
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -396,7 +396,7 @@ def colour_columns(pattern: sp.csr_array, shapes: Shapes | None = None) -> NDArr
     colours = _colour_by_lattice(links, field_indices(shapes or [(size,)]), fullest_row)
     if colours.max() < 2 * fullest_row:
         return colours
-    return min(colours, coloured_graph(links), key=np.max)
+    return min(colours, colour_graph(links), key=np.max)
 
 
 def field_indices(shapes: Shapes, starts: Sequence[Sequence[int]] | None = None) -> NDArray[Any]:

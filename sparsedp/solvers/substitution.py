@@ -1,4 +1,4 @@
-"""Block triangular systems: the unknowns that follow from known ones by substitution, before and after the others.
+"""Block triangular systems: unknowns that are found by substitution, before and after the coupled ones.
 
 Row i of A uses unknown j where A[i, j] is not 0. Unknowns that use each other, directly or through others, form the
 strongly connected components of that graph. In a topological order of the components A is block lower triangular. A
@@ -19,8 +19,10 @@ Duff and Reid, An implementation of Tarjan's algorithm for the block triangulari
 Mathematical Software 4 (1978) 137-147.
 """
 
+from __future__ import annotations
+
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -34,6 +36,10 @@ from sparsedp.solvers.engine import Engine
 from sparsedp.solvers.nullspace import NullSpace
 from sparsedp.solvers.records import failure
 from sparsedp.solvers.scaling import norm, shifted
+
+if TYPE_CHECKING:
+    from scipy.sparse.linalg import SuperLU
+
 
 __all__ = [
     "SMALL_BLOCK",
@@ -67,12 +73,12 @@ class Splitting(NamedTuple):
     coupled: np.ndarray
 
     @property
-    def size(self):
-        """Number of unknowns that are found by substitution."""
+    def size(self) -> int:
+        """The number of unknowns that are found by substitution."""
         return self.first.size + self.last.size
 
 
-def split(matrix, active):
+def split(matrix: sp.csr_array, active: np.ndarray | None) -> Splitting | None:
     """Find the unknowns of a matrix that are solved by substitution.
 
     Parameters
@@ -93,11 +99,12 @@ def split(matrix, active):
         If an unknown that is a component of its own has no pivot: then the matrix is singular.
     """
     size = matrix.shape[0]
-    active = np.ones(size, dtype=bool) if active is None else active
+    if active is None:
+        active = np.ones(size, dtype=bool)
     graph = _graph(matrix)
     count, labels = connected_components(graph, directed=True, connection="strong")
-    alone = np.bincount(labels, minlength=count)[labels] == 1
-    alone &= active & (np.diff(matrix.indptr) + np.bincount(matrix.indices, minlength=size) > 0)  # else a null vector
+    has_entries = np.diff(matrix.indptr) + np.bincount(matrix.indices, minlength=size) > 0  # else it is a null vector
+    alone = (np.bincount(labels, minlength=count)[labels] == 1) & active & has_entries
     if not alone.any() or not _is_topological(graph, labels):  # SciPy numbers them so, but does not promise it
         return None
     without_pivot = np.flatnonzero(alone & (matrix.diagonal() == 0))
@@ -111,34 +118,36 @@ def split(matrix, active):
     return Splitting(_in_order(first, labels), _in_order(last, labels), active & ~first & ~last)
 
 
-def largest_block(matrix):
+def largest_block(matrix: sp.csr_array) -> tuple[int, bool]:
     """Return the number of unknowns of the largest strongly connected component, and whether components use others."""
     _, sizes, triangular = _components(matrix)
     return int(np.max(sizes)), triangular
 
 
-def _components(matrix):
+def _components(matrix: sp.csr_array) -> tuple[np.ndarray, np.ndarray, bool]:
     """Return the components: their numbers in topological order, their sizes, and whether some use others.
 
-    They are taken for unlinked if the numbers are in no such order: SciPy's are, but it does not promise that.
+    If the numbers are in no such order, no component is said to use others: SciPy's are in order, but it does not
+    promise that.
     """
     graph = _graph(matrix)
     count, labels = connected_components(graph, directed=True, connection="strong")
     regions, _ = connected_components(graph, directed=False)
-    return labels, np.bincount(labels, minlength=count), count > regions and _is_topological(graph, labels)
+    triangular = count > regions and _is_topological(graph, labels)
+    return labels, np.bincount(labels, minlength=count), triangular
 
 
-def _graph(matrix):
-    """The pattern of a csr_array, with ones for entries that may be complex or far from 1."""
+def _graph(matrix: sp.csr_array) -> sp.csr_array:
+    """Return the pattern of a csr_array, with ones for entries that may be complex or far from 1."""
     return sp.csr_array((np.ones(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape)
 
 
-def _is_topological(graph, labels):
-    """Whether no row uses a component of a higher number."""
+def _is_topological(graph: sp.csr_array, labels: np.ndarray) -> bool:
+    """Return whether no row uses a component of a higher number."""
     return bool(np.all(labels[rows_of(graph)] >= labels[graph.indices]))
 
 
-def _in_order(chosen, labels):
+def _in_order(chosen: np.ndarray, labels: np.ndarray) -> np.ndarray:
     """Return the chosen unknowns, each a component of its own, by increasing number of their component."""
     unknowns = np.flatnonzero(chosen)
     members = np.full(labels.size, -1, dtype=np.int32)
@@ -146,16 +155,16 @@ def _in_order(chosen, labels):
     return members[members >= 0]
 
 
-def _reached(graph, starts):
+def _reached(graph: sp.csr_array, starts: np.ndarray) -> np.ndarray:
     """Return which nodes of a directed graph can be reached from any of the starts, these included."""
     size = graph.shape[0]
-    found = np.zeros(size + 1, dtype=bool)
+    is_reached = np.zeros(size + 1, dtype=bool)
     if starts.size:
         indices = np.concatenate([graph.indices, starts.astype(graph.indices.dtype)])
         indptr = np.append(graph.indptr, graph.indptr.dtype.type(indices.size))  # one more node, linked to all starts
         links = sp.csr_array((np.ones(indices.size), indices, indptr), shape=(size + 1, size + 1))
-        found[breadth_first_order(links, size, return_predecessors=False)] = True
-    return found[:size]
+        is_reached[breadth_first_order(links, size, return_predecessors=False)] = True
+    return is_reached[:size]
 
 
 class Substitution:
@@ -169,48 +178,75 @@ class Substitution:
         Rows; each uses only rows before it, and unknowns that are known.
     """
 
-    def __init__(self, matrix, order):
-        self.matrix, self.order = matrix, order
+    def __init__(self, matrix: sp.csr_array, order: np.ndarray) -> None:
+        self.matrix = matrix
+        self.order = order
 
-    def forward(self, b, x):
-        """Write into x the unknowns in order: the solution of their rows of A x = b. The others of x are given."""
+    def forward(self, b: np.ndarray, x: np.ndarray) -> None:
+        """Write the unknowns in order into x: the solution of their rows of A x = b. The others of x are given."""
         if not self.order.size or self._run("forward", b, x):
             return
         reverse = self.order[::-1]
         x[reverse] = 0.0
         x[reverse] = self.factors.solve((b - self.matrix @ x)[reverse])
 
-    def backward(self, r, x):
-        """Write into x the unknowns in order: the solution of their columns of A^T x = r; r becomes r - A^T x."""
+    def backward(self, r: np.ndarray, x: np.ndarray) -> None:
+        """Write the unknowns in order into x: the solution of their columns of A^T x = r; r becomes r - A^T x."""
         if not self.order.size or self._run("backward", r, x):
             return
-        reverse, found = self.order[::-1], np.zeros_like(x)
-        found[reverse] = self.factors.solve(r[reverse], trans="T")
-        r -= self.matrix.T @ found
-        x[reverse] = found[reverse]
+        reverse = self.order[::-1]
+        solution = np.zeros_like(x)
+        solution[reverse] = self.factors.solve(r[reverse], trans="T")
+        r -= self.matrix.T @ solution
+        x[reverse] = solution[reverse]
 
-    def _run(self, name, b, x):
+    def _run(self, name: str, b: np.ndarray, x: np.ndarray) -> bool:
         """Run a compiled loop; return whether there is one."""
         matrix = self.matrix
-        name += "_complex" * (matrix.dtype.kind == "c")
-        entries = matrix.indptr, matrix.indices, matrix.data
+        if matrix.dtype.kind == "c":
+            name = f"{name}_complex"
+        entries = (matrix.indptr, matrix.indices, matrix.data)
         return kernels.run("substitution", name, self.order.size, 0, 1, *entries, self.order, b, x)
 
     @cached_property
-    def factors(self):
+    def factors(self) -> SuperLU:
         """Without compiled loops: LU factors of the rows and columns in reverse order, an upper triangular matrix.
 
         It is its own factor, without fill-in: columns are eliminated one by one, and the only pivot is the diagonal.
         """
         reverse = self.order[::-1]
         block = sp.csc_array(self.matrix[reverse][:, reverse])
-        return splu(block, permc_spec="NATURAL", diag_pivot_thresh=0.0, options=dict(Equil=False))
+        return splu(block, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"Equil": False})
 
-    def row_sums(self):
-        """Sums of the magnitudes of the entries that link the unknowns in order to each other."""
+    def row_sums(self) -> np.ndarray:
+        """Return the sums of the magnitudes of the entries that link the unknowns in order to each other."""
         members = np.zeros(self.matrix.shape[0])
         members[self.order] = 1.0
         return members * (abs(self.matrix) @ members)
+
+
+class Stage(NamedTuple):
+    """Rows of a block triangular matrix that are factored together.
+
+    Attributes
+    ----------
+    rows : slice
+        In topological order.
+    step : 1 or -1
+        -1 if the factors are of the rows in reverse order.
+    factors : SuperLU
+        Of the diagonal blocks.
+    links : csr_array
+        The entries of these rows in columns of earlier stages.
+    columns : int array
+        The columns of `links`, in topological order.
+    """
+
+    rows: slice
+    step: int
+    factors: SuperLU
+    links: sp.csr_array
+    columns: np.ndarray
 
 
 class BlockFactors:
@@ -231,25 +267,35 @@ class BlockFactors:
         For each stage, whether it is one large component.
     """
 
-    def __init__(self, matrix, order, edges, large):
-        self.order, self.stages, entries = order, [], 0
-        place = np.empty_like(order)
-        place[order] = np.arange(order.size)
-        for low, high, alone in zip(edges[:-1].tolist(), edges[1:].tolist(), large.tolist(), strict=True):
-            rows = matrix[order[low:high]]
-            columns = place[rows.indices]
-            here, row = columns >= low, rows_of(rows)
-            block = sp.csc_array((rows.data[here], (row[here], columns[here] - low)), shape=(high - low,) * 2)
-            known, column = np.unique(columns[~here], return_inverse=True)
-            links = sp.csr_array((rows.data[~here], (row[~here], column)), shape=(high - low, known.size))
-            factors = splu(block) if alone else splu(sp.csc_array(block[::-1, ::-1]), permc_spec="NATURAL")
-            self.stages.append((slice(low, high), 1 if alone else -1, factors, links, known))
-            entries += factors.nnz
+    def __init__(self, matrix: sp.csr_array, order: np.ndarray, edges: np.ndarray, large: np.ndarray) -> None:
+        self.order = order
+        position = np.empty_like(order)
+        position[order] = np.arange(order.size)
+        self.stages = [
+            self._stage(matrix, position, low, high, is_large)
+            for low, high, is_large in zip(edges[:-1].tolist(), edges[1:].tolist(), large.tolist(), strict=True)
+        ]
+        entries = sum(stage.factors.nnz for stage in self.stages)
         blocks = f" of {len(self.stages)} blocks" if len(self.stages) > 1 else ""
         self.words = f"sparse LU{blocks} in block triangular order, {entries} entries in the factors"
 
+    def _stage(self, matrix: sp.csr_array, position: np.ndarray, low: int, high: int, is_large: bool) -> Stage:
+        """Factor the rows from `low` to `high` in topological order."""
+        rows = matrix[self.order[low:high]]
+        row = rows_of(rows)
+        column = position[rows.indices]
+        is_inside = column >= low
+        inside = (rows.data[is_inside], (row[is_inside], column[is_inside] - low))
+        block = sp.csc_array(inside, shape=(high - low, high - low))
+        columns, link_column = np.unique(column[~is_inside], return_inverse=True)
+        links = sp.csr_array((rows.data[~is_inside], (row[~is_inside], link_column)), shape=(high - low, columns.size))
+        if is_large:
+            return Stage(slice(low, high), 1, splu(block), links, columns)
+        factors = splu(sp.csc_array(block[::-1, ::-1]), permc_spec="NATURAL")
+        return Stage(slice(low, high), -1, factors, links, columns)
+
     @classmethod
-    def of(cls, matrix):
+    def of(cls, matrix: sp.csr_array) -> BlockFactors | None:
         """Return the factors of a matrix; None if one component is most of it, or components do not use others."""
         labels, sizes, triangular = _components(matrix)
         size = matrix.shape[0]
@@ -257,18 +303,21 @@ class BlockFactors:
             return None
         ends = np.cumsum(sizes)
         is_large = sizes > SMALL_BLOCK
-        edges = np.unique(np.concatenate([[0, size], ends[is_large], (ends - sizes)[is_large]]))
-        return cls(matrix, np.argsort(labels, kind="stable"), edges, np.isin(edges[:-1], (ends - sizes)[is_large]))
+        large_starts = (ends - sizes)[is_large]
+        edges = np.unique(np.concatenate([[0, size], ends[is_large], large_starts]))
+        return cls(matrix, np.argsort(labels, kind="stable"), edges, np.isin(edges[:-1], large_starts))
 
-    def solve(self, b, transposed):
+    def solve(self, b: np.ndarray, transposed: bool) -> np.ndarray:
         """Solve A x = b, or A^T x = b, block by block."""
-        r, x = b[self.order], np.empty_like(b)
-        for rows, step, factors, links, known in reversed(self.stages) if transposed else self.stages:
-            if transposed:
+        r = b[self.order]
+        if transposed:
+            for rows, step, factors, links, columns in reversed(self.stages):
                 r[rows] = factors.solve(r[rows][::step], trans="T")[::step]
-                r[known] -= links.T @ r[rows]
-            else:
-                r[rows] = factors.solve((r[rows] - links @ r[known])[::step])[::step]
+                r[columns] -= links.T @ r[rows]
+        else:
+            for rows, step, factors, links, columns in self.stages:
+                r[rows] = factors.solve((r[rows] - links @ r[columns])[::step])[::step]
+        x = np.empty_like(b)
         x[self.order] = r
         return x
 
@@ -288,16 +337,27 @@ class BlockTriangular(Engine):
         If the triangular parts are singular to working precision.
     """
 
-    def __init__(self, system, inner):
-        self.system, self.inner = system, inner
+    def __init__(self, system: Any, inner: Engine | None) -> None:
+        self.system = system
+        self.inner = inner
         splitting = system.splitting
-        self.first, self.last = (Substitution(system.matrix, order) for order in (splitting.first, splitting.last))
-        self.method, self.unit = ("direct", "iterations") if inner is None else (inner.method, inner.unit)
-        words = f"substitution, {splitting.size} unknowns"
-        self.hierarchy = f"{words}, {system.matrix.nnz} entries" if inner is None else f"{inner.hierarchy}; {words}"
-        if inner is not None:
-            for name in ("iterative", "hierarchical", "refines", "most_refinements", "reduction", "advice"):
-                setattr(self, name, getattr(inner, name))
+        assert splitting is not None
+        self.first = Substitution(system.matrix, splitting.first)
+        self.last = Substitution(system.matrix, splitting.last)
+        description = f"substitution, {splitting.size} unknowns"
+        if inner is None:
+            self.method = "direct"
+            self.hierarchy = f"{description}, {system.matrix.nnz} entries"
+        else:
+            self.method = inner.method
+            self.unit = inner.unit
+            self.hierarchy = f"{inner.hierarchy}; {description}"
+            self.iterative = inner.iterative
+            self.hierarchical = inner.hierarchical
+            self.refines = inner.refines
+            self.most_refinements = inner.most_refinements
+            self.reduction = inner.reduction
+            self.advice = inner.advice
         if not self._growth() < LARGEST_GROWTH:
             raise ConvergenceError(
                 f"{system.unscaled} is singular, or its condition number is beyond 1e14: in its triangular part a "
@@ -306,57 +366,70 @@ class BlockTriangular(Engine):
                 info=failure("setup_failed"),
             )
 
-    def _growth(self):
+    def _growth(self) -> float:
         """Return an estimate of |A^-1| |A| for the triangular parts, from solutions for random data."""
         largest = []
         with np.errstate(all="ignore"):
             for part in (self.first, self.last):
+                if not part.order.size:
+                    continue
                 sums = part.row_sums()
-                for probe in probes(sums.size) if part.order.size else ():
+                for probe in probes(sums.size):
                     x = np.zeros(sums.size, part.matrix.dtype)
                     part.forward((sums * probe).astype(x.dtype), x)
                     largest.append(np.max(np.abs(x)))
         return np.max(largest)
 
-    def solve(self, b, goal, transposed):
+    def solve(self, b: np.ndarray, goal: float, transposed: bool) -> tuple[np.ndarray, int, str]:
         """Substitute, solve for the coupled unknowns to the residual `goal`, substitute."""
-        return (self._transposed if transposed else self._forward)(b, goal)
+        return self._backward(b, goal) if transposed else self._forward(b, goal)
 
-    def _forward(self, b, goal):
+    def _forward(self, b: np.ndarray, goal: float) -> tuple[np.ndarray, int, str]:
+        """Solve A x = b."""
         x = np.zeros_like(b)
+        iterations = 0
+        status = ""
         self.first.forward(b, x)
-        used, trouble = 0, ""
         if self.inner is not None:
-            residual = b - self.system.product(x) if self.first.order.size else b
-            used, trouble = self._coupled(residual, goal, x, False)
+            residual = b
+            if self.first.order.size:
+                residual = b - self.system.product(x)
+            iterations, status = self._solve_coupled(self.inner, residual, goal, x, False)
         self.last.forward(b, x)
-        return x, used, trouble
+        return x, iterations, status
 
-    def _transposed(self, b, goal):
-        x, residual = np.zeros_like(b), b.copy()
+    def _backward(self, b: np.ndarray, goal: float) -> tuple[np.ndarray, int, str]:
+        """Solve A^T x = b."""
+        x = np.zeros_like(b)
+        residual = b.copy()
+        iterations = 0
+        status = ""
         self.last.backward(residual, x)
-        used, trouble = 0, ""
         if self.inner is not None:
-            used, trouble = self._coupled(residual, goal, x, True)
+            iterations, status = self._solve_coupled(self.inner, residual, goal, x, True)
             if self.first.order.size:
                 residual = b - self.system.product(x, True)
         self.first.backward(residual, x)
-        return x, used, trouble
+        return x, iterations, status
 
-    def _coupled(self, residual, goal, x, transposed):
+    def _solve_coupled(
+        self, inner: Engine, residual: np.ndarray, goal: float, x: np.ndarray, transposed: bool
+    ) -> tuple[int, str]:
         """Write the coupled unknowns into x, and return iterations and status word."""
-        system, members = self.system.coupled, self.system.splitting.coupled
+        system = self.system.coupled
+        assert self.system.splitting is not None
+        members = self.system.splitting.coupled
         residual = np.where(members, residual, 0.0)
         if not norm(residual) > goal:
             return 0, ""
         residual = system.null_space.project(residual, transposed)
-        y, used, trouble = self.inner.solve(residual, goal, transposed)
+        y, iterations, status = inner.solve(residual, goal, transposed)
         x[members] = shifted(y[members], -system.exponent)
-        return used, trouble
+        return iterations, status
 
 
-def extended_null_space(system):
-    """Return the NullSpace of a System that is split, from that of its coupled unknowns.
+def extended_null_space(system: Any) -> NullSpace:
+    """Return the NullSpace of a System that is split, from the NullSpace of its coupled unknowns.
 
     With A_CC r_C = 0 and l_C A_CC = 0 the null vectors of A are r = (0, r_C, -A_LL^-1 A_LC r_C) and
     l = (-A_FF^-T A_CF^T l_C, l_C, 0).
@@ -367,20 +440,30 @@ def extended_null_space(system):
         If an unknown belongs to the null vectors of two components.
     """
     splitting = system.splitting
-    inner = system.coupled.null_space if splitting.coupled.any() else NullSpace.none()
+    assert splitting is not None
+    if not splitting.coupled.any():
+        return NullSpace.none(system.size)
+    inner = system.coupled.null_space
     if not inner.count:
         return NullSpace.none(system.size)
-    first, last = (Substitution(system.matrix, order) for order in (splitting.first, splitting.last))
-    labels = np.where(splitting.coupled, 0, -1) if inner.labels is None else inner.labels.copy()
-    right, left = inner.right.copy(), inner.left.copy()
+    first = Substitution(system.matrix, splitting.first)
+    last = Substitution(system.matrix, splitting.last)
+    if inner.labels is None:
+        labels = np.where(splitting.coupled, 0, -1)
+    else:
+        labels = inner.labels.copy()
+    right = inner.right.copy()
+    left = inner.left.copy()
     for number in range(inner.count):
         members = labels == number
-        r, l = np.where(members, inner.right, 0.0), np.where(members, inner.left, 0.0)
+        r = np.where(members, inner.right, 0.0)
+        l = np.where(members, inner.left, 0.0)
         last.forward(np.zeros_like(r), r)
         first.backward(-system.product(l, True), l)
         others = ((r != 0) | (l != 0)) & ~members
         if np.any(labels[others] >= 0):
             raise ArithmeticError("an unknown is linked to two singular components")
         labels[others] = number
-        right[others], left[others] = r[others], l[others]
+        right[others] = r[others]
+        left[others] = l[others]
     return system.kernel(labels, right, left, inner.count)

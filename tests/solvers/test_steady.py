@@ -375,7 +375,7 @@ def test_a_jacobian_leans_on_the_factors_of_one_before(monkeypatch, most, own):
     loss = dp.value_and_grad(lambda ends: anp.sum(find(-grid.centres()[0], ends) ** 2))
     exact = loss(ends)
     monkeypatch.setattr(preconditioners, "direct_engine", lambda system: factored.append(system) or made(system))
-    monkeypatch.setattr(preconditioners, "MOST", most)
+    monkeypatch.setattr(preconditioners, "MOST_ITERATIONS", most)
     monkeypatch.setattr(newton, "NEAR_FROM", 100)
     found = loss(ends)
     again = loss(ends)
