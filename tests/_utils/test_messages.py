@@ -18,7 +18,9 @@ SILENT = {"SystemExit", "StopIteration", "KeyboardInterrupt"}  # carry no senten
 def sentences(node, scope):
     """All constant texts an expression can give, with HOLE for each part known only at run time."""
     if isinstance(node, ast.Constant):
-        return [node.value] if isinstance(node.value, str) else [HOLE]
+        if isinstance(node.value, str):
+            return [node.value]
+        return [HOLE]
     if isinstance(node, ast.JoinedStr):
         return join([sentences(v, scope) if isinstance(v, ast.Constant) else [HOLE] for v in node.values])
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):

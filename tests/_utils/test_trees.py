@@ -244,7 +244,9 @@ def test_a_gradient_whose_order_changes_from_call_to_call():
     def gradient(x):
         calls.append(None)
         slopes = turned_gradient(x)
-        return slopes if len(calls) % 2 else dict(reversed(slopes.items()))
+        if len(calls) % 2:
+            return slopes
+        return dict(reversed(slopes.items()))
 
     assert dp.minimize(loss, START, gradient=gradient).x == pytest.approx({"a": 1.0, "b": 2.0})
 
@@ -480,7 +482,9 @@ def in_turn(results):
     def function(i, state):
         calls.append(None)
         entries = results(state)
-        return entries if len(calls) % 3 else dict(reversed(entries.items()))
+        if len(calls) % 3:
+            return entries
+        return dict(reversed(entries.items()))
 
     return function
 

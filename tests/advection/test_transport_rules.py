@@ -246,7 +246,9 @@ def test_an_array_may_be_reused_before_the_pullback(scheme):
 
         def moved(x, others=others, number=number):
             args = [x if place == number else value for place, value in enumerate(others)]
-            return carry(*args) if scheme == "convection" else carry(*args, 0.1)
+            if scheme == "convection":
+                return carry(*args)
+            return carry(*args, 0.1)
 
         wanted = pullback(moved, buffers[number])[1](buffers[0])
         pull = pullback(moved, buffers[number])[1]

@@ -60,7 +60,9 @@ def cubic(x, p):
 
 
 def walls(name):
-    return {"x": (dp.neumann, dp.dirichlet)} if name == "pressure" else {"x": [dp.inflow, dp.outflow]}
+    if name == "pressure":
+        return {"x": (dp.neumann, dp.dirichlet)}
+    return {"x": [dp.inflow, dp.outflow]}
 
 
 # name -> (arguments that hold arrays, lists or dicts; builder; what it is used for)

@@ -29,7 +29,9 @@ def grids(shape, drawn):
 @pytest.fixture
 def most(shape, drawn):
     """How many choices of walls a grid is tried with: on a line, that is all of them; fewer by default."""
-    return {1: 16, 2: 4, 3: 1}[len(shape)] if drawn is list else {1: 5, 2: 2, 3: 1}[len(shape)]
+    if drawn is list:
+        return {1: 16, 2: 4, 3: 1}[len(shape)]
+    return {1: 5, 2: 2, 3: 1}[len(shape)]
 
 
 def flows(grid, most, rng):

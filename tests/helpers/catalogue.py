@@ -24,7 +24,9 @@ class Entry(NamedTuple):
 
     def conditions(self, boundaries):
         """Those for which it is made: one when it does not look at them."""
-        return boundaries if inspect.signature(self.make).parameters.keys() - {"_"} >= {"boundary"} else boundaries[:1]
+        if inspect.signature(self.make).parameters.keys() - {"_"} >= {"boundary"}:
+            return boundaries
+        return boundaries[:1]
 
 
 def solid(grid):

@@ -102,7 +102,9 @@ class Dense:
                         column = np.zeros(len(self.faces))
                         column[row] = (2 * side - 1) / (0.5 * wall.a * self.width(cell, axis) + wall.b)
                         columns.append(column)
-        return np.stack(columns, axis=1) if columns else np.zeros((len(self.faces), 0))
+        if columns:
+            return np.stack(columns, axis=1)
+        return np.zeros((len(self.faces), 0))
 
     def average(self):
         A = np.zeros((len(self.faces), len(self.cells)))
@@ -243,5 +245,7 @@ class Dense:
             high = node
         else:
             side = int(node > 0)
-            return 0.0 if OPPOSITE[self.sides[axis][side]] is dp.dirichlet else value((n - 1) * side)
+            if OPPOSITE[self.sides[axis][side]] is dp.dirichlet:
+                return 0.0
+            return value((n - 1) * side)
         return (value(low) * h[high] + value(high) * h[low]) / (h[low] + h[high])

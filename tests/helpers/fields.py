@@ -59,7 +59,9 @@ class Field:
                 wall = [np.take(x, [-side], axis) for x in grid.face_centres(axis)]
                 normal = (2 * side - 1) * self.along(wall, axis, 1)
                 values.append((condition.a * self(wall) + condition.b * normal).ravel())
-        return np.concatenate(values) if values else np.zeros(0)
+        if values:
+            return np.concatenate(values)
+        return np.zeros(0)
 
     # ---------------------------------------------------- (input, wanted) of one operator each
 

@@ -131,7 +131,9 @@ def outcome(scene, method, tolerance):
         slope = pushforward(loss, x, np.eye(len(x))[0])[1]
     except (DerivativeError, ConvergenceError):
         return "refused"
-    return "right" if abs(slope - scene.slope) <= 0.01 * abs(scene.slope) else "wrong"
+    if abs(slope - scene.slope) <= 0.01 * abs(scene.slope):
+        return "right"
+    return "wrong"
 
 
 def counted(make, count, seed, methods=TOLERANCES, coarsest=2):

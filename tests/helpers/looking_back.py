@@ -56,7 +56,9 @@ def cell(u, places, sides, inflow):
 
 def _plain(p, n, side):
     p = getval(p)
-    return p - n * np.floor(p / n) if side == "wrap" else np.clip(p, -1.5, n + 0.5)
+    if side == "wrap":
+        return p - n * np.floor(p / n)
+    return np.clip(p, -1.5, n + 0.5)
 
 
 def down(part, axis, wraps):
@@ -71,12 +73,18 @@ def up(part, axis, wraps, widths):
     """Interpolate along an axis from cells to faces; at a wall the only cell counts."""
     n = part.shape[axis]
     line = [-1 if a == axis else 1 for a in range(part.ndim)]
-    before = np.roll(widths, 1) if wraps else np.append(widths[:1], widths)
-    after = widths if wraps else np.append(widths, widths[-1:])
+    if wraps:
+        before = np.roll(widths, 1)
+        after = widths
+        lower = anp.roll(part, 1, axis)
+        upper = part
+    else:
+        before = np.append(widths[:1], widths)
+        after = np.append(widths, widths[-1:])
+        lower = anp.concatenate([_cut(part, axis, 0, 1), part], axis)
+        upper = anp.concatenate([part, _cut(part, axis, n - 1, n)], axis)
     before = before.reshape(line)
     after = after.reshape(line)
-    lower = anp.roll(part, 1, axis) if wraps else anp.concatenate([_cut(part, axis, 0, 1), part], axis)
-    upper = part if wraps else anp.concatenate([part, _cut(part, axis, n - 1, n)], axis)
     return (after * lower + before * upper) / (before + after)
 
 
@@ -90,8 +98,9 @@ def speeds(move, v):
     grid = setting.grid
     parts = grid.split(v) if setting.velocity == "faces" else [v[a] for a in range(grid.dim)]
     if setting.of == "cells":
-        on_faces = setting.velocity == "faces"
-        return [[down(p, a, grid.periodic[a]) if on_faces else p for a, p in enumerate(parts)]]
+        if setting.velocity == "faces":
+            parts = [down(p, a, grid.periodic[a]) for a, p in enumerate(parts)]
+        return [parts]
     found = []
     for own in range(grid.dim):
         line = []
@@ -99,7 +108,8 @@ def speeds(move, v):
             if setting.velocity == "faces" and axis == own:
                 line.append(part)
                 continue
-            part = down(part, axis, grid.periodic[axis]) if setting.velocity == "faces" else part
+            if setting.velocity == "faces":
+                part = down(part, axis, grid.periodic[axis])
             line.append(up(part, own, grid.periodic[own], grid.widths[own]))
         found.append(line)
     return found
@@ -115,7 +125,9 @@ def moved(move, u, v, dt, inflow):
         _component(move, part, w, _lines(grid, setting.of == "faces" and own), dt, letters, inflow)
         for own, (part, w) in enumerate(zip(parts, speeds(move, v)))
     ]
-    return results[0] if setting.of == "cells" else grid.join(*results)
+    if setting.of == "cells":
+        return results[0]
+    return grid.join(*results)
 
 
 def _lines(grid, own):
@@ -133,8 +145,10 @@ def _lines(grid, own):
 def number(line, x, cubic, period):
     """Where among the points a place lies: the inverse of the curve through them, by bisection and a Newton step."""
     n = line.size - 6
-    turns = np.floor((getval(x) - line[3]) / period) if period else 0.0
-    x = x - turns * period if period else x
+    turns = 0.0
+    if period:
+        turns = np.floor((getval(x) - line[3]) / period)
+        x = x - turns * period
     numbers = np.arange(-3.0, n + 3)
     if not cubic:
         i = np.clip(np.searchsorted(line, getval(x), "right") - 1, 0, line.size - 2)

@@ -24,34 +24,45 @@ def to_nodes(x, grid, axis, shared):
     hl = cut(h, axis, 0, -1)
     hh = cut(h, axis, 1, None)
     inner = (low * hl + high * hh) / (hl + hh) if shared else (low * hh + high * hl) / (hl + hh)
-    return inner if grid.periodic[axis] else anp.concatenate([cut(x, axis, 0, 1), inner, cut(x, axis, -1, None)], axis)
+    if grid.periodic[axis]:
+        return inner
+    return anp.concatenate([cut(x, axis, 0, 1), inner, cut(x, axis, -1, None)], axis)
 
 
 def inside(x, grid, axis, nodes):
     """Return values at the interfaces between the nodes of an axis: the cell centres, and the walls."""
-    if grid.periodic[axis]:
-        x = anp.concatenate([x, cut(x, axis, 0, 1)], axis) if nodes else x
-        middle = 0.5 * (cut(x, axis, 0, -1) + cut(x, axis, 1, None)) if nodes else x
+    periodic = grid.periodic[axis]
+    middle = x
+    if nodes:
+        if periodic:
+            x = anp.concatenate([x, cut(x, axis, 0, 1)], axis)
+        middle = 0.5 * (cut(x, axis, 0, -1) + cut(x, axis, 1, None))
+    if periodic:
         return anp.concatenate([cut(middle, axis, -1, None), cut(middle, axis, 0, -1)], axis)
-    middle = 0.5 * (cut(x, axis, 0, -1) + cut(x, axis, 1, None)) if nodes else x
     return anp.concatenate([cut(x, axis, 0, 1), middle, cut(x, axis, -1, None)], axis)
 
 
 def carrying_speeds(grid, v, velocity, form, own):
     """The velocity along each axis where component `own` (None: cells) needs it."""
-    parts = (
-        grid.split(v) if velocity == "faces" else [anp.reshape(v, (grid.dim, *grid.shape))[a] for a in range(grid.dim)]
-    )
-    found = []
+    on_faces = velocity == "faces"
+    if on_faces:
+        parts = grid.split(v)
+    else:
+        parts = list(anp.reshape(v, (grid.dim, *grid.shape)))
+    speeds = []
     for axis, part in enumerate(parts):
-        if velocity == "cells" and form == "advective":
-            found.append(part if own is None else to_nodes(part, grid, own, False))
+        if not on_faces and form == "advective":
+            if own is not None:
+                part = to_nodes(part, grid, own, False)
         elif axis == own:
-            found.append(inside(part, grid, axis, velocity == "faces"))
+            part = inside(part, grid, axis, on_faces)
         else:
-            part = part if velocity == "faces" else to_nodes(part, grid, axis, False)
-            found.append(part if own is None else to_nodes(part, grid, own, True))
-    return found
+            if not on_faces:
+                part = to_nodes(part, grid, axis, False)
+            if own is not None:
+                part = to_nodes(part, grid, own, True)
+        speeds.append(part)
+    return speeds
 
 
 class Line:
@@ -64,19 +75,27 @@ class Line:
         self.walls = walls
         cells = grid.widths[axis]
         between = grid.spacings(axis)
-        h = between if own == axis else cells
-        if self.periodic:
-            gaps = anp.roll(cells, 1) if own == axis else between
-            gaps = anp.append(gaps, gaps[:1])
+        if own == axis:  # points on faces
+            h = between
+            inner_gaps = cells
+            wrapped_gaps = anp.roll(cells, 1)
         else:
-            gaps = anp.concatenate([h[:1], cells if own == axis else between[1:-1], h[-1:]])
-        self.half = gaps * anp.where(anp.arange(gaps.size) % (gaps.size - 1) == 0, 1.0 if self.periodic else 0.5, 1.0)
+            h = cells
+            inner_gaps = between[1:-1]
+            wrapped_gaps = between
+        if self.periodic:
+            gaps = anp.append(wrapped_gaps, wrapped_gaps[:1])
+            share_at_ends = 1.0
+        else:
+            gaps = anp.concatenate([h[:1], inner_gaps, h[-1:]])
+            share_at_ends = 0.5
+        self.half = gaps * anp.where(anp.arange(gaps.size) % (gaps.size - 1) == 0, share_at_ends, 1.0)
         self.h, self.gaps, self.half = (line(x, axis, grid.dim) for x in (h, gaps, self.half))
 
     def around(self, u, low=None, high=None):
         """The values below and above each interface, walls and both ends of a periodic axis included."""
-        low = u if low is None else low
-        high = u if high is None else high
+        if low is None:
+            low = high = u
         first = cut(u, self.axis, 0, 1)
         last = cut(u, self.axis, -1, None)
         before = cut(low, self.axis, -1, None)
@@ -107,12 +126,18 @@ class Line:
         if points:
             p = anp.maximum(w, 0.0)
             m = anp.minimum(w, 0.0)
-            back, ahead = (self.h, self.h) if limited else (lower(self.gaps), upper(self.gaps))
+            back = ahead = self.h
+            if not limited:
+                back = lower(self.gaps)
+                ahead = upper(self.gaps)
             return -p * (upper(below) - lower(below)) / back - m * (upper(above) - lower(above)) / ahead
-        w = anp.concatenate([w, cut(w, self.axis, 0, 1)], self.axis) if self.periodic else w
+        if self.periodic:
+            w = anp.concatenate([w, cut(w, self.axis, 0, 1)], self.axis)
         flux = anp.maximum(w, 0.0) * below + anp.minimum(w, 0.0) * above
         rate = -(upper(flux) - lower(flux)) / self.h
-        return rate + u * (upper(w) - lower(w)) / self.h if form == "advective" else rate
+        if form == "advective":
+            return rate + u * (upper(w) - lower(w)) / self.h
+        return rate
 
 
 def component(grid, own, u, w, dt, walls, sides, form, points, scheme):
@@ -122,7 +147,9 @@ def component(grid, own, u, w, dt, walls, sides, form, points, scheme):
         lines.append(Line(grid, axis, own, sides[axis], outside))
     rate = lambda u: sum(one.rate(u, w[a], form, points, scheme == "van_leer") for a, one in enumerate(lines))
     first = u + dt * rate(u)
-    return first if scheme == "upwind" else 0.5 * (u + first + dt * rate(first))
+    if scheme == "upwind":
+        return first
+    return 0.5 * (u + first + dt * rate(first))
 
 
 def twin(grid, scheme, boundary, velocity, of, form):
@@ -140,6 +167,8 @@ def twin(grid, scheme, boundary, velocity, of, form):
             own = None if of == "cells" else number
             w = carrying_speeds(grid, v, velocity, form, own)
             moved.append(component(grid, own, part, w, dt, values, sides, form, points, scheme))
-        return moved[0] if of == "cells" else space.join(*moved)
+        if of == "cells":
+            return moved[0]
+        return space.join(*moved)
 
     return move

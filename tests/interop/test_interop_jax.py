@@ -335,7 +335,9 @@ def test_results_are_paired_by_key():
 
 def test_the_form_of_a_result_may_depend_on_shapes():
     def f(x):
-        return OrderedDict(a=x**2, b=x) if x.size == 2 else OrderedDict(b=x, a=x**2)
+        if x.size == 2:
+            return OrderedDict(a=x**2, b=x)
+        return OrderedDict(b=x, a=x**2)
 
     for bridged, kind in ((from_jax(f), np.arange), (to_jax(f), jnp.arange)):
         for size in (2, 3, 2):

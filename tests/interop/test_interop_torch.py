@@ -354,7 +354,9 @@ def test_a_second_run_in_another_order():
     def f(x):
         calls.append(None)
         results = {"a": x**2, "b": 10.0 * x**3}
-        return results if len(calls) % 2 else dict(reversed(results.items()))
+        if len(calls) % 2:
+            return results
+        return dict(reversed(results.items()))
 
     x = tensor(np.array([1.0, 2.0]))
     (slope,) = torch.autograd.grad(to_torch(f)(x)["a"].sum(), x, create_graph=True)

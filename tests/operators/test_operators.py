@@ -126,9 +126,9 @@ ORDER = [(entry, label) for entry, label in zip(CATALOGUE, LABELS) if entry.exac
 
 
 def conditions_for(periodic):
-    return (
-        [dp.neumann] if periodic else [dp.neumann, dp.dirichlet, dp.robin(1.0, 0.7), {"x": (dp.dirichlet, dp.neumann)}]
-    )
+    if periodic:
+        return [dp.neumann]
+    return [dp.neumann, dp.dirichlet, dp.robin(1.0, 0.7), {"x": (dp.dirichlet, dp.neumann)}]
 
 
 @pytest.mark.sampled(1)

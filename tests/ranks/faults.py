@@ -64,7 +64,9 @@ def fails(error=None):
 
 def here(usual, on_the_last):
     """What only the last rank is given otherwise."""
-    return on_the_last if LAST else usual
+    if LAST:
+        return on_the_last
+    return usual
 
 
 class Shy(Exception):

@@ -71,7 +71,9 @@ def guess(make, grid, field):
     zeros = field(grid.cells, np.zeros(grid.shape))
     if make is species:
         return {"a": zeros, "b": zeros + 1.0}
-    return {"p": zeros, "q": field(grid.faces, np.zeros(grid.faces.size))} if make is flux else zeros
+    if make is flux:
+        return {"p": zeros, "q": field(grid.faces, np.zeros(grid.faces.size))}
+    return zeros
 
 
 def looked_at(make, grid, field):
@@ -124,7 +126,9 @@ def jacobian_given(matrix, grid, field):
 
     def jacobian(x, u, k):
         J = dp.identity(grid.cells) - 1e-2 * L @ dp.diagonal(grid.cells, 3 * k * dp.gather(x) ** 2)
-        return J.matrix if matrix else J
+        if matrix:
+            return J.matrix
+        return J
 
     solve = dp.implicit(lambda x, u, k: x - u - 1e-2 * k * L(x**3), jacobian, rtol=1e-13)
     u = field(grid.cells, np.random.default_rng(1).standard_normal(grid.shape))

@@ -83,7 +83,9 @@ def derivatives_are_those_of_one_process(cases):
 
 def flat(results):
     """Numbers and arrays in tuples, one by one."""
-    return [leaf for one in results for leaf in flat(one)] if isinstance(results, tuple) else [results]
+    if isinstance(results, tuple):
+        return [leaf for one in results for leaf in flat(one)]
+    return [results]
 
 
 def steps_of_one_process():

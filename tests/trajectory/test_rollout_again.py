@@ -353,7 +353,9 @@ def stores(where):
             dp.rollout(step, U, p, N, memory=memory)
         if where == "another rollout":
             return anp.sum(dp.rollout(lambda u, q: u * q, U, seen[5], 2))
-        return seen[5] if where == "as it is" else p * seen[5]
+        if where == "as it is":
+            return seen[5]
+        return p * seen[5]
 
     return loss
 

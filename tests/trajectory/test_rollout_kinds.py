@@ -68,7 +68,9 @@ KEEPS = {
 
 def pairs(i, state):
     """Something on every third state: results of several shapes, constants among them."""
-    return {"mean": anp.mean(state), "pair": (state[1:], np.array([2.0, 2.0])), "i": i} if i % 3 == 1 else None
+    if i % 3 == 1:
+        return {"mean": anp.mean(state), "pair": (state[1:], np.array([2.0, 2.0])), "i": i}
+    return None
 
 
 @pytest.mark.sampled
@@ -127,7 +129,9 @@ def test_no_step_one_and_two(n, keep, inputs, options):
         out = dp.rollout(few, (u, 3, ()), {"k": k, "none": []}, n, inputs=force, keep=kept.get(keep, keep), **options)
         if keep in kept:
             assert len(out) == n + 1
-            return sum(out, 0.0 * k) if keep == "function" else 0.0 * k + len(out) + anp.sum(u)
+            if keep == "function":
+                return sum(out, 0.0 * k)
+            return 0.0 * k + len(out) + anp.sum(u)
         assert out[2] == () and np.array_equal(out[1], np.arange(3, n + 4) if keep == "all" else n + 3)
         return anp.sum(out[0] ** 2)
 
@@ -231,7 +235,9 @@ def test_truncation(k, memory, losses):
             total = total + anp.sum(WEIGHTS[i] * u**2)
             u = bend(plain(u) if i and (n - i) % k == 0 else u, p)
         last = anp.sum(WEIGHTS[n] * u**2)
-        return total + last if losses else last
+        if losses:
+            return total + last
+        return last
 
     def ours(u, p):
         if not losses:

@@ -138,11 +138,15 @@ def plain_sum(u):
 
 def forgetful(u, p):
     """A state that depends on params only, wherever the one before is large."""
-    return p["rate"] * NUMBERS if plain_sum(u) > 2.0 else bend(u, p) + 0.5
+    if plain_sum(u) > 2.0:
+        return p["rate"] * NUMBERS
+    return bend(u, p) + 0.5
 
 
 def constant(u, p):
-    return np.cos(NUMBERS) if plain_sum(u) > 2.0 else bend(u, p) + 0.5
+    if plain_sum(u) > 2.0:
+        return np.cos(NUMBERS)
+    return bend(u, p) + 0.5
 
 
 STEPS = {f.__name__: f for f in (bend, now_and_then, turned, forgetful, constant)}

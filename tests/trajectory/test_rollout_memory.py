@@ -63,7 +63,9 @@ def loss(step, x, keep="last", n=N, **options):
     out = dp.rollout(step, *x, n, keep=keep, **options)
     if keep == "last":
         return anp.sum(WEIGHTS[0] * out**2)
-    return anp.sum(WEIGHTS * out**2) if keep == "all" else sum(out)
+    if keep == "all":
+        return anp.sum(WEIGHTS * out**2)
+    return sum(out)
 
 
 @pytest.mark.parametrize("keep", ["last", "all", lambda i, u: anp.sum(WEIGHTS[i] * u**3)], ids=["last", "all", "each"])
@@ -212,7 +214,9 @@ def test_the_budget_is_what_a_step_without_needs_of_its_own_takes(states, params
     def total(u, v):
         options = {"keep": lambda i, u: anp.sum(u[:3])} if keep == "each" else {}
         out = dp.rollout(step, u, v, n, memory=states * size, record=runs.append, **options)
-        return sum(out) if keep == "each" else anp.sum(weights * out)
+        if keep == "each":
+            return sum(out)
+        return anp.sum(weights * out)
 
     gradient = lambda: dp.value_and_grad((lambda x: total(*x)) if params else lambda u: total(u, v))(
         (u, v) if params else u

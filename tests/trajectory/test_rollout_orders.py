@@ -40,7 +40,9 @@ STEPS = {  # step, and what derivatives are taken in: state, params, inputs
 
 
 def field(state):
-    return state["u"] + state["v"] ** 2 if isinstance(state, dict) else state
+    if isinstance(state, dict):
+        return state["u"] + state["v"] ** 2
+    return state
 
 
 def by_loop(step, x, keep, truncate=None, memory=None):

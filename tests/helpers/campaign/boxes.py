@@ -50,7 +50,9 @@ class Box:
     def field_shape(self, kind):
         """Return the shape of a field on "cells" or on "faces"."""
         grid = self.grid()
-        return grid.cells.shape if kind == "cells" else grid.faces.shape
+        if kind == "cells":
+            return grid.cells.shape
+        return grid.faces.shape
 
 
 @lru_cache(maxsize=64)

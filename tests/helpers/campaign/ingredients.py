@@ -139,7 +139,9 @@ class Solve(Ingredient):
 
     def _system(self):
         kind = self.source
-        return ("sum", ("scale", self.shift, ("identity", kind)), self.expression) if self.shift else self.expression
+        if self.shift:
+            return ("sum", ("scale", self.shift, ("identity", kind)), self.expression)
+        return self.expression
 
     def _scale(self, box):
         return bound(box, self.expression) + abs(self.shift)
@@ -216,7 +218,9 @@ class Elliptic(OnCells):
         def act(u, p):
             k = anp.exp(p["k"])
             k = k if to_faces is None else to_faces(k)
-            return solve(k, u, p["shift"]) if "shift" in p else solve(k, u)
+            if "shift" in p:
+                return solve(k, u, p["shift"])
+            return solve(k, u)
 
         return act
 
@@ -473,11 +477,15 @@ class Transport(Ingredient):
 
     @property
     def order(self):
-        return 2 if self.scheme == "upwind" else 1
+        if self.scheme == "upwind":
+            return 2
+        return 1
 
     @property
     def refusals(self):
-        return () if self.scheme == "upwind" else ((dp.errors.DerivativeError, "second order|first"),)
+        if self.scheme == "upwind":
+            return ()
+        return ((dp.errors.DerivativeError, "second order|first"),)
 
     @property
     def source(self):
@@ -537,7 +545,9 @@ class Convection(Ingredient):
     target = "faces"
 
     def parameters(self, box):
-        return {"dt": 0.1} if self.own else {"dt": 0.1, "w": numbers(self.seed, box.field_shape("faces"))}
+        if self.own:
+            return {"dt": 0.1}
+        return {"dt": 0.1, "w": numbers(self.seed, box.field_shape("faces"))}
 
     def library(self, box):
         convect = dp.convection(box.grid(), boundary(box, self.sides), obstacle(box, self.solid))
@@ -622,7 +632,9 @@ def mean_of_two(table, axis, node, component, place, units):
     else:
         side = int(node > 0)
         sticks = table.sides[axis][side] in (dp.no_slip, dp.inflow)
-        return np.zeros(len(units)) if sticks else weights((cells - 1) * side)
+        if sticks:
+            return np.zeros(len(units))
+        return weights((cells - 1) * side)
     return (weights(low) * widths[high] + weights(high) * widths[low]) / (widths[low] + widths[high])
 
 
@@ -820,7 +832,9 @@ class TimeStep(OnCells):
 
     @property
     def order(self):
-        return 1 if self.method == "radau" else 2
+        if self.method == "radau":
+            return 1
+        return 2
 
     @property
     def refusals(self):
@@ -968,7 +982,9 @@ class Sum(Ingredient):
         def act(u, p):
             left = one(u, part_of(p, "one"))
             right = other(u, part_of(p, "other"))
-            return anp.sin(left) * right if self.multiplied else 0.7 * (left + right)
+            if self.multiplied:
+                return anp.sin(left) * right
+            return 0.7 * (left + right)
 
         return act
 
@@ -1084,7 +1100,9 @@ class Rollout(Ingredient):
             u = advance(u, p)
             if added:
                 u = u + added[0]["inputs"] * added[0]["scales"]
-            return {"time": state["time"] + 0.5, "field": u, "name": "ink"} if self.tree else u
+            if self.tree:
+                return {"time": state["time"] + 0.5, "field": u, "name": "ink"}
+            return u
 
         def act(u, p):
             p = dict(p)
@@ -1097,7 +1115,9 @@ class Rollout(Ingredient):
             if self.keep == "function":
                 return self._summed([one["sine"] for one in end])
             end = end["field"] if self.tree else end
-            return end if self.keep == "last" else self._summed(end)
+            if self.keep == "last":
+                return end
+            return self._summed(end)
 
         return act
 

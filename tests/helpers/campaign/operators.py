@@ -34,7 +34,9 @@ def matrix(box, expression):
 
 def space(box, kind):
     grid = box.grid()
-    return grid.cells if kind == "cells" else grid.faces
+    if kind == "cells":
+        return grid.cells
+    return grid.faces
 
 
 def given_entries(box, kind, seed):

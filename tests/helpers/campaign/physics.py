@@ -114,7 +114,9 @@ class Law(OnCells):
 
     @property
     def order(self):
-        return 1 if self.scheme == "van_leer" else 2
+        if self.scheme == "van_leer":
+            return 1
+        return 2
 
     def parameters(self, box):
         return {"a": 1.3, "dt": 0.05, "push": 0.2 * numbers(self.seed, box.shape)}
@@ -238,7 +240,9 @@ def flux_between(below, above, flux, speed):
 
 
 def pair_of(speed):
-    return speed if isinstance(speed, tuple) else (-speed, speed)
+    if isinstance(speed, tuple):
+        return speed
+    return (-speed, speed)
 
 
 # ---- flow ----------------------------------------------------------------------------------------------------------
@@ -275,7 +279,9 @@ class Flow(Ingredient):
         size = bound(box, ("face_laplacian", self.sides, self.solid, "no_slip"))
         walls = tuple(pair and ("dirichlet", "dirichlet") for pair in self.sides)
         size = max(size, bound(box, ("laplacian", walls, None, "neumann")))
-        return 0.1 / (size * self._dt()) if self.viscosity != "implicit" else 5.0 / (size * self._dt())
+        if self.viscosity != "implicit":
+            return 0.1 / (size * self._dt())
+        return 5.0 / (size * self._dt())
 
     def library(self, box):
         grid = box.grid()
@@ -305,7 +311,9 @@ class Flow(Ingredient):
             state = step.start(v, p, {"heat": p["heat"]}) if self.heat else step.start(v, p)
             state = dp.rollout(step, state, p, self.steps)
             v = state["v"] + 0.1 * dp.average(grid)(state["p"])
-            return v + 0.1 * dp.average(grid)(state["s"]["heat"]) if self.heat else v
+            if self.heat:
+                return v + 0.1 * dp.average(grid)(state["s"]["heat"])
+            return v
 
         return act
 
@@ -367,7 +375,9 @@ class Flow(Ingredient):
                 a_before = a
                 r_before = r
             result = v + 0.1 * anp.dot(average, q)
-            return result + 0.1 * anp.dot(average, heat) if self.heat else result
+            if self.heat:
+                return result + 0.1 * anp.dot(average, heat)
+            return result
 
         return act
 
@@ -554,12 +564,16 @@ class Adaptive(OnCells):
 
     @property
     def order(self):
-        return 1 if self.method == "radau" else 2
+        if self.method == "radau":
+            return 1
+        return 2
 
     @property
     def refusals(self):
         coarse = (dp.errors.DerivativeError, "tolerance")
-        return (*FIRST_ORDER, coarse) if self.method == "radau" else (coarse,)
+        if self.method == "radau":
+            return (*FIRST_ORDER, coarse)
+        return (coarse,)
 
     def _expression(self):
         return ("laplacian", self.sides, None, "neumann")
@@ -606,13 +620,17 @@ class Switched(OnCells):
 
     @property
     def order(self):
-        return 1 if self.method == "radau" else 2
+        if self.method == "radau":
+            return 1
+        return 2
 
     @property
     def refusals(self):
         coarse = (dp.errors.DerivativeError, "tolerance")
         single = (ValueError, "cannot meet the tolerance 1e-08 with a state of float32")
-        return (*FIRST_ORDER, coarse, single) if self.method == "radau" else (coarse, single)
+        if self.method == "radau":
+            return (*FIRST_ORDER, coarse, single)
+        return (coarse, single)
 
     def parameters(self, box):
         return {"k": 0.9, "f": 1 + 0.3 * np.sin(numbers(self.seed, box.shape)), "off": 0.23}
@@ -648,13 +666,17 @@ class Ball(OnCells):
 
     @property
     def order(self):
-        return 1 if self.method == "radau" else 2
+        if self.method == "radau":
+            return 1
+        return 2
 
     @property
     def refusals(self):
         coarse = (dp.errors.DerivativeError, "tolerance")
         single = (ValueError, "cannot meet the tolerance 1e-08 with a state of float32")
-        return (*FIRST_ORDER, coarse, single) if self.method == "radau" else (coarse, single)
+        if self.method == "radau":
+            return (*FIRST_ORDER, coarse, single)
+        return (coarse, single)
 
     def parameters(self, box):
         return {"g": 9.81, "e": 0.8}

@@ -74,7 +74,9 @@ class Scene:
     @property
     def order(self):
         orders = [part.order for part in self.chain]
-        return 1 if self.dtype == "complex128" else min([2, *orders])
+        if self.dtype == "complex128":
+            return 1
+        return min([2, *orders])
 
     @property
     def second_order(self):
@@ -401,7 +403,9 @@ def of_tensors(tensors, found, values):
 
 def order_of(tangents, values, tree):
     """Dicts are paired by name, so their entries come in another order; lists by position."""
-    return tangents if tree in ("dict", "reversed") else {name: tangents[name] for name in values}
+    if tree in ("dict", "reversed"):
+        return tangents
+    return {name: tangents[name] for name in values}
 
 
 class Twin:

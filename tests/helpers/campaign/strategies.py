@@ -151,7 +151,9 @@ def solves(draw, box, source):
 
 def structured_methods(box):
     """Structured multigrid needs two axes and compiled loops."""
-    return ["structured"] if box.dim > 1 and compiled() else []
+    if box.dim > 1 and compiled():
+        return ["structured"]
+    return []
 
 
 @st.composite
