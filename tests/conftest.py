@@ -61,8 +61,8 @@ def rng(request):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """What a sample leaves out gets the marker `whole`, before -m looks at it."""
-    for item in pairwise.left_out(items):
+    """Give tests that are not in a sample the marker `whole`, before -m selects by markers."""
+    for item in pairwise.skipped_items(items):
         item.add_marker(pytest.mark.whole)
 
 

@@ -1,4 +1,4 @@
-"""Samples of cross products hold every pair, are small, and are the same in every run."""
+"""Samples of cross products contain every pair, are small, and are the same in every run."""
 
 from itertools import combinations, product
 
@@ -11,26 +11,26 @@ def pairs(rows, ways=2):
 
 
 @pytest.mark.parametrize("ways", [1, 2, 3])
-def test_every_pair_is_there_and_few_rows_are(ways):
+def test_every_pair_occurs_in_few_rows(ways):
     rows = [row for row in product("abcdef", "ghi", "jklm", "no") if row[0] != "a" or row[3] == "n"]
-    found = [rows[n] for n in pairwise.chosen(rows, ways)]
+    found = [rows[n] for n in pairwise.sampled_rows(rows, ways)]
     assert pairs(found, ways) == pairs(rows, ways)
     assert len(found) <= {1: 6, 2: 30, 3: 85}[ways]
-    assert pairwise.chosen(rows, ways) == pairwise.chosen(rows, ways)
+    assert pairwise.sampled_rows(rows, ways) == pairwise.sampled_rows(rows, ways)
 
 
 def test_short_lists():
     assert pairwise.sample([]) == []
     assert pairwise.sample([("a",), ("b",)]) == [("a",), ("b",)]
-    assert pairwise.chosen([(0, 1), (0, 1)]) != []
+    assert pairwise.sampled_rows([(0, 1), (0, 1)]) != []
 
 
 @pytest.mark.sampled
 @pytest.mark.parametrize("c", range(4))
 @pytest.mark.parametrize("a, b", [(0, 1), (2, 3)])
 @pytest.mark.parametrize("d", range(4))
-def test_this_one_is_sampled(a, b, c, d, request):
-    """Two of 32 in each pair: 16 rows, and -m sees the others as `whole`."""
+def test_a_marked_test_is_sampled(a, b, c, d, request):
+    """Each pair occurs in two of 32 cases, so that 16 are in the sample; the others have the marker `whole`."""
     name = request.node.originalname
     of_this = [item for item in request.session.items if getattr(item, "originalname", None) == name]
     inside = {

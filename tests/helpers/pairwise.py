@@ -1,8 +1,8 @@
-"""Samples of cross products: in the rows that are chosen every pair of values occurs that occurs in any row.
+"""Samples of cross products of parameters in which every pair of values occurs.
 
-A test with the mark `sampled` runs on such rows of its parameters; the other rows have the marker `whole`. With
-`sampled(1)` every value occurs, not every pair: for two long lists. Faults that three parameters make together are left
-to the whole product, which .ci/run goes through.
+A test with the mark `sampled` runs by default on such a sample of its parameters; the other cases have the marker
+`whole`, and .ci/run runs them. With ``sampled(1)`` every value occurs, not every pair: for two long lists. Faults that
+need three values together may show only in the whole product.
 """
 
 import random
@@ -11,43 +11,56 @@ from itertools import combinations
 SEED = 14
 
 
-def chosen(rows, ways=2, name=""):
-    """Numbers of the rows of a sample: tuples of n values each, found greedily in a shuffled order.
+def sampled_rows(rows, ways=2, name=""):
+    """Return the numbers of the rows of a sample, found greedily in a shuffled order.
 
-    The order depends on the name: tests of the same product run on other rows of it.
+    Parameters
+    ----------
+    rows : list of tuple
+    ways : int
+        Size of the groups of values that must occur: 2 for pairs.
+    name : str
+        Seeds the order: two tests with the same product run on different rows.
     """
     order = random.Random(f"{SEED} {name}").sample(range(len(rows)), len(rows))
     columns = [list(enumerate(row)) for row in rows]
-    pairs = [set(combinations(values, min(ways, len(values)))) for values in columns]
-    missing = set().union(*pairs)
-    found = []
+    groups = [set(combinations(values, min(ways, len(values)))) for values in columns]
+    missing = set().union(*groups)
+    selected = []
     while missing:
-        found.append(max(order, key=lambda n: len(pairs[n] & missing)))
-        missing -= pairs[found[-1]]
-    return sorted(found)
+        best = max(order, key=lambda number: len(groups[number] & missing))
+        selected.append(best)
+        missing -= groups[best]
+    return sorted(selected)
 
 
 def numbered(values):
-    """Values as numbers, in the order in which they come first; what cannot be hashed is known by its text."""
+    """Return values as numbers, in the order of their first occurrence; values are compared by their text."""
     numbers = {}
     return tuple(numbers.setdefault(repr(value), len(numbers)) for value in values)
 
 
 def sample(rows, ways=2):
-    """The rows of a sample, each a tuple of values."""
-    return [rows[n] for n in chosen(list(zip(*map(numbered, zip(*rows)))), ways)]
+    """Return the rows of a sample, each a tuple of values."""
+    columns = [numbered(column) for column in zip(*rows)]
+    return [rows[number] for number in sampled_rows(list(zip(*columns)), ways)]
 
 
-def left_out(items):
-    """Collected tests whose function has the mark `sampled` and whose parameters are not in the sample.
+def skipped_items(items):
+    """Yield the collected tests whose function has the mark `sampled` and whose parameters are not in the sample.
 
-    What has the marker `whole` already, for one of its parameters, is no part of the product.
+    Tests that have the marker `whole` for one of their parameters are not part of the product.
     """
-    functions = {}
+    cases_by_function = {}
     for item in items:
-        if (mark := item.get_closest_marker("sampled")) and not item.get_closest_marker("whole"):
-            functions.setdefault(item.nodeid.split("[")[0], (mark, []))[1].append(item)
-    for function, (mark, members) in functions.items():
-        rows = zip(*(numbered(item.callspec.params[name] for item in members) for name in members[0].callspec.params))
-        inside = chosen(list(rows), *mark.args, name=function.split("::")[-1])
-        yield from (item for number, item in enumerate(members) if number not in inside)
+        mark = item.get_closest_marker("sampled")
+        if mark and not item.get_closest_marker("whole"):
+            function = item.nodeid.split("[")[0]
+            cases_by_function.setdefault(function, (mark, []))[1].append(item)
+    for function, (mark, cases) in cases_by_function.items():
+        parameters = cases[0].callspec.params
+        columns = [numbered(case.callspec.params[name] for case in cases) for name in parameters]
+        selected = set(sampled_rows(list(zip(*columns)), *mark.args, name=function.split("::")[-1]))
+        for number, case in enumerate(cases):
+            if number not in selected:
+                yield case
