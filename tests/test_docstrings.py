@@ -1,6 +1,7 @@
 """What a public docstring must have, and nothing about style: first line, parameters, result, errors, an example."""
 
 import ast
+import dataclasses
 import doctest
 import inspect
 import pickle
@@ -147,6 +148,15 @@ def check_options(table, options):
 def test_options_of_minimize_are_those_of_its_table():
     options = options_of(METHODS, lambda method: 0)
     check_options(options_in_the_table(sparsedp.minimize), options)
+
+
+@pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
+def test_methods_of_minimize_document_their_options(method):
+    doc = inspect.getdoc(method)
+    parameters = doc[doc.index("Parameters\n---") : doc.index("Notes\n---")]
+    for field in dataclasses.fields(method):
+        assert re.search(rf"(?m)^(\w+, )*{field.name}\b", parameters), field.name
+    assert "References\n---" in doc
 
 
 def test_options_of_inverse_are_those_of_its_table():

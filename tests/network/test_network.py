@@ -1,4 +1,4 @@
-"""Layers against loops written out in autograd.numpy, their derivatives of both orders, and files."""
+"""Layers against loops in autograd.numpy, their first and second derivatives, and files."""
 
 import json
 
@@ -16,7 +16,7 @@ SHAPES = [((3,), (7,)), ((5,), (5,)), ((1,), (4,)), ((3, 5), (6, 7)), ((1, 3), (
 
 
 def twin(p, x, padding):
-    """The sum of shifted fields, one for each entry of the filters."""
+    """Return the convolution as a sum of shifted fields, one for each entry of the filters."""
     w = p["weight"]
     dim = anp.ndim(x) - 2
     widths = anp.shape(w)[-dim:]

@@ -1,4 +1,4 @@
-"""Runs that are killed and taken up again."""
+"""Checkpoints of minimize: runs that are stopped, interrupted or killed, and resumed."""
 
 import signal
 import subprocess
@@ -67,7 +67,7 @@ def test_a_finished_run_called_again(tmp_path):
 
 
 def test_a_run_stopped_by_its_callback_continues(tmp_path):
-    """A callback stops one run; more iterations and a smaller tolerance go on from there, to the same bits."""
+    """The next call continues with more iterations and a smaller tolerance, to the same bits."""
     options = {"maxiter": 30, "tolerance": 1e-6}
     whole = dp.minimize(valley, START, **options)
     stopped = dp.minimize(
@@ -107,7 +107,7 @@ def test_a_new_state_stays_beside_damaged_newer_ones(tmp_path, monkeypatch):
 
 
 def test_a_single_changed_byte_is_detected(tmp_path):
-    """Wherever it is: the state is skipped, or it is the same."""
+    """The state is skipped, or the changed byte has no effect."""
     whole = dp.minimize(valley, START, maxiter=3, tolerance=0, checkpoint=tmp_path)
     [state] = tmp_path.glob("state-*3.npz")
     [path.unlink() for path in tmp_path.glob("state-*") if path != state]
@@ -143,7 +143,7 @@ def test_another_run_is_refused(tmp_path, change, name):
 
 
 def refused(tmp_path, name, begun, given, **both):
-    """Whether a run is refused that was begun with other arguments, and goes on with its own."""
+    """Check that a folder refuses other arguments, and that the run continues with its own."""
     both = {"maxiter": 6, "tolerance": 0, "checkpoint": tmp_path, **both}
     dp.minimize(**begun, **{**both, "maxiter": 3})
     with pytest.raises(ValueError, match=f"holds a run with another {name}; call minimize as that run began"):
@@ -171,7 +171,7 @@ TREE = {"x": START, "n": 2, "word": "a", "none": None, "flag": True, "pair": (1.
     ],
 )
 def test_other_static_leaves_are_refused(tmp_path, leaf):
-    """Also where the loss at the start is the same: it is asked for the unknowns alone."""
+    """Also where the loss at the start is the same, because it depends on the unknowns alone."""
     loss = lambda tree: valley(tree["x"]) + tree["pair"][0] ** 2
     refused(tmp_path, "start", {"start": TREE}, {"start": {**TREE, **leaf}}, loss=loss)
 
@@ -216,7 +216,7 @@ def test_each_batch_is_computed_once():
 
 
 def test_bounds_with_equal_text_are_distinguished(tmp_path):
-    """NumPy prints the ends of a long array and eight digits."""
+    """NumPy prints the ends of a long array only, and eight digits."""
     start = np.full(2000, 0.5)
     lower = np.full(2000, -1.0)
     for place, change in ((1000, 0.5), (0, 1e-12)):
@@ -230,14 +230,14 @@ def test_bounds_with_equal_text_are_distinguished(tmp_path):
 
 
 def test_a_loss_that_differs_away_from_the_start_is_refused(tmp_path):
-    """The same value and gradient at the start, others at the last point."""
+    """The value and gradient are equal at the start and differ at the last point."""
     other = lambda x: valley(x) + anp.sum((x - START) ** 4)
     assert other(START) == valley(START)
     refused(tmp_path, "loss at the last point", {"loss": valley}, {"loss": other}, start=START)
 
 
 def test_a_run_with_functions_as_options_is_resumed(tmp_path):
-    """They have no address in the folder."""
+    """Their addresses differ in the next process and must not be stored."""
     run = lambda maxiter, **more: dp.minimize(
         lambda y: anp.sum((y - 2.0) ** 2),
         START,
@@ -276,7 +276,7 @@ LOSSES_0_2 = {
 
 @pytest.mark.parametrize("name", CHECKPOINTS)
 def test_resumes_a_checkpoint_of_version_0_2(tmp_path, name):
-    """The run goes on along the iterations of a run from the start."""
+    """The resumed run takes the same iterations as a run from the start."""
     write_checkpoint_0_2(tmp_path, name)
     loss = LOSSES_0_2.get(name, valley)
     method = name.partition(",")[0]
@@ -314,12 +314,12 @@ np.save(sys.argv[2] + ".values", [record.value for record in best.history])
 
 
 def newest(folder):
-    """Number of the last iteration that is written down; -1 without any."""
+    """Return the number of the last iteration in a folder; -1 without any."""
     return max((int(path.stem[6:]) for path in folder.glob("state-*.npz")), default=-1)
 
 
 def killed_on_its_way(run, folder, delay):
-    """Whether kill -9, n seconds after the first new state, came before the end of the run."""
+    """Kill a run some seconds after its first new state; return whether that was before its end."""
     process = subprocess.Popen(run)
     before = newest(folder)
     while process.poll() is None and newest(folder) == before:
@@ -332,7 +332,7 @@ def killed_on_its_way(run, folder, delay):
 @pytest.mark.slow
 @pytest.mark.parametrize("bounds", [[], ["bounds"]])
 def test_a_run_killed_at_ten_random_times(tmp_path, rng, bounds):
-    """kill -9 while it runs, ten times: result and all values on the way have the bits of an undisturbed run."""
+    """The result and all values in the history have the bits of an undisturbed run."""
     run = [sys.executable, "-c", SCRIPT]
     subprocess.run([*run, str(tmp_path / "whole"), str(tmp_path / "whole.npy"), *bounds], check=True)
     parts = [*run, str(tmp_path / "parts"), str(tmp_path / "parts.npy"), *bounds]
@@ -370,7 +370,7 @@ print(best.message, best.converged, len(best.history), best.value, valley(best.x
 
 
 def pressed(words, *arguments):
-    """What a script prints that gets SIGINT each time it has printed one of the words, and its exit code."""
+    """Run a script, send SIGINT each time it prints one of the words; return its output, errors and exit code."""
     run = [sys.executable, "-c", PRESSED, *map(str, arguments)]
     with subprocess.Popen(run, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         for word in words:
@@ -404,7 +404,7 @@ def test_a_second_interrupt_stops_at_once(tmp_path):
 @pytest.mark.parametrize("method, loss", [("adam", valley), ("levenberg_marquardt", residuals), ("lbfgs", valley)])
 @pytest.mark.parametrize("at", [1, 8, 12])
 def test_interrupted_inside_an_evaluation(tmp_path, monkeypatch, method, loss, at):
-    """The evaluation that was cut short is made again: the resumed run has the bits and counts of the whole one."""
+    """The interrupted evaluation is repeated: the resumed run has the bits and counts of an uninterrupted run."""
     monkeypatch.setattr("sparsedp.optimize.checkpoint.SHARE", 0.0)  # no state is written before the end
     calls = []
 

@@ -32,7 +32,7 @@ def test_bounds_against_scipy(rng, method):
 @pytest.mark.parametrize("method", ["levenberg_marquardt", "gauss_newton"])
 @pytest.mark.parametrize("options", [{}, {"dense": False}, {"apart": True}])
 def test_bounded_least_squares_against_scipy(rng, method, options):
-    """A step that counts on an unknown at its bound is no descent for the others; it must not pass for converged."""
+    """A step computed without the bounds may be no descent for the free unknowns; that is not convergence."""
     matrix = rng.standard_normal((12, 8))
     data = 3 * rng.standard_normal(12)
     misses = lambda x: anp.sum(matrix * x, axis=-1) - data  # of copies of x too
@@ -68,7 +68,7 @@ def test_bounds_as_trees_and_on_one_side():
 
 
 def test_bounds_ignore_leaves_that_are_not_floating():
-    """A static leaf may be far too large to be filled."""
+    """A static leaf may be too large for an array of bounds."""
     huge = np.broadcast_to(1, (10**7, 10**7))
     loss = lambda tree: anp.sum((tree["x"] - 2.0) ** 2)
     for bounds in ((None, 1.0), (None, {"A": None, "x": 1.0, "word": None})):
@@ -104,7 +104,7 @@ NOT_PROJECTIONS = {
 @pytest.mark.parametrize("method", ["lbfgs", "gd", "adam", "newton_cg", "gauss_newton", "half_inverse"])
 @pytest.mark.parametrize("kind", NOT_PROJECTIONS)
 def test_maps_other_than_affine_projections_are_refused(kind, method):
-    """Searches stopped at the start, where the derivative of the clip is 0, and called it converged."""
+    """The derivative of a clip is 0 beyond its limits: a run would stop there as converged."""
     project, reason = NOT_PROJECTIONS[kind]
     loss = (lambda x: x) if method in ("gauss_newton", "half_inverse") else lambda x: anp.sum(x**2)
     with pytest.raises(ValueError, match=f"{reason}.*Write bounds="):
@@ -119,7 +119,7 @@ def test_a_projection_that_is_not_affine_only_near_the_result_is_refused():
 
 @pytest.mark.parametrize("method", ["lbfgs", "gd", "newton_cg", "gauss_newton", "levenberg_marquardt"])
 def test_an_affine_projection_and_a_gradient_of_the_user(method):
-    """The gradient of the user is the gradient of the loss; with project it was taken at x, and not projected."""
+    """The user's gradient is evaluated at project(x), and projected."""
     target = np.array([1.0, 2.0, 6.0])
     mean_two = lambda x: x - anp.mean(x) + 2.0
     squares = method in ("gauss_newton", "levenberg_marquardt")

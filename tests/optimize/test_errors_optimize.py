@@ -1,4 +1,4 @@
-"""What the optimizers refuse: each message, whole."""
+"""Errors of the optimizers: each whole message."""
 
 import re
 
@@ -19,7 +19,7 @@ def direction(outputs=lambda u: u, x=(1.0, 1.0), g=None, **options):
 
 
 def back(inverse):
-    """The way back through a simulator with this inverse."""
+    """Differentiate through a simulator with this inverse."""
     rule = dp.physical_gradient(lambda x: x, inverse)
     return lambda: dp.value_and_grad(lambda x: anp.sum(rule(x)))(np.ones(3))
 

@@ -1,4 +1,4 @@
-"""minimize(): every method, any nesting, any scale; trial points that the loss refuses; what it says about it."""
+"""minimize(): every method, trees, scales, refused trial points, history and messages."""
 
 import sys
 from collections import namedtuple
@@ -39,7 +39,7 @@ def nested(tree):
 
 
 def walled(loss, reach, error=UnstableStepError):
-    """A loss that refuses points with an entry beyond `reach`."""
+    """Return a loss that refuses points with an entry beyond `reach`."""
 
     def inside(x):
         if np.max(np.abs(plain(x))) > reach:
@@ -53,7 +53,7 @@ def refused(result):
     return [failure for record in result.history for failure in record.failed]
 
 
-# ---- what it finds -------------------------------------------------------------------------------------------------
+# ---- results -------------------------------------------------------------------------------------------------------
 
 
 def test_nested_leaves_keep_their_kinds():
@@ -142,7 +142,7 @@ def test_a_large_offset_ends_in_rounding():
     assert descent.converged and np.allclose(descent.x, 3, atol=1e-3)
 
 
-# ---- trial points that are refused ---------------------------------------------------------------------------------
+# ---- refused trial points ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("error", [UnstableStepError, ConvergenceError, NonFiniteError])

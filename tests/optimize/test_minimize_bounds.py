@@ -1,4 +1,4 @@
-"""lbfgs inside bounds: its step beside dense matrices, its cost beside SciPy's, trials that are refused."""
+"""lbfgs with bounds: steps against dense matrices, cost against SciPy, refused trial points."""
 
 import autograd.numpy as anp
 import numpy as np
@@ -15,7 +15,7 @@ from sparsedp.optimize.lbfgs import quasi_newton_step
 
 @pytest.mark.parametrize("k", [1, 2, 7])
 def test_quasi_newton_step_against_the_dense_formula(rng, k):
-    """The B that the BFGS formula makes of steps and changes with s.y > 0, one pair after the other."""
+    """Return B of the BFGS formula for steps s and changes y with s.y > 0, pair by pair."""
     root = rng.standard_normal((12, 12))
     steps = rng.standard_normal((k, 12))
     changes = steps @ (root @ root.T / 12 + 0.1 * np.eye(12)) + 0.01 * rng.standard_normal((k, 12))
@@ -35,7 +35,7 @@ def test_quasi_newton_step_without_curvature_or_memory():
 
 @pytest.mark.parametrize("seed", range(12))
 def test_starts_on_bounds_and_close_to_them(seed):
-    """Quadratics of conditions up to 1e5, from where a step along the bounds is easily lost."""
+    """Quadratics of conditions up to 1e5 from starts on bounds, where a short step may be lost to rounding."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(2, 60))
     basis = np.linalg.qr(rng.standard_normal((n, n)))[0]
@@ -66,7 +66,7 @@ LONG = {"deconvolution", "tomography"}
     [pytest.param(one, id=one.__name__, marks=[pytest.mark.whole] * (one.__name__ in LONG)) for one in PROBLEMS],
 )
 def test_number_of_evaluations_against_scipy(problem):
-    """At most 1.5 times what SciPy takes to the loss that it ends at."""
+    """At most 1.5 times as many as SciPy needs to reach its final loss."""
     best, ours, scipys = compared(problem)
     lower, upper = (
         np.inf * sign if side is None else side for side, sign in zip(problem(np.random.default_rng(0))[2], (-1, 1))
@@ -93,7 +93,7 @@ def test_bounds_at_all_scales(rng):
 
 
 def test_refused_trial_points_with_bounds(rng):
-    """A wall on one side and bounds on the other: the search goes back from the wall and along the bounds."""
+    """Refused points on one side and bounds on the other: both shorten the steps."""
 
     def walled(x):
         if np.max(plain(x)) > 0.95:
@@ -120,7 +120,7 @@ def test_equal_bounds_and_corners():
 
 
 def test_a_real_bound_on_a_complex_leaf_bounds_both_parts():
-    """As a number does; it was refused by NumPy's broadcasting, in words about shapes."""
+    """A real array as bound acts like a real number."""
     goal = np.array([2.0 + 3.0j, -1.0 + 0.25j])
     bounds = {"z": np.zeros(2)}, {"z": np.array([1.0, 0.5])}
     best = dp.minimize(lambda x: anp.sum(anp.abs(x["z"] - goal) ** 2), {"z": np.zeros(2, complex)}, bounds=bounds)
@@ -133,7 +133,7 @@ def test_a_real_bound_on_a_complex_leaf_bounds_both_parts():
 
 
 def bounded_problem(seed):
-    """Random residuals, bounds (some infinite, some equal) and a start inside; every third start is on bounds."""
+    """Return random residuals, bounds (some infinite, some equal) and a start inside; every third one on bounds."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(2, 8))
     matrix = rng.normal(size=(n + 3, n)) * np.exp(rng.normal(size=n))
@@ -207,7 +207,7 @@ def test_random_bounded_problems_against_scipy(method, options):
 
 
 def test_gauss_newton_with_large_residuals_is_damped(rng):
-    """It took steps of 2^-7 of their length, and stopped after 300 iterations short of the minimum."""
+    """Undamped steps are accepted at 2^-7 of their length only: 300 iterations do not reach the minimum."""
     residuals = lambda x: anp.concatenate([10 * (x[1:] - x[:-1] ** 2), 1 - x[:-1]])
     lower = np.array([-1.4, -1.4659497, -0.07, -0.5, -1.1])
     upper = np.array([0.45, -1.4659497, 0.98, np.inf, np.inf])
@@ -219,7 +219,7 @@ def test_gauss_newton_with_large_residuals_is_damped(rng):
 
 
 def test_a_linear_problem_in_a_box_takes_one_step(rng):
-    """The step is the minimum inside the bounds, whichever of them hold: exact for linear residuals."""
+    """The step is the minimum inside the bounds: exact for linear residuals."""
     for _ in range(20):
         matrix = rng.normal(size=(30, 20))
         data = 5 * rng.normal(size=30)

@@ -1,4 +1,4 @@
-"""What minimize() refuses, and what it says."""
+"""Errors of minimize()."""
 
 import autograd.numpy as anp
 import numpy as np
@@ -13,7 +13,7 @@ def bowl(x):
 
 
 def foreign(value, gradient):
-    """A run on a loss that is not traced."""
+    """Run minimize with a loss and a gradient that are not traced."""
     return dp.minimize(lambda x: value(x), np.ones(2), gradient=gradient)
 
 
@@ -49,7 +49,7 @@ def test_errors_at_the_start_are_not_hidden():
 
 @pytest.mark.parametrize("method", ["gauss_newton", "levenberg_marquardt", "newton_cg"])
 def test_a_wrong_derivative_is_no_convergence(method):
-    """A rule with the wrong sign: no point is lower along it, and that is no rounding."""
+    """With a wrong sign no point is lower along the step; that is not rounding."""
     wrong = dp.differentiable("wrong", lambda x: x**2, lambda nums, y, x: lambda g: (-2 * x * g,))
     loss = (lambda x: anp.sum(wrong(x))) if method == "newton_cg" else (lambda x: wrong(x) + 1.0)
     best = dp.minimize(loss, np.ones(2), method)

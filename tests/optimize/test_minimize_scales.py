@@ -1,4 +1,4 @@
-"""minimize at every magnitude of the loss, the residuals and x, and near kinks: what is called converged is."""
+"""minimize at every magnitude of the loss, the residuals and x, and near kinks: no false convergence."""
 
 import autograd.numpy as anp
 import numpy as np
@@ -28,7 +28,7 @@ def loss(x):
 @pytest.mark.parametrize("method, options", SQUARES)
 @pytest.mark.parametrize("bounds", [None, (-1.0, 1.0)])
 def test_residuals_of_any_magnitude(method, options, bounds):
-    """Their squares underflow below 1e-162: the start was called converged, since the gradient was 0."""
+    """Squares underflow below 1e-162: without scaling the gradient is 0 and the start seems converged."""
     start = np.array([0.1, 0.0, -0.2])
     known = dp.minimize(residuals, start, method, bounds=bounds, **options)
     assert known.converged
@@ -46,7 +46,7 @@ def test_residuals_of_any_magnitude(method, options, bounds):
 )
 @pytest.mark.parametrize("bounds", [None, 1.0])
 def test_unknowns_of_any_magnitude(method, options, bounds):
-    """Also those whose quotients by the gradient, or whose squared Jacobian, are beyond the range of floats."""
+    """Also where quotients by the gradient, or the squared Jacobian, are beyond the range of floats."""
     misfit = residuals if "dense" in options or method in ("gauss_newton", "levenberg_marquardt") else loss
 
     def run(size):
@@ -78,14 +78,14 @@ def test_losses_of_any_magnitude(method, options, exponent):
 
 @pytest.mark.parametrize("exponent", [-1000, -550, 550])
 def test_half_inverse_far_from_the_minimum_is_not_converged(exponent):
-    """Its steps have the square root of the scale of the residuals; a point far from the minimum is not converged."""
+    """Steps scale with the square root of the residuals, so that few steps do not converge at these scales."""
     with np.errstate(over="ignore"):
         best = dp.minimize(lambda x: 2.0**exponent * residuals(x), np.zeros(3), "half_inverse", maxiter=5)
     assert not best.converged
 
 
 def test_half_inverse_takes_the_same_steps_beyond_the_range_of_squares():
-    """The direction is the residuals' scale to the power 1/2 times that of residuals near 1."""
+    """The direction scales with the square root of the residuals."""
     unit = 2.0**-600
     rate = 0.25
     best = dp.minimize(residuals, np.zeros(3), "half_inverse", rate=rate, maxiter=3)
@@ -98,7 +98,7 @@ def test_half_inverse_takes_the_same_steps_beyond_the_range_of_squares():
 @pytest.mark.parametrize("bounds", [None, (-0.3, 0.5)])
 @pytest.mark.parametrize("method", ["gd", "newton_cg"])
 def test_stopping_at_a_kink_is_not_convergence(method, bounds, rng):
-    """Steps became so short that no change of the loss was seen, far from the minimum."""
+    """Steps become so short that no change of the loss is visible, far from the minimum."""
     matrix = rng.normal(size=(8, 5))
     data = rng.normal(size=8)
     matrix[0] *= 30
@@ -130,7 +130,7 @@ def test_the_hint_of_least_squares_sums_the_residuals():
 
 @pytest.mark.parametrize("exponent", [-1000, -550, 550, 1000])
 def test_a_tolerance_function_gets_comparable_losses(exponent):
-    """Records of residuals near 1e-300 hold a loss and a gradient of 0: a rule called the start converged."""
+    """Records of residuals near 1e-300 hold a loss and a gradient of 0: the function must get scaled ones."""
     rule = lambda record, first: record.gradient_norm <= 1e-6 * first.gradient_norm
     factor = 2.0**exponent
     start = np.array([0.1, 0.0, -0.2])
@@ -144,7 +144,7 @@ def test_a_tolerance_function_gets_comparable_losses(exponent):
 @pytest.mark.parametrize("as_function", [False, True])
 @pytest.mark.parametrize("resumed", [False, True])
 def test_one_batch_with_a_small_gradient_is_not_converged(as_function, resumed, tmp_path):
-    """The second batch is nearly constant: all of them have to be small in turn."""
+    """The second batch is nearly constant: the gradients of all batches must be small."""
     weights = [1.0, 1e-12, 0.5]
     batches = (lambda number: weights[number % 3]) if as_function else weights
     target = np.array([2.0, -1.0])

@@ -1,4 +1,4 @@
-"""Least squares: the Jacobian by the fewer products, and the covariance of the unknowns."""
+"""Least squares: number of products for the Jacobian, and the covariance of the unknowns."""
 
 import autograd.numpy as anp
 import numpy as np
@@ -11,7 +11,7 @@ METHODS = ["levenberg_marquardt", "gauss_newton"]
 
 
 class Counted:
-    """exp, and how often its derivative was asked for in each direction."""
+    """exp that counts its derivatives in forward and in reverse mode."""
 
     def __init__(self, jvp=True):
         self.forward = self.reverse = 0
@@ -57,7 +57,7 @@ def test_a_rule_without_a_forward_derivative(rng, method):
 
 @pytest.mark.slow
 def test_lotka_volterra(rng):
-    """Three rates from 42 noisy numbers, beside SciPy; 200 steps of rk4 for each evaluation."""
+    """Three rates from 42 noisy numbers, against SciPy; 200 steps of rk4 for each evaluation."""
 
     def rate(u, p):
         return anp.array([p[0] * u[0] - p[1] * u[0] * u[1], p[1] * u[0] * u[1] - p[2] * u[1]])
@@ -160,7 +160,7 @@ def test_absolute_sigma_against_curve_fit(rng, method):
 
 @pytest.mark.parametrize("exponent", [-1000, -700, 500])
 def test_covariance_of_residuals_of_any_magnitude(rng, exponent):
-    """The covariance does not depend on a factor of the residuals, and with absolute_sigma on its square."""
+    """The covariance is independent of a factor of the residuals; with absolute_sigma it has its inverse square."""
     matrix = rng.standard_normal((10, 3))
     data = rng.standard_normal(10)
     factor = 2.0**exponent

@@ -1,4 +1,4 @@
-"""total_variation, smoothness and the method admm: values by hand, walls and obstacles, edges, optimality."""
+"""total_variation, smoothness and admm: values against loops, walls and obstacles, optimality conditions."""
 
 import autograd.numpy as anp
 import numpy as np
@@ -24,7 +24,7 @@ def test_a_ramp_counts_the_same_everywhere(grid):
 
 
 def by_hand(grid, u, eps, solid):
-    """The sum over cells in loops, for unit cells in 2-D."""
+    """Return the sum over cells by loops, for unit cells in 2-D."""
     total = smooth = 0.0
     n, m = u.shape
     for i in range(n):
@@ -74,7 +74,7 @@ def test_refused_numbers():
 @pytest.mark.parametrize("exponent", [-480, -200, 200, 480])
 @pytest.mark.parametrize("share", [2.0**-30, 1.0, 2.0**30])
 def test_total_variation_of_slopes_of_any_magnitude(exponent, share, rng):
-    """With eps it scales: their squares underflow or overflow, they themselves do not."""
+    """It scales with the slopes and eps, also where squares of slopes underflow or overflow."""
     grid = dp.Grid((5, 4), size=1.0)
     factor = 2.0**exponent
     u, v = share * rng.normal(size=(2, *grid.shape))
@@ -86,7 +86,7 @@ def test_total_variation_of_slopes_of_any_magnitude(exponent, share, rng):
 
 
 def test_total_variation_of_slopes_far_from_eps(rng):
-    """Far above eps it is the integral of the slopes, far below half of that of their squares by eps."""
+    """For slopes far above eps it is their integral, far below the integral of their squares over 2 eps."""
     grid = dp.Grid((5, 4), size=1.0)
     u = rng.normal(size=grid.shape)
     steep = dp.total_variation(grid, 1.0)(1e200 * u)
@@ -162,7 +162,7 @@ def test_admm_of_complex_unknowns(rng):
 
 
 def test_admm_of_a_complex_operator(rng):
-    """The transpose of the residuals is conjugate: K turns phases, and changes no magnitude."""
+    """The transpose of a complex operator needs conjugates; this one changes phases and no magnitudes."""
     phases = np.exp(1j * rng.uniform(0, 6, 5))
     goal = rng.normal(size=5) + 1j * rng.normal(size=5)
     misfit = lambda x: 0.5 * anp.sum(anp.abs(x - goal) ** 2)
@@ -174,7 +174,7 @@ def test_admm_of_a_complex_operator(rng):
 
 
 def test_admm_converges_to_zero():
-    """K x and its copy both go to 0: their difference relative to themselves does not."""
+    """K x and z both go to 0, but their difference relative to their size does not."""
     best = dp.minimize(lambda x: 0.5 * anp.sum((x - 1.0) ** 2), np.full(3, 5.0), "admm", weight=3.0, tolerance=1e-6)
     assert best.converged and np.allclose(best.x, 0.0, atol=1e-6)
 
@@ -196,7 +196,7 @@ def test_admm_stops_at_maxiter_and_by_its_callback():
 
 
 def test_an_interrupted_round_of_admm_ends_the_run():
-    """The search inside gives back its best point; that is no reason to go on."""
+    """The interrupted inner minimization returns its best point; the rounds must end too."""
     calls = []
 
     def loss(x):
@@ -224,7 +224,7 @@ def test_admm_refuses():
 
 @pytest.mark.parametrize("scale", [1e-3, 1e-9, 1e-100])
 def test_total_variation_of_small_slopes_is_accurate(scale):
-    """Slopes far below eps count by their square."""
+    """Slopes far below eps enter by their square."""
     u = np.random.default_rng(0).standard_normal(GRIDS[1].shape)
     tv = dp.total_variation(GRIDS[1], 1.0)
     h1 = dp.smoothness(GRIDS[1])

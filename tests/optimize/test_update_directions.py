@@ -1,4 +1,4 @@
-"""Gradient, half-inverse, Gauss-Newton: one family of directions, and the methods of minimize built on it."""
+"""Update directions (gradient, half-inverse, Gauss-Newton), and the methods of minimize built on them."""
 
 import autograd.numpy as anp
 import numpy as np
@@ -47,7 +47,7 @@ def test_the_family_against_the_svd(rng, shape, power, method):
 @pytest.mark.parametrize("power", [0.5, 1])
 @pytest.mark.parametrize("method", ["dense", "krylov"])
 def test_a_cotangent_outside_the_range_of_the_jacobian(rng, shape, power, method):
-    """Outside of the range of J: misses of more outputs than unknowns have such a part."""
+    """Residuals of more outputs than unknowns have a part outside the range of J."""
     matrix = jacobian(rng, shape)
     g = rng.standard_normal(shape[0])
     found = dp.update_direction(lambda u: matrix @ u, np.zeros(shape[1]), g, power=power, method=method)
@@ -60,7 +60,7 @@ SCALES = [1.0, 1e-200, 1e180]
 @pytest.mark.parametrize("decades, digits", [(0, 13), (3, 10), (5, 8), (7, 8), (9, 7), (16, 6)])
 @pytest.mark.parametrize("scale", SCALES)
 def test_singular_values_from_gram_matrices(rng, decades, digits, scale):
-    """One Gram matrix would lose what is below 1e-8; group by group they are as exact as Householder's."""
+    """One Gram matrix loses singular values below 1e-8; group by group they are as exact as by an SVD."""
     matrix = scale * jacobian(rng, (20, 50), decades)
     left, values = left_singular(matrix)
     u, s, v = np.linalg.svd(matrix, full_matrices=False)
@@ -146,7 +146,7 @@ def test_trees_and_samples_apart(rng):
 
 
 def test_memory_of_the_bidiagonalisation(rng):
-    """No matrix of m x n numbers: products with an operator of 10^10 entries."""
+    """Products with an operator of 10^10 entries: no m x n matrix is allocated."""
     size = 100_000
     weights = 1.0 / (1 + np.arange(size) % 7)
     rule = linear("weights", lambda u: weights * u, lambda g: weights * g)[0]
@@ -194,7 +194,7 @@ def test_a_singular_jacobian_takes_the_shortest_step():
 
 
 def test_the_published_example_of_two_variables():
-    """y = (x0, x1^2), L = |y|^2 from (3, 3). Source: Holl, Koltun, Thuerey, 2022; figures of case C1."""
+    """y = (x0, x1^2), L = |y|^2 from (3, 3), see Holl, Koltun, Thuerey, 2022."""
     start = np.array([3.0, 3.0])
     y = lambda x: anp.stack([x[0], x[1] ** 2])
     square = lambda v: anp.sum(v**2)
@@ -241,7 +241,7 @@ def test_the_inverse_simulator():
 
 
 def test_half_inverse_losses_as_with_a_dense_svd(rng):
-    """Case C2 in small: a batch of 32 with four misses each; losses of six steps equal to 1e-6 and better."""
+    """A batch of 32 samples with four residuals each: the losses of six steps agree to 1e-6."""
     physics, states, target = rng.standard_normal((24, 4)), *rng.random((2, 32, 4))
     first = rng.standard_normal((4, 20))
     second = rng.standard_normal((20, 24)) / 5
@@ -267,7 +267,7 @@ def test_half_inverse_losses_as_with_a_dense_svd(rng):
 @pytest.mark.parametrize("power", [0.5, 0.75, 1.0])
 @pytest.mark.parametrize("exponent", [-1000, -550, 550, 1000])
 def test_outputs_of_any_magnitude(method, power, exponent, rng):
-    """Squares of the singular values leave the range of floats: directions were NaN or 0."""
+    """Also where squares of the singular values leave the range of floats."""
     matrix = rng.standard_normal((6, 4))
     data = rng.standard_normal(6)
     factor = 2.0**exponent
@@ -283,7 +283,7 @@ def test_outputs_of_any_magnitude(method, power, exponent, rng):
 @pytest.mark.parametrize("method", ["dense", "krylov"])
 @pytest.mark.parametrize("exponent", [-500, 500])
 def test_damped_steps_of_unknowns_of_any_magnitude(method, exponent, rng):
-    """Of unknowns times f J is divided by f, the damping by f^2, and the step is times f."""
+    """For unknowns times f, J is divided by f, the damping by f^2, and the step multiplied by f."""
     matrix = rng.standard_normal((6, 4))
     data = rng.standard_normal(6)
     factor = 2.0**exponent
