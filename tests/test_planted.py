@@ -282,8 +282,8 @@ BUGS = {
     # ---- grid, space, conditions
     "a wall as far away as the next cell": Bug(
         "grid/grid.py",
-        "return 0.5 * (np.append(h, 0.0) + np.append(0.0, h))",
-        "return np.maximum(np.append(h, 0.0), np.append(0.0, h))",
+        "return 0.5 * (np.append(widths, 0.0) + np.append(0.0, widths))",
+        "return np.maximum(np.append(widths, 0.0), np.append(0.0, widths))",
         "tests/grid/test_grid.py tests/operators/test_operators.py::test_discrete_identities",
     ),
     "components of a face field in the wrong order": Bug(

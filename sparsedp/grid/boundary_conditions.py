@@ -1,34 +1,52 @@
 """Boundary conditions: one for each side of each bounded axis, of a field or of a flow.
 
-All conditions are one form, a u + b du/dn = value at the wall, n pointing outwards:
-dirichlet is (1, 0), neumann is (0, 1), robin(a, b) the rest. With u_c the value in the cell next
+All conditions have one form, a u + b du/dn = value at the wall, with n pointing outwards:
+dirichlet is (1, 0), neumann is (0, 1), robin(a, b) any other. With u_c the value in the cell next
 to the wall and h its width, the wall value and the slope follow from (u_w - u_c) / (h / 2) = du/dn:
 
     du/dn = (value - a u_c) / (a h / 2 + b),        u_w = (b u_c + value h / 2) / (a h / 2 + b).
 
-What a fluid does at a wall implies conditions of its velocity along the wall and of the pressure: FlowCondition.
+A FlowCondition is the behaviour of a fluid at a wall: it implies conditions of the tangential velocity and of the
+pressure.
 """
 
-from dataclasses import dataclass, field
+from __future__ import annotations
+
+from typing import Any, NoReturn
 
 from sparsedp._utils.reconstruction import Value
 from sparsedp._utils.validation import check_number, check_type
 from sparsedp.grid.grid import AXES, Grid
 
 __all__ = [
-    "Condition", "FlowCondition", "check_condition", "dirichlet", "free_slip", "inflow", "neumann", "no_slip",
-    "outflow", "resolve", "robin",
-]  # fmt: skip
+    "Condition",
+    "FlowCondition",
+    "check_condition",
+    "dirichlet",
+    "free_slip",
+    "inflow",
+    "neumann",
+    "no_slip",
+    "outflow",
+    "resolve",
+    "robin",
+]
 
 EXAMPLE = "; write for example robin(1.0, 0.5)"
 
 
 class Condition(Value):
-    """What holds at a wall: a u + b du/dn = value, n pointing outwards. Frozen, equal by value.
+    """A boundary condition of a field: a u + b du/dn = value, n pointing outwards. Frozen, equal by value.
 
-    dirichlet: u = value. neumann: du/dn = value. robin(a, b): the rest. Write one condition for all walls, or a dict
-    with the axes: for each a condition, or a pair (lower, upper). Axes that are not named are neumann, periodic ones
-    have no walls. The value is 0 in an operator; `lift` brings in others.
+    dirichlet: u = value. neumann: du/dn = value. robin(a, b): any other. Write one condition for all walls, or a dict
+    whose keys are axes: for each a condition, or a pair (lower, upper). Axes that are not named are neumann, periodic
+    ones have no walls. The value is 0 in an operator; `lift` adds other values.
+
+    Parameters
+    ----------
+    a, b : float
+    description : str, optional
+        Docstring of the instance.
 
     Examples
     --------
@@ -42,19 +60,25 @@ class Condition(Value):
     a: float
     b: float
 
-    def __init__(self, a, b, description=None):
-        documented = {} if description is None else {"__doc__": description}
-        super().__init__(a=a, b=b, **documented)
+    def __init__(self, a: float, b: float, description: str | None = None) -> None:
+        values: dict[str, Any] = {"a": a, "b": b}
+        if description is not None:
+            values["__doc__"] = description
+        super().__init__(**values)
 
     @property
     def _key(self):
         return self.a, self.b
 
-    def __call__(self, value):
+    def __call__(self, value: Any) -> NoReturn:
         raise TypeError(f"{self} takes no value here; write G(u) + B(values), B = dp.lift(grid, dp.{self})")
 
-    def __repr__(self):
-        return {(1.0, 0.0): "dirichlet", (0.0, 1.0): "neumann"}.get(self._key, f"robin({self.a:g}, {self.b:g})")
+    def __repr__(self) -> str:
+        if self._key == (1.0, 0.0):
+            return "dirichlet"
+        if self._key == (0.0, 1.0):
+            return "neumann"
+        return f"robin({self.a:g}, {self.b:g})"
 
 
 dirichlet = Condition(
@@ -62,7 +86,7 @@ dirichlet = Condition(
     0.0,
     """Fix the value at a wall: u = value.
 
-    In an operator the value is 0; `lift` brings in others. In `transport` it is what the wind brings in. The field is
+    In an operator the value is 0; `lift` adds other values. In `transport` it is the value of the inflow. The field is
     odd across the wall: the slope there is (value - u) / (h / 2), with u in the cell next to the wall and h its width.
 
     Examples
@@ -78,8 +102,8 @@ neumann = Condition(
     1.0,
     """Fix the slope at a wall: du/dn = value, n pointing outwards.
 
-    In an operator the slope is 0, a tight or insulated wall; `lift` brings in others. It is the condition of walls that
-    are not named.
+    In an operator the slope is 0, a tight or insulated wall; `lift` adds other values. It is the condition of walls
+    that are not named.
 
     Examples
     --------
@@ -91,8 +115,8 @@ neumann = Condition(
 )
 
 
-def robin(a, b):
-    """Two weights -> the condition a u + b du/dn = value, n outwards.
+def robin(a: float, b: float) -> Condition:
+    """Return the condition a u + b du/dn = value, with n pointing outwards.
 
     Parameters
     ----------
@@ -106,7 +130,7 @@ def robin(a, b):
     Raises
     ------
     ValueError
-        If a weight is negative or not finite, or both are 0: the problem would not be well posed.
+        If a weight is negative or not finite, or both are 0: the problem is not well posed.
     TypeError
         If a weight is not a real number.
 
@@ -117,17 +141,18 @@ def robin(a, b):
     >>> robin(1, 0)
     dirichlet
     """
-    a, b = (check_number(f"{name} of robin", weight, ">= 0", EXAMPLE, EXAMPLE) for name, weight in (("a", a), ("b", b)))
+    a = check_number("a of robin", a, ">= 0", EXAMPLE, EXAMPLE)
+    b = check_number("b of robin", b, ">= 0", EXAMPLE, EXAMPLE)
     if a == b == 0:
         raise ValueError(f"a and b of robin must not both be 0{EXAMPLE}")
     return Condition(a, b)
 
 
-@dataclass(frozen=True)
-class FlowCondition:
-    """What a fluid does at a wall: no_slip (sticks), free_slip (glides), inflow (given), outflow (open).
+class FlowCondition(Value):
+    """The behaviour of a fluid at a wall: no_slip, free_slip, inflow or outflow. Frozen, equal by value.
 
-    Write one for all walls, or a dict with the axes, as for other conditions: axes that are not named are no_slip.
+    Write one for all walls, or a dict whose keys are axes, as for other conditions: axes that are not named are
+    no_slip.
 
     Parameters
     ----------
@@ -137,6 +162,9 @@ class FlowCondition:
     along : Condition
         Of the velocity along the wall.
     pressure : Condition
+        Of the pressure.
+    description : str, optional
+        Docstring of the instance.
 
     Examples
     --------
@@ -145,18 +173,25 @@ class FlowCondition:
     >>> P = dp.projection(grid, boundary={"x": (dp.inflow, dp.outflow)})
     """
 
+    choices = "no_slip, free_slip, inflow, outflow"
     name: str
     closed: bool
     along: Condition
     pressure: Condition
-    description: str = field(default="", repr=False, compare=False)
-    choices = "no_slip, free_slip, inflow, outflow"  # no annotation: the same for all
 
-    def __post_init__(self):
-        if self.description:
-            object.__setattr__(self, "__doc__", self.description)
+    def __init__(
+        self, name: str, closed: bool, along: Condition, pressure: Condition, description: str | None = None
+    ) -> None:
+        values: dict[str, Any] = {"name": name, "closed": closed, "along": along, "pressure": pressure}
+        if description is not None:
+            values["__doc__"] = description
+        super().__init__(**values)
 
-    def __repr__(self):
+    @property
+    def _key(self):
+        return self.name, self.closed, self.along, self.pressure
+
+    def __repr__(self) -> str:
         return self.name
 
 
@@ -165,7 +200,7 @@ no_slip = FlowCondition(
     True,
     dirichlet,
     neumann,
-    """Let the fluid stick to a wall: nothing passes, and the velocity along the wall is that of the wall.
+    """Let the fluid stick to a wall: nothing passes, and the fluid at the wall moves with the wall.
 
     A wall moves with the values of `face_lift` (a lid), else it rests. It is the condition of flow on walls that are
     not named. The pressure has slope 0 there.
@@ -198,7 +233,7 @@ inflow = FlowCondition(
     neumann,
     """Prescribe what passes a side: the velocity across it is what the face field holds there.
 
-    A projection leaves these entries as they are, so set them in the start. The velocity along the side is that of
+    A projection does not change these entries, so set them in the first state. The velocity along the side is given by
     `face_lift`, by default 0. The pressure has slope 0 there. A region with an inflow needs an outflow.
 
     Examples
@@ -212,7 +247,7 @@ outflow = FlowCondition(
     False,
     neumann,
     dirichlet,
-    """Open a side: what passes is found, and the pressure is 0 there.
+    """Open a side: the flow through it is computed, and the pressure is 0 there.
 
     The slope of the velocity along the side is 0. Flow may also enter through it.
 
@@ -224,8 +259,10 @@ outflow = FlowCondition(
 )
 
 
-def resolve(grid, boundary, default=neumann):
-    """Boundary argument -> for each axis (lower, upper), or None where the axis is periodic.
+def resolve(
+    grid: Grid, boundary: Any, default: Condition | FlowCondition = neumann
+) -> tuple[tuple[Any, Any] | None, ...]:
+    """Return the conditions of both sides of each axis, from an argument `boundary`.
 
     Parameters
     ----------
@@ -234,18 +271,20 @@ def resolve(grid, boundary, default=neumann):
         One condition for all bounded sides, or a dict with keys "x", "y", "z", each a condition
         or a pair (lower, upper). On a grid of one axis a pair needs no dict.
     default : Condition or FlowCondition
-        That of the axes that are not named; says which kind of conditions is meant.
+        Condition of the axes that are not named; its type is the type of all conditions.
 
     Returns
     -------
     tuple
+        For each axis (lower, upper), or None if the axis is periodic.
 
     Raises
     ------
     ValueError
         If a periodic axis or an axis the grid does not have is named.
     TypeError
-        If an entry is not a condition of that kind, a pair of them has no axis, or the grid is not a grid.
+        If an entry is not a condition of the type of `default`, if a pair is given without an axis, or if `grid` is no
+        Grid.
 
     Examples
     --------
@@ -260,19 +299,23 @@ def resolve(grid, boundary, default=neumann):
         if isinstance(boundary, (tuple, list)) and grid.dim > 1:
             raise TypeError(f"a pair of conditions belongs to one axis of {grid}; name it: {{'x': {boundary!r}}}")
         boundary = dict.fromkeys(AXES, boundary)
-    return tuple(
-        None if periodic else _sides(axis, boundary.get(axis, default), type(default))
-        for axis, periodic in zip(AXES, grid.periodic, strict=False)
-    )
+    conditions: list[tuple[Any, Any] | None] = []
+    for axis, periodic in zip(grid.axes, grid.periodic, strict=True):
+        if periodic:
+            conditions.append(None)
+        else:
+            conditions.append(_sides(axis, boundary.get(axis, default), type(default)))
+    return tuple(conditions)
 
 
-def check_condition(name, given):
-    """Refuse what is not one condition."""
-    if not isinstance(given, Condition):
-        raise TypeError(f"{name} needs one condition, dirichlet, neumann or robin(a, b), got {given!r}")
+def check_condition(name: str, condition: Any) -> None:
+    """Raise TypeError if an argument is not one Condition."""
+    if not isinstance(condition, Condition):
+        raise TypeError(f"{name} needs one condition, dirichlet, neumann or robin(a, b), got {condition!r}")
 
 
 def _check_names(grid, boundary):
+    """Raise ValueError if a dict of conditions names an axis that has no walls."""
     for name in boundary:
         if name not in grid.axes:
             raise ValueError(
@@ -284,7 +327,10 @@ def _check_names(grid, boundary):
 
 
 def _sides(axis, entry, kind):
-    sides = (entry, entry) if isinstance(entry, kind) else entry
+    """Return the conditions (lower, upper) of an axis, given one condition or a pair."""
+    if isinstance(entry, kind):
+        return entry, entry
+    sides = entry
     if not (isinstance(sides, (tuple, list)) and len(sides) == 2 and all(isinstance(s, kind) for s in sides)):
         raise TypeError(
             f"boundary on {axis} needs {kind.choices} or a pair of them, got {entry!r}{_instead(sides, kind)}"
@@ -293,8 +339,10 @@ def _sides(axis, entry, kind):
 
 
 def _instead(sides, kind):
-    """Return advice for what is not a condition of a kind; empty if there is none."""
-    first = sides[0] if isinstance(sides, (tuple, list)) and sides else sides
+    """Return advice for an entry that is not a condition of a kind; empty if there is none."""
+    first = sides
+    if isinstance(sides, (tuple, list)) and sides:
+        first = sides[0]
     if isinstance(first, str):
         if first in kind.choices.split(", "):
             return f"; write dp.{first}"
@@ -303,4 +351,6 @@ def _instead(sides, kind):
         return ""
     if isinstance(first, FlowCondition):
         return f"; {first} belongs to dp.projection and dp.flow_step, write dp.{first.along} here"
-    return EXAMPLE if "function robin" in repr(first) else ""
+    if getattr(first, "__name__", "") == "robin":
+        return EXAMPLE
+    return ""

@@ -10,8 +10,12 @@
 * Lengths carry whatever unit the user chose; every docstring says [length].
 """
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from functools import cached_property
 from itertools import compress
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,6 +27,9 @@ from sparsedp.autodiff.backend import NUMPY, Backend
 from sparsedp.errors import ShapeError
 from sparsedp.grid.space import Space, whole_lengths
 
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
 __all__ = [
     "AXES",
     "Grid",
@@ -33,7 +40,7 @@ __all__ = [
 
 
 def _what_to_write(*shape, **options):
-    """The call in place of one that `Grid` refuses, such as Grid(64, 64) and Grid((64, 64), dx=0.1)."""
+    """Return what to write instead of a call that `Grid` refuses, such as Grid(64, 64) or Grid((64, 64), dx=0.1)."""
     lengths = [n for n in shape if isinstance(n, (int, np.integer))]
     if len(lengths) == len(shape) > 1:
         return f"dp.Grid({tuple(map(int, lengths))})"
@@ -66,7 +73,7 @@ class Grid(Value, Uncached):
     Raises
     ------
     ShapeError
-        If the shape is not one to three lengths >= 0, or an argument does not fit it.
+        If the shape is not one to three integers >= 0, or an argument does not fit it.
     ValueError
         If a width is not positive and finite, or both `size` and `spacing` are given.
     TypeError
@@ -91,7 +98,15 @@ class Grid(Value, Uncached):
     backend: Backend = NUMPY  # where the fields are stored
 
     @public("dp.Grid", _what_to_write)
-    def __init__(self, shape, *, size=None, spacing=None, origin=0.0, periodic=False):
+    def __init__(
+        self,
+        shape: int | Sequence[int],
+        *,
+        size: float | Sequence[float] | None = None,
+        spacing: float | Sequence | NDArray | None = None,
+        origin: float | Sequence[float] = 0.0,
+        periodic: bool | Sequence[bool] = False,
+    ) -> None:
         shape = lengths(shape)
         if size is not None and spacing is not None:
             raise ValueError("a grid takes size or spacing, not both; leave one out")
@@ -105,22 +120,22 @@ class Grid(Value, Uncached):
         )
 
     @cached_property
-    def cells(self):
+    def cells(self) -> Space:
         """Space of cell fields; their shape is `grid.shape`."""
         return Space(self.shape, "cells", self)
 
     @cached_property
-    def nodes(self):
+    def nodes(self) -> Space:
         """Space of node fields."""
         return Space(self._part("nodes", 0), "nodes", self)
 
     @cached_property
-    def faces(self):
+    def faces(self) -> Space:
         """Space of face fields, flat: x-faces, then y-faces, then z-faces."""
         return self._stacked("faces")
 
     @cached_property
-    def edges(self):
+    def edges(self) -> Space:
         """Space of edge fields, flat: x-edges, then y-edges, then z-edges."""
         return self._stacked("edges")
 
@@ -128,52 +143,57 @@ class Grid(Value, Uncached):
         return Space(None, kind, self, [self._part(kind, axis) for axis in range(self.dim)])
 
     def _part(self, kind, component):
-        """Shape of a component of a space."""
-        on_nodes = node_axes(kind, component, self.dim)
-        return tuple(self.node_count(a) if a in on_nodes else n for a, n in enumerate(self.shape))
+        """Return the shape of a component of a space."""
+        on_nodes = node_axes(kind, component, self.dim) or ()
+        lengths = list(self.shape)
+        for axis in on_nodes:
+            lengths[axis] = self.node_count(axis)
+        return tuple(lengths)
 
-    def node_count(self, axis):
-        """Number of nodes (and of faces) along one axis."""
+    def node_count(self, axis: int) -> int:
+        """Return the number of nodes (and of faces) along one axis."""
         return self.shape[axis] + (not self.periodic[axis])
 
-    def face_shape(self, axis):
-        """Shape of the component of a face field that crosses `axis`."""
+    def face_shape(self, axis: int) -> tuple[int, ...]:
+        """Return the shape of the component of a face field that crosses `axis`."""
         return self._part("faces", axis)
 
     @cached_property
-    def volumes(self):
+    def volumes(self) -> Any:
         """Cell volumes [length^dim], shape `grid.shape`, read-only."""
         return self.cells.volumes
 
     @cached_property
-    def size(self):
+    def size(self) -> tuple[float, ...]:
         """Extent of each axis [length]."""
         return tuple(float(widths.sum()) for widths in self.widths)
 
     @cached_property
-    def uniform(self):
+    def uniform(self) -> tuple[bool, ...]:
         """For each axis, whether all cells have the same width."""
         return tuple(bool(np.all(widths == widths[:1])) for widths in self.widths)
 
-    def spacings(self, axis):
-        """Distance between the neighbouring centres at each face of an axis [length].
+    def spacings(self, axis: int) -> NDArray:
+        """Return the distance between the neighbouring centres at each face of an axis [length].
 
         At a wall it is the distance from the centre to the wall: half a cell.
         """
-        h = self.widths[axis]
+        widths = self.widths[axis]
         if self.periodic[axis]:
-            return 0.5 * (h + np.roll(h, 1))
-        return 0.5 * (np.append(h, 0.0) + np.append(0.0, h))
+            return 0.5 * (widths + np.roll(widths, 1))
+        return 0.5 * (np.append(widths, 0.0) + np.append(0.0, widths))
 
-    def control_lengths(self, kind, axis):
-        """The lengths along each axis whose products are the control volumes of a component; they fill the box."""
+    def control_lengths(self, kind: str, axis: int) -> list[NDArray]:
+        """Return the lengths along each axis whose products are the control volumes of a component."""
         on_nodes = node_axes(kind, axis, self.dim)
         if on_nodes is None:
             raise ShapeError(f"values on {kind} have no volumes; take those of grid.cells, faces, nodes or edges")
         return [self.spacings(a) if a in on_nodes else self.widths[a] for a in range(self.dim)]
 
-    def split(self, v):
-        """Face field (or 3-D edge field; in 2-D write ``grid.edges.split``) -> tuple of components. Differentiable.
+    def split(self, v: ArrayLike) -> tuple:
+        """Return the components of a face field, or of an edge field in 3-D. Differentiable.
+
+        For an edge field in 2-D write ``grid.edges.split(v)``.
 
         Parameters
         ----------
@@ -198,13 +218,15 @@ class Grid(Value, Uncached):
         on_edges = self.dim == 3 and np.shape(v) == self.edges.shape
         return (self.edges if on_edges else self.faces).split(v)
 
-    def join(self, *parts):
-        """Components -> face field (or 3-D edge field; in 2-D ``grid.edges.join``), one flat array. Differentiable.
+    def join(self, *parts: ArrayLike) -> Any:
+        """Return a face field, or an edge field in 3-D, as one flat array from its components. Differentiable.
+
+        For an edge field in 2-D write ``grid.edges.join(*parts)``.
 
         Parameters
         ----------
         *parts : arrays, one for each axis
-            Read-only arrays and arrays that broadcast to the component shapes are fine.
+            They broadcast to the shapes of the components.
 
         Returns
         -------
@@ -223,14 +245,14 @@ class Grid(Value, Uncached):
         on_edges = self.dim == 3 and tuple(map(np.shape, parts)) == self.edges.parts
         return (self.edges if on_edges else self.faces).join(*parts)
 
-    def coordinates(self, axis, at="cells"):
-        """1-D coordinates along one axis [length]: of the `cells` (centres), the `nodes`, or the `ends` of cells.
+    def coordinates(self, axis: int, at: str = "cells") -> NDArray:
+        """Return the 1-D coordinates of cell centres, nodes or cell ends along one axis [length].
 
         Parameters
         ----------
         axis : int
         at : "cells", "nodes" or "ends"
-            Ends of cells are nodes, and on a periodic axis one more: where the last cell ends.
+            The ends are the nodes and, on a periodic axis, also the end of the last cell.
 
         Returns
         -------
@@ -239,10 +261,12 @@ class Grid(Value, Uncached):
         ends = self.origin[axis] + np.append(0.0, np.cumsum(self.widths[axis]))
         if at == "cells":
             return 0.5 * (ends[:-1] + ends[1:])
-        return ends[: self.node_count(axis)] if at == "nodes" else ends
+        if at == "nodes":
+            return ends[: self.node_count(axis)]
+        return ends
 
-    def centres(self):
-        """Coordinates of the cell centres: a tuple of `dim` full arrays, also in 1-D.
+    def centres(self) -> tuple:
+        """Return the coordinates of the cell centres: a tuple of `dim` full arrays, also in 1-D.
 
         Returns
         -------
@@ -255,8 +279,8 @@ class Grid(Value, Uncached):
         """
         return self._mesh(["cells"] * self.dim)
 
-    def face_centres(self, axis):
-        """Coordinates of the centres of the faces that cross `axis`: a tuple of `dim` full arrays.
+    def face_centres(self, axis: int) -> tuple:
+        """Return the coordinates of the centres of the faces that cross `axis`: a tuple of `dim` full arrays.
 
         Parameters
         ----------
@@ -275,12 +299,15 @@ class Grid(Value, Uncached):
         return self._mesh(["nodes" if a == axis else "cells" for a in range(self.dim)])
 
     def _mesh(self, places):
+        """Return the coordinates of points that are cells or nodes along each axis."""
         lines = [self.coordinates(axis, at) for axis, at in enumerate(places)]
         return self.backend.mesh(self, lines)
 
-    def axis(self, axis):
-        """Check an axis number or name ("x") and return the number."""
-        number = AXES.index(axis) if isinstance(axis, str) and axis in AXES else axis
+    def axis(self, axis: int | str) -> int:
+        """Return the number of an axis that is given by its number or name ("x")."""
+        number: Any = axis
+        if isinstance(axis, str) and axis in AXES:
+            number = AXES.index(axis)
         if isinstance(number, (int, np.integer)) and 0 <= number < self.dim:
             return int(number)
         raise ValueError(
@@ -291,7 +318,7 @@ class Grid(Value, Uncached):
     def _key(self):
         return self.shape, self.periodic, self.origin, tuple(widths.tobytes() for widths in self.widths), self.backend
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         words = [" x ".join(map(str, self.shape)) + " cells", "size " + " x ".join(f"{size:.6g}" for size in self.size)]
         if any(self.origin):
             words.append("origin " + ", ".join(f"{start:.6g}" for start in self.origin))
@@ -303,53 +330,75 @@ class Grid(Value, Uncached):
         return f"Grid({', '.join(words)})"
 
     def _repr_html_(self):
-        """For a notebook: a line for each axis and for each space."""
+        """Return HTML for a notebook: a line for each axis and for each space."""
         entries = {}
-        for name, n, size, start, widths, around in zip(
-            self.axes, self.shape, self.size, self.origin, self.widths, self.periodic, strict=True
-        ):
-            narrow, wide = np.min(widths, initial=np.inf), np.max(widths, initial=0.0)
-            width = f"width {wide:.4g}" if wide <= narrow else f"widths {narrow:.4g} to {wide:.4g}"
-            ends = f"from {start:.6g} to {start + size:.6g}{', periodic' if around else ''}"
-            entries[name] = f"{n} cells {ends}, {width}"
+        for axis, name in enumerate(self.axes):
+            widths = self.widths[axis]
+            narrowest = np.min(widths, initial=np.inf)
+            widest = np.max(widths, initial=0.0)
+            start = self.origin[axis]
+            text = f"{self.shape[axis]} cells from {start:.6g} to {start + self.size[axis]:.6g}"
+            if self.periodic[axis]:
+                text += ", periodic"
+            if widest <= narrowest:
+                text += f", width {widest:.4g}"
+            else:
+                text += f", widths {narrowest:.4g} to {widest:.4g}"
+            entries[name] = text
         for space in (self.cells, self.faces, self.nodes, self.edges):
             entries[space.kind] = f"{space.size} values, shape {space.shape}"
         return facts(repr(self), entries)
 
 
-def check_grid(name, grid):
-    """Refuse what is no Grid."""
+def check_grid(name: str, grid: Any) -> None:
+    """Raise TypeError if an argument is not a Grid, or a function does not support where its fields are stored."""
     check_type(name, grid, Grid, "a Grid", "dp.Grid((64, 64), size=1.0)")
     grid.backend.check(name)
 
 
-# ---- from what the user gave to one entry for each axis ----
+# ---- arguments with one entry for each axis ----
 
 
 AXES = ("x", "y", "z")
 
 
-def lengths(shape):
-    """Shape argument -> tuple of one to three lengths."""
+def lengths(shape: Any) -> tuple[int, ...]:
+    """Return the argument `shape` as a tuple of one to three integers."""
     entries = whole_lengths(shape)
     if entries is None or not 1 <= len(entries) <= 3:
         raise ShapeError(f"a grid needs one to three whole lengths >= 0, got shape {shape}; write Grid((8, 6))")
     return entries
 
 
-def node_axes(kind, component, dim):
-    """Axes along which values sit on nodes, not on centres; None for kinds of spaces that have no places, as walls.
+def node_axes(kind: str, component: int, dim: int) -> tuple[int, ...] | None:
+    """Return the axes along which values are placed on nodes, not on centres.
 
-    kind: cells, nodes, faces, edges, or one component of faces, such as x-faces; component: its number.
+    Parameters
+    ----------
+    kind : str
+        cells, nodes, faces, edges, or one component of faces, such as x-faces.
+    component : int
+        Number of the component of faces or edges.
+    dim : int
+
+    Returns
+    -------
+    tuple of int, or None
+        None for a kind without places, such as walls.
     """
-    across = tuple(axis for axis in range(dim) if axis != component)
-    places: dict = {f"{axis}-faces": (number,) for number, axis in enumerate(AXES)}
-    places |= {"cells": (), "nodes": tuple(range(dim)), "faces": (component,), "edges": across}
-    return places.get(kind)
+    axes: dict[str, tuple[int, ...]] = {
+        "cells": (),
+        "nodes": tuple(range(dim)),
+        "faces": (component,),
+        "edges": tuple(axis for axis in range(dim) if axis != component),
+    }
+    for number, name in enumerate(AXES):
+        axes[f"{name}-faces"] = (number,)
+    return axes.get(kind)
 
 
-def per_axis(value, shape, name):
-    """One entry for each axis; a scalar serves all of them."""
+def per_axis(value: Any, shape: tuple[int, ...], name: str) -> tuple:
+    """Return one entry for each axis; a scalar is repeated."""
     if not isinstance(value, (tuple, list)) and np.ndim(value) == 0:
         return (value,) * len(shape)
     if len(value) != len(shape):
@@ -357,44 +406,49 @@ def per_axis(value, shape, name):
     return tuple(value)
 
 
-def real_numbers(entry, name, example):
-    """Array of real numbers, or TypeError that names the argument."""
+def real_numbers(entry: Any, name: str, example: str) -> NDArray:
+    """Return an array of real numbers; raise TypeError if an argument holds anything else."""
     values = np.asarray(entry)
     if values.dtype.kind not in "biuf":
         raise TypeError(f"{name} needs real numbers, got {entry!r}; write for example {example}")
     return values
 
 
-def numbers_per_axis(value, shape, name, needs=""):
-    """One finite float for each axis, in the range that is needed; a number serves all of them."""
-    kind = "; write one number for each axis, or one for all"
-    return tuple(check_number(name, entry, needs, kind=kind) for entry in per_axis(value, shape, name))
+def numbers_per_axis(value: Any, shape: tuple[int, ...], name: str, needs: str = "") -> tuple[float, ...]:
+    """Return one finite float for each axis, in a required range such as "> 0"; a number is repeated."""
+    advice = "; write one number for each axis, or one for all"
+    return tuple(check_number(name, entry, needs, kind=advice) for entry in per_axis(value, shape, name))
 
 
-def flag(entry, shape):
-    """One entry of `periodic`: True or False, nothing that only counts as one of them."""
+def flag(entry: Any, shape: tuple[int, ...]) -> bool:
+    """Return one entry of `periodic`; raise TypeError if it is not a bool."""
     if not isinstance(entry, (bool, np.bool_)):
-        example = (True, False, False)[: len(shape)] if len(shape) > 1 else True
+        example: Any = True
+        if len(shape) > 1:
+            example = (True, False, False)[: len(shape)]
         raise TypeError(f"periodic needs True or False for each axis, got {entry!r}; write periodic={example}")
     return bool(entry)
 
 
-def cell_widths(shape, size, spacing):
-    """Size or spacing argument -> tuple of read-only arrays of cell widths, one for each axis."""
+def cell_widths(shape: tuple[int, ...], size: Any, spacing: Any) -> tuple[NDArray, ...]:
+    """Return the cell widths of each axis as read-only arrays, from the argument `size` or `spacing`."""
     if size is not None:
         extents = numbers_per_axis(size, shape, "size", "> 0")
         spacing = [extent / max(n, 1) for n, extent in zip(shape, extents, strict=True)]
     elif len(shape) == 1 and isinstance(spacing, np.ndarray) and spacing.ndim == 1:
-        spacing = [spacing]  # in 1-D an array is the widths themselves
-    entries = per_axis(1.0 if spacing is None else spacing, shape, "spacing")
+        spacing = [spacing]  # in 1-D an array holds the widths of the one axis
+    elif spacing is None:
+        spacing = 1.0
+    entries = per_axis(spacing, shape, "spacing")
     return tuple(_axis_widths(n, entry, axis) for n, entry, axis in zip(shape, entries, AXES, strict=False))
 
 
 def _axis_widths(n, entry, axis):
+    """Return the widths of the cells of one axis, given one width or an array of them."""
     line = np.array(real_numbers(entry, "spacing", "spacing=0.5"), dtype=float)
     if line.shape not in ((), (n,)):
         raise ShapeError(f"spacing along {axis} needs {n} cell widths, got an array of shape {line.shape}")
-    wrong = ~((line > 0) & (line < np.inf))  # NaN too
+    wrong = ~((line > 0) & (line < np.inf))  # also true for NaN
     if np.any(wrong):
         raise ValueError(f"spacing must be positive and finite, got {line[wrong][0]}")
     line = np.full(n, line)

@@ -141,7 +141,7 @@ def dataset_of(name, grid, attrs, times, content):
         for number, (label, part) in enumerate(zip(labels, flat)):
             if label in {*variables, *coords}:
                 raise ValueError(f"{name} would store {field} as {label}, which is there; write another name")
-            on_nodes = node_axes(space.kind, number, grid.dim)
+            on_nodes = node_axes(space.kind, number, grid.dim) or ()
             places = [f"{axis}_nodes" if n in on_nodes else axis for n, axis in enumerate(grid.axes)]
             variables[label] = batch + places, part.reshape(*lead, *space.parts[number]), given.get(field)
         notes["fields"][field] = space.kind, labels
