@@ -46,7 +46,7 @@ from sparsedp.integrators.jacobians import jacobians_of
 from sparsedp.integrators.problem import Sided, combine, like, unsided, untraced
 from sparsedp.integrators.runge_kutta import Scheme, as_matrix
 from sparsedp.solvers.direct import dense_lu
-from sparsedp.solvers.newton import Layout
+from sparsedp.solvers.newton import Unknowns
 
 __all__ = ["Radau"]
 
@@ -87,7 +87,7 @@ class Flat:
 
     def __init__(self, problem, u, name):
         require_arrays(name, map(plain, leaves(u)))
-        self.problem, self.timed, self.layout = problem, problem.timed, Layout(u, name)
+        self.problem, self.timed, self.layout = problem, problem.timed, Unknowns(u, name)
         self.size = self.layout.size
         if self.size > UNKNOWNS:
             raise ShapeError(

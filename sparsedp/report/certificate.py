@@ -158,10 +158,10 @@ class RecordedSolves(dict[SolveKey, RecordedSolve]):
         """Return the flat solution of a nonlinear solve."""
 
         def corrected(x: NDArray[Any], kept: Any) -> NDArray[Any]:
-            return root.corrected(equation, x, leaves, self.share, -kept)
+            return root.newton_correction(equation, x, leaves, self.share, -kept)
 
         key = self._next_key(root.name, "forward")
-        x = self._solution(key, guess.size, partial(root.solved, equation, guess, leaves), corrected)
+        x = self._solution(key, guess.size, partial(root.newton_solve, equation, guess, leaves), corrected)
         self[key] = RecordedSolve(x, -equation.value(x, leaves), 0.0, root.rtol, True)
         return x
 

@@ -1,11 +1,13 @@
-"""The Jacobian J = dF/dx of a residual at a point, set up for solves: given, assembled by colours, or as products.
+"""The Jacobian J = dF/dx of a residual at a point, set up for solves: supplied, assembled by colours, or as products.
 
-Set-ups are cached by content, the last two: of the point (x and the parameters, for the derivative rules),
-and of the entries (a residual that is linear in x is set up once). Forward solves never look a point up.
+The last two set-ups are cached by content: of the point (x and the parameters, for the derivative rules), and of the
+entries (a residual that is linear in x is set up once). Forward solves never look up a point.
 """
 
+from __future__ import annotations
+
 from threading import RLock
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -26,12 +28,29 @@ from sparsedp.solvers.inverse import Inverse, Solution, build, build_dense
 from sparsedp.solvers.records import failure
 from sparsedp.solvers.sparsity import ColouredPattern, dense_pattern, find_pattern, pattern_like, stencil_pattern
 
-__all__ = ["Jacobians", "Linearisation"]
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from sparsedp.solvers.engine import Engine
+    from sparsedp.solvers.records import SolveInfo
+    from sparsedp.solvers.solve import Solver
+
+__all__ = ["Jacobians", "Linearisation", "Point", "find_fields"]
 
 FULL_UP_TO = 16  # unknowns: a full Jacobian takes fewer products than the search for its pattern
-FULL_AT_MOST = 2000  # unknowns: a larger Jacobian that is not sparse is left as products
-SYMMETRIC = 1e-12  # of the largest entry: by how much a symmetric Jacobian may differ from its transpose
-AGREES = 1e-8  # relative difference up to which two forms of one Jacobian are taken for equal
+FULL_AT_MOST = 2000  # unknowns: a larger Jacobian that is not sparse is applied by products
+SYMMETRY_TOLERANCE = 1e-12  # of the largest entry: by how much a symmetric Jacobian may differ from its transpose
+AGREEMENT = 1e-8  # largest relative difference of two forms of one Jacobian that counts as rounding
+
+
+class Point(NamedTuple):
+    """Where a Jacobian is taken: plain copies of the unknowns and of the floating leaves of the parameters."""
+
+    equation: Any
+    x: Any
+    leaves: Sequence[Any]
 
 
 class Linearisation:
@@ -41,44 +60,61 @@ class Linearisation:
     ----------
     solver : Solver
         Of J.
-    point : (equation, x, leaves)
-        Plain copies.
+    point : Point
     checked : bool
         Whether J is known to be the derivative of the residual.
     """
 
-    def __init__(self, solver, point, checked):
-        self.solver, self.point, self.checked = solver, point, checked
+    def __init__(self, solver: Solver, point: Point, checked: bool) -> None:
+        self.solver = solver
+        self.point = point
+        self.checked = checked
 
-    def __str__(self):
+    def __str__(self) -> str:
         return str(Inverse(Solution(self.solver)))
 
-    def _of(self, act, x, *given):
-        """What a method of the solver or its system, which know flat numbers, gives for a field."""
+    def _on_field(self, function, x, *args):
+        """Apply a function of flat arrays, such as a method of the solver, to a field, distributed or not."""
         system = self.solver.system
-        return system.shaped(act(system.flat(x), *given), self.point[0].layout.space)
+        return system.shaped(function(system.flat(x), *args), self.point.equation.unknowns.space)
 
-    def product(self, x):
-        """J x."""
-        return self._of(self.solver.system.applied, x)
+    def product(self, x: Any) -> Any:
+        """Return J x."""
+        return self._on_field(self.solver.system.applied, x)
 
-    def magnitude(self, x):
-        """|J| x, row by row, for x >= 0."""
+    def magnitude(self, x: Any) -> Any:
+        """Return |J| x, with the magnitudes of the entries of J, for x >= 0."""
         system = self.solver.system
-        return self._of(lambda x: np.ldexp(system.magnitude(x), system.exponent), x)
+
+        def unscaled_magnitude(x):
+            return np.ldexp(system.magnitude(x), system.exponent)
+
+        return self._on_field(unscaled_magnitude, x)
 
     @property
-    def singular(self):
-        """Whether a null space of J, or an unknown that no equation uses, is known."""
+    def singular(self) -> bool:
+        """Whether J is known to have a null space, or an unknown that no equation uses."""
         system = self.solver.system
         return system.active is not None or system.null_space.count > 0
 
-    def step(self, F, forcing):
-        """The Newton step -J^-1 F, up to the relative residual `forcing`. Never refused: the next residual judges."""
-        return self._of(self.solver.approximate, -F, max(forcing, self.solver.system.rtol))
+    def step(self, F: Any, forcing: float) -> Any:
+        """Return the Newton step -J^-1 F, to the relative residual `forcing` where that can be reached."""
+        return self._on_field(self.solver.approximate, -F, max(forcing, self.solver.system.rtol))
 
-    def solve(self, b, transposed):
-        """(J^-1 b or J^-T b to the full tolerance, its record). Refused when the root is not isolated."""
+    def solve(self, b: Any, transposed: bool) -> tuple[Any, SolveInfo | None]:
+        """Solve J x = b or J^T x = b to the full tolerance.
+
+        Returns
+        -------
+        x : flat unknowns
+        info : SolveInfo or None
+            Its record; None where a certificate repeats an earlier solve.
+
+        Raises
+        ------
+        ConvergenceError
+            If J is singular, that is, if the root is not isolated.
+        """
         solver = self.solver
         if self.singular and solver.nullspace == "raise":
             raise ConvergenceError(
@@ -86,111 +122,173 @@ class Linearisation:
                 "no derivative; add an equation that fixes it or write nullspace='project'",
                 info=failure("setup_failed"),
             )
-        x = self._of(solver.solve, b, transposed, False)
-        return x, solver.log.adjoint if transposed else solver.log.forward
+        x = self._on_field(solver.solve, b, transposed, False)
+        return x, solver.log.last(transposed)
 
-    def defect(self):
-        """How far J is from the derivative of the residual along a random direction: (largest, its row)."""
+    def defect(self) -> tuple[float, int]:
+        """Compare J with the derivative of the residual along a random direction.
+
+        Returns
+        -------
+        largest : float
+            The largest relative difference of a row.
+        row : int
+        """
         equation, x, leaves = self.point
         rng = np.random.default_rng(0)
-        v = equation.layout.laid(rng.uniform(0.5, 1.5, x.size) * rng.choice([-1.0, 1.0], x.size))
+        v = equation.unknowns.distribute(rng.uniform(0.5, 1.5, x.size) * rng.choice([-1.0, 1.0], x.size))
         with np.errstate(all="ignore"):
-            wanted = equation.tangent(x, leaves)(v)
-        size = np.maximum(self.magnitude(np.abs(v)), np.abs(wanted))
+            expected = equation.tangent(x, leaves)(v)
+        size = np.maximum(self.magnitude(np.abs(v)), np.abs(expected))
         size = size + 1e-8 * np.max(size, initial=0.0)  # rounding of large rows is no difference in small ones
-        share = np.abs(self.product(v) - wanted) / np.where(size > 0, size, 1.0)
-        return float(np.max(share, initial=0.0)), int(np.argmax(share)) if share.size else 0
+        differences = np.abs(self.product(v) - expected) / np.where(size > 0, size, 1.0)
+        row = int(np.argmax(differences)) if differences.size else 0
+        return float(np.max(differences, initial=0.0)), row
+
+
+class KnownPattern(NamedTuple):
+    """What is known of the Jacobian on one space of unknowns.
+
+    Attributes
+    ----------
+    coloured : ColouredPattern or None
+        None if J is only applied by products.
+    cells : Space or None
+        The cells of a grid on which the unknowns were found to lie.
+    """
+
+    coloured: Any
+    cells: Space | None
 
 
 class Jacobians:
-    """Where the Jacobians of one residual come from.
+    """The source of the Jacobians of one residual.
 
     Parameters
     ----------
     name : str
     jacobian : callable or None
+        ``jacobian(x, *params)``, supplied by the user.
     sparsity : sparse matrix or None
+        Supplied by the user.
     settings : dict
         Keywords of `build`.
+
+    Attributes
+    ----------
+    description : str
+        How the Jacobians are obtained; empty before the first one.
     """
 
-    def __init__(self, name, jacobian, sparsity, settings):
-        self.name, self.given, self.settings = name, jacobian, dict(settings, name=f"{name}.jacobian")
+    def __init__(self, name: str, jacobian: Callable[..., Any] | None, sparsity: Any, settings: dict[str, Any]) -> None:
+        self.name = name
+        self.user_jacobian = jacobian
+        self.settings = dict(settings, name=f"{name}.jacobian")
         self.sparsity: Any = None if sparsity is None else pattern_like(sparsity)
-        self.ways: list = []  # whether rows are coloured, for VJPs, or columns, for JVPs: what the residual has
-        self.way = ""
-        # space -> (Coloured, or None when only products will do; the cells that the unknowns were found to lie on)
-        self._patterns: dict = {}
-        self._points, self._operators, self._matrices = Cache(), Cache(), Cache()
-        self._alone = RLock()  # held by the thread that looks for a pattern
+        self.description = ""
+        # The values of `by_rows` of ColouredPattern that the residual allows: True by VJPs, False by JVPs.
+        self._orientations: list[bool] = []
+        self._patterns: dict[Space, KnownPattern] = {}
+        self._points = Cache()
+        self._operators = Cache()
+        self._matrices = Cache()
+        self._lock = RLock()  # held by the thread that searches a pattern
 
-    def __str__(self):
-        lines = [
-            f"  {space.size} unknowns" + ("" if coloured is None else f", {coloured.count} products")
-            for space, (coloured, _) in self._patterns.items()
-        ]
-        return "\n".join([*lines, str(self._points.last) if len(self._points) else "  not set up yet"])
+    def __str__(self) -> str:
+        lines = []
+        for space, pattern in self._patterns.items():
+            products = "" if pattern.coloured is None else f", {pattern.coloured.count} products"
+            lines.append(f"  {space.size} unknowns{products}")
+        lines.append(str(self._points.last) if len(self._points) else "  not set up yet")
+        return "\n".join(lines)
 
     # ------------------------------------------------------------ set-ups
 
-    def fresh(self, equation, x, leaves, near=None):
-        """The Jacobian at this point, made now. One that leans on the engine of another, `near`, is not kept."""
-        op, exact = self._operator(equation, x, leaves)
-        known = Linearisation(self._solver(op, near), (equation, *copied((x, leaves))), exact)
-        return known if near else self._points.put(_key(equation, x, leaves), known)
+    def evaluate(self, equation: Any, x: Any, leaves: Sequence[Any], near: Engine | None = None) -> Linearisation:
+        """Return the Jacobian at a point.
 
-    def cached(self, equation, x, leaves):
-        """The Jacobian at this point for a derivative: found again or made, and checked against the residual."""
-        known = self._points.find(_key(equation, x, leaves)) or self.fresh(equation, x, leaves)
-        return self.fresh(equation, x, leaves) if self.enlarged(known) else known
+        Parameters
+        ----------
+        equation : Equation
+        x : flat unknowns
+        leaves : sequence of arrays
+        near : Engine, optional
+            Of another Jacobian, to precondition the solves with this one, which is then not cached.
+        """
+        op, is_exact = self._operator(equation, x, leaves)
+        point = Point(equation, *copied((x, leaves)))
+        linearisation = Linearisation(self._solver(op, near), point, is_exact)
+        if near:
+            return linearisation
+        return self._points.put(_key(equation, x, leaves), linearisation)
 
-    def relaxed(self, equation, x, leaves, pace, near):
-        """The Solver of J + D / pace, D the rates of its rows; None where its entries are not known."""
+    def cached(self, equation: Any, x: Any, leaves: Sequence[Any]) -> Linearisation:
+        """Return the Jacobian at a point for a derivative, from the cache or new, compared with the residual."""
+        linearisation = self._points.find(_key(equation, x, leaves)) or self.evaluate(equation, x, leaves)
+        if self.complete_pattern(linearisation):
+            return self.evaluate(equation, x, leaves)
+        return linearisation
+
+    def relaxed_solver(
+        self, equation: Any, x: Any, leaves: Sequence[Any], time_step: float, near: Engine | None
+    ) -> Solver | None:
+        """Return the Solver of J + D / time_step, D the rates of its rows; None where its entries are not known."""
         op, _ = self._operator(equation, x, leaves)
         if op.form != "explicit" or not op.backend.whole_fields:
             return None
-        matrix = op.matrix + sp.diags_array(_rates(op.matrix, equation.layout) / pace)
+        matrix = op.matrix + sp.diags_array(_rates(op.matrix, equation.unknowns) / time_step)
         return self._solver(from_matrix(matrix, op.domain, op.domain, op.name), near)
 
     def _solver(self, op, near):
-        """The Solver of a Jacobian: found again by its entries, or set up."""
-        settings, solver = self.settings, None
-        key: Any = None
-        if op.form == "explicit" and op.backend.whole_fields and not near:
-            entries = op.matrix.indptr, op.matrix.indices, op.matrix.data
-            key = (op,) if op is self._operators.last else entries
-            solver = self._matrices.find(key)
-            if not solver and op.shape[0] <= DENSE_UP_TO and settings["method"] in ("auto", "direct"):
-                solver = build_dense(op, settings["rtol"], settings["nullspace"], settings["name"])
-        solver = solver or build(op, **settings, solves="few", near=near, all_rows=False).solver
-        return self._matrices.put(key, solver) if key else solver
+        """Return the Solver of a Jacobian, from the cache of entries or new."""
+        if op.form != "explicit" or not op.backend.whole_fields or near:
+            return self._build(op, near)
+        key: tuple[Any, ...]
+        if op is self._operators.last:
+            key = (op,)
+        else:
+            key = (op.matrix.indptr, op.matrix.indices, op.matrix.data)
+        solver = self._matrices.find(key)
+        if not solver and op.shape[0] <= DENSE_UP_TO and self.settings["method"] in ("auto", "direct"):
+            solver = build_dense(op, self.settings["rtol"], self.settings["nullspace"], self.settings["name"])
+        return self._matrices.put(key, solver or self._build(op, near))
 
-    def suspected(self, known):
-        """As `enlarged`, for a Newton step that did not do well. A Jacobian that was given may be a simpler one."""
-        return self.given is None and self.enlarged(known)
+    def _build(self, op, near):
+        return build(op, **self.settings, solves="few", near=near, all_rows=False).solver
 
-    def hint(self, known):
-        """What a failed solve should say about a Jacobian that was given."""
-        if self.given is None:
+    def check_after_slow_step(self, linearisation: Linearisation) -> bool:
+        """Do the same as `complete_pattern`, unless the user supplied the Jacobian: it may be a simpler one."""
+        return self.user_jacobian is None and self.complete_pattern(linearisation)
+
+    def hint(self, linearisation: Linearisation) -> str:
+        """Return what the message of a failed solve should say about a Jacobian that the user supplied."""
+        if self.user_jacobian is None:
             return ""
-        defect = known.defect()[0]
-        return f"; the jacobian given differs from the derivative of the residual by {defect:.1e}" * (defect > AGREES)
+        defect = linearisation.defect()[0]
+        if defect <= AGREEMENT:
+            return ""
+        return f"; the jacobian given differs from the derivative of the residual by {defect:.1e}"
 
-    def enlarged(self, known):
-        """Check a Jacobian, once. Returns True when entries were missing and its pattern has been enlarged.
+    def complete_pattern(self, linearisation: Linearisation) -> bool:
+        """Compare a Jacobian with the derivative of the residual, once.
+
+        Returns
+        -------
+        bool
+            Whether entries were missing, and have been added to the pattern.
 
         Raises
         ------
         DerivativeError
-            When it was given, as a whole or as its sparsity, and does not fit the residual.
+            If the user supplied the Jacobian or its sparsity, and it does not fit the residual.
         """
-        if known.checked:
+        if linearisation.checked:
             return False
-        defect, row = known.defect()
-        known.checked = defect <= AGREES
-        if known.checked:
+        defect, row = linearisation.defect()
+        linearisation.checked = defect <= AGREEMENT
+        if linearisation.checked:
             return False
-        if self.given is not None:
+        if self.user_jacobian is not None:
             raise DerivativeError(
                 f"the jacobian given for {self.name} differs from the derivative of the residual "
                 f"by {defect:.1e} (relative) in row {row}; correct it or leave it out"
@@ -199,166 +297,212 @@ class Jacobians:
             raise DerivativeError(
                 f"the sparsity given for {self.name} lacks entries in row {row}; add them or leave it out"
             )
-        equation, x, leaves = known.point
-        with self._alone:
-            if not equation.layout.backend.whole_fields:
-                self._stencil(equation, [x], leaves, known.solver.system.unscaled.structure.stencil)
+        equation, x, leaves = linearisation.point
+        with self._lock:
+            if not equation.unknowns.backend.whole_fields:
+                structure: Any = linearisation.solver.system.unscaled.structure
+                incomplete = structure.stencil
+                self._find_distributed_stencil(equation, [x], leaves, incomplete)
             else:
-                self._enlarge(equation, x, leaves, row)
+                self._enlarge_pattern(equation, x, leaves, row)
         return True
 
     # ------------------------------------------------------------ three ways to a Jacobian
 
     def _operator(self, equation, x, leaves):
-        """(J as an Operator, explicit where its entries are known; whether it is exact for certain)."""
-        size, name = equation.size, self.settings["name"]
-        if self.given is not None:
-            self.way = "given"
-            given = self.given(equation.layout.split(x), *equation.params(leaves))
-            return self._as_operator(given, equation.layout, name), False
-        with self._alone:
-            coloured, space = self._patterns.get(equation.layout.space) or self._coloured(equation, x, leaves)
+        """Return J as an Operator, explicit where its entries are known, and whether it is certainly exact."""
+        unknowns = equation.unknowns
+        name = self.settings["name"]
+        if self.user_jacobian is not None:
+            self.description = "given"
+            jacobian = self.user_jacobian(unknowns.split(x), *equation.params(leaves))
+            return self._as_operator(jacobian, unknowns, name), False
+        with self._lock:
+            pattern = self._patterns.get(unknowns.space)
+            if pattern is None:
+                pattern = self._find_pattern(equation, x, leaves)
+        coloured = pattern.coloured
+        size = equation.size
         if coloured is None:
-            forward, backward = (self._product(equation, x, leaves, turned) for turned in (False, True))
+            forward = self._product(equation, x, leaves, transposed=False)
+            backward = self._product(equation, x, leaves, transposed=True)
             return from_functions(forward, backward, size, size, name), True
         product = self._product(equation, x, leaves, coloured.by_rows)
-        if not equation.layout.backend.whole_fields:
+        if not unknowns.backend.whole_fields:
             return coloured.operator(product, name), False
-        matrix = coloured.matrix(product)
-        if space is not None and equation.layout.shapes[0] != space.shape:
-            space = None  # a field of another shape that has as many unknowns
-        key = space, matrix.indptr, matrix.indices, matrix.data
-        op = self._operators.find(key)  # that of the step before, where the residual is linear
-        if op is None:
-            cells = space if space is not None and _is_symmetric(matrix, space) else Space(size)
-            op = self._operators.put(key, from_matrix(matrix, cells, cells, name))
-        return op, coloured.by_rows and coloured.pattern.nnz == size**2
+        op = self._explicit_operator(coloured.matrix(product), unknowns, pattern.cells, name)
+        is_full = coloured.pattern.nnz == size**2
+        return op, coloured.by_rows and is_full
 
-    def _as_operator(self, given, layout, name):
-        if isbox(given):
+    def _explicit_operator(self, matrix, unknowns, cells, name):
+        """Return the matrix as an Operator, the last one if it is equal, on the cells of a grid if it is symmetric."""
+        if cells is not None and unknowns.shapes[0] != cells.shape:
+            cells = None  # a field of another shape with as many unknowns
+        key = (cells, matrix.indptr, matrix.indices, matrix.data)
+        op = self._operators.find(key)
+        if op is not None:
+            return op
+        space = Space(unknowns.size)
+        if cells is not None and _is_symmetric(matrix, cells):
+            space = cells
+        return self._operators.put(key, from_matrix(matrix, space, space, name))
+
+    def _as_operator(self, jacobian, unknowns, name):
+        """Return a Jacobian that the user supplied as an Operator on the unknowns."""
+        if isbox(jacobian):
             raise DerivativeError(f"the jacobian of {self.name} uses a traced value that is not an argument")
-        if not isinstance(given, Operator):
-            given = from_matrix(given if sp.issparse(given) or np.ndim(given) else [[given]], name=name)
-        check_shape(f"the jacobian of {self.name}", given, (layout.size,) * 2)
-        given = layout.backend.implementation(jacobian_on_unknowns)(given, layout.space)
-        check_kind(f"the jacobian of {self.name}", given.dtype, "real numbers")
-        return given
+        if not isinstance(jacobian, Operator):
+            is_matrix = sp.issparse(jacobian) or np.ndim(jacobian)
+            jacobian = from_matrix(jacobian if is_matrix else [[jacobian]], name=name)
+        check_shape(f"the jacobian of {self.name}", jacobian, (unknowns.size, unknowns.size))
+        jacobian = unknowns.backend.implementation(jacobian_on_unknowns)(jacobian, unknowns.space)
+        check_kind(f"the jacobian of {self.name}", jacobian.dtype, "real numbers")
+        return jacobian
 
     def _product(self, equation, x, leaves, transposed, purpose="jacobian"):
-        """v -> J v or J^T v, counted."""
-        key = f"{self.name}.{purpose}", "vjp" if transposed else "jvp"
-        act = (equation.transposed if transposed else equation.tangent)(x, leaves)
+        """Return the function that maps v to J v or J^T v, and counts."""
+        counter = (f"{self.name}.{purpose}", "vjp" if transposed else "jvp")
+        if transposed:
+            multiply = equation.transposed(x, leaves)
+        else:
+            multiply = equation.tangent(x, leaves)
 
         def product(v):
-            count(*key)
+            count(*counter)
             with np.errstate(all="ignore"):
-                return act(v)
+                return multiply(v)
 
         return product
 
     # ------------------------------------------------------------ the pattern
 
-    def _coloured(self, equation, x, leaves):
-        """The coloured pattern for this many unknowns (None: only products will do), and the cells that they lie on."""
-        size, pattern = equation.size, self.sparsity
-        if not equation.layout.backend.whole_fields:
-            return self._stencil(equation, _points(equation, x, leaves), leaves)
-        if not self.ways:
-            has_jvp = _can(pushforward, lambda y: equation(y, *leaves), x, np.ones_like(x))
-            has_vjp = _can(lambda: equation.transposed(x, leaves)(np.ones_like(x)))
-            self.ways = [False] * has_jvp + [True] * (has_vjp or not has_jvp)
-        if pattern is not None:
-            self.way = "assembled on the pattern given"
-            check_shape(f"the sparsity of {self.name}", pattern, (size, size))
-        elif self.settings["method"] == "krylov":
-            self.way = "products only, as asked"
-        elif size <= FULL_UP_TO:
-            pattern, self.way = dense_pattern(size, size), "assembled, all entries"
-        else:
-            points, self.way = _points(equation, x, leaves), "assembled on a pattern found by probing"
-            if self._guessed(equation, points, leaves):
-                return self._patterns[equation.layout.space]
-            pattern = self._probed(equation, points, leaves)
-            if pattern is None and self.settings["method"] == "auto" and size > FULL_AT_MOST:
-                self.way = f"products only: {size} unknowns and a Jacobian that is not sparse"
-            elif pattern is None:
-                pattern, self.way = dense_pattern(size, size), "assembled, all entries: it is not sparse"
-        if pattern is not None:
-            return self._colour(pattern, equation, x, leaves)
-        return self._patterns.setdefault(equation.layout.space, (None, None))
+    def _find_pattern(self, equation, x, leaves):
+        """Find and store the pattern for the space of these unknowns."""
+        unknowns = equation.unknowns
+        size = equation.size
+        if not unknowns.backend.whole_fields:
+            return self._find_distributed_stencil(equation, _probing_points(equation, x, leaves), leaves)
+        if not self._orientations:
+            self._orientations = _possible_orientations(equation, x, leaves)
+        if self.sparsity is not None:
+            self.description = "assembled on the pattern given"
+            check_shape(f"the sparsity of {self.name}", self.sparsity, (size, size))
+            return self._store_coloured(self.sparsity, equation, x, leaves)
+        if self.settings["method"] == "krylov":
+            self.description = "products only, as asked"
+            return self._store(unknowns.space, KnownPattern(None, None))
+        if size <= FULL_UP_TO:
+            self.description = "assembled, all entries"
+            return self._store_coloured(dense_pattern(size, size), equation, x, leaves)
+        self.description = "assembled on a pattern found by probing"
+        points = _probing_points(equation, x, leaves)
+        if self._is_stencil(equation, points, leaves):
+            return self._patterns[unknowns.space]
+        pattern = self._probed_pattern(equation, points, leaves)
+        if pattern is None and self.settings["method"] == "auto" and size > FULL_AT_MOST:
+            self.description = f"products only: {size} unknowns and a Jacobian that is not sparse"
+            return self._store(unknowns.space, KnownPattern(None, None))
+        if pattern is None:
+            self.description = "assembled, all entries: it is not sparse"
+            pattern = dense_pattern(size, size)
+        return self._store_coloured(pattern, equation, x, leaves)
 
-    def _colour(self, pattern, equation, x, leaves):
-        cells, shapes = fields_met(equation, x, leaves)
-        coloured = ColouredPattern(pattern, shapes, None if len(self.ways) > 1 else self.ways[0])
-        known = self._patterns[equation.layout.space] = coloured, cells
-        return known
+    def _store_coloured(self, pattern, equation, x, leaves):
+        cells, shapes = find_fields(equation, x, leaves)
+        by_rows = self._orientations[0] if len(self._orientations) == 1 else None
+        coloured = ColouredPattern(pattern, shapes, by_rows)
+        return self._store(equation.unknowns.space, KnownPattern(coloured, cells))
 
-    def _stencil(self, equation, points, leaves, lacking=None):
-        """What the ranks know of the pattern, from some points; of one that is `lacking` entries, with those."""
-        space, backend = equation.layout.space, equation.layout.backend
-        self.way = f"the rows of each rank, {backend}"
+    def _store(self, space, pattern):
+        self._patterns[space] = pattern
+        return pattern
+
+    def _find_distributed_stencil(self, equation, points, leaves, incomplete=None):
+        """Find and store the stencil of distributed unknowns; `incomplete`: a stencil to which entries are added."""
+        unknowns = equation.unknowns
+        self.description = f"the rows of each rank, {unknowns.backend}"
         if self.sparsity is not None:
             raise TypeError(f"{self.name} takes no sparsity for fields on ranks; leave it out")
-        products = self._products(equation, points, leaves, False)
-        known = self._patterns[space] = backend.stencil(self.name, space, products, lacking), None
-        return known
+        products = self._pattern_products(equation, points, leaves, by_rows=False)
+        stencil = unknowns.backend.stencil(self.name, unknowns.space, products, incomplete)
+        return self._store(unknowns.space, KnownPattern(stencil, None))
 
-    def _guessed(self, equation, points, leaves):
-        """Whether J has entries on a stencil only: what its products with colours give acts as it does. It is kept."""
-        by_rows, shapes = self.ways[0], fields_met(equation, points[0], leaves)[1]
-        guess = stencil_pattern(self._products(equation, points, leaves, by_rows), shapes)
+    def _is_stencil(self, equation, points, leaves):
+        """Guess a stencil, store it, and return whether J has no entries elsewhere."""
+        by_rows = self._orientations[0]
+        shapes = find_fields(equation, points[0], leaves)[1]
+        guess = stencil_pattern(self._pattern_products(equation, points, leaves, by_rows), shapes)
         if guess is None:
             return False
-        coloured = self._colour(guess.T.tocsr() if by_rows else guess, equation, points[0], leaves)[0]
-        (product,) = self._products(equation, points[-1:], leaves, coloured.by_rows)
-        return coloured.acts_as(product, AGREES)
+        if by_rows:
+            guess = guess.T.tocsr()
+        coloured = self._store_coloured(guess, equation, points[0], leaves).coloured
+        (product,) = self._pattern_products(equation, points[-1:], leaves, coloured.by_rows)
+        return coloured.acts_as(product, AGREEMENT)
 
-    def _probed(self, equation, points, leaves):
-        """The union of the patterns of J at the points, by columns or by rows; None where it is not sparse."""
-        for by_rows in self.ways:
-            found = find_pattern(self._products(equation, points, leaves, by_rows), *(equation.size,) * 2)
-            if found is not None:
-                return found.T.tocsr() if by_rows else found
+    def _probed_pattern(self, equation, points, leaves):
+        """Return the union of the patterns of J at the points, probed by columns or by rows; None if not sparse."""
+        for by_rows in self._orientations:
+            products = self._pattern_products(equation, points, leaves, by_rows)
+            pattern = find_pattern(products, equation.size, equation.size)
+            if pattern is not None:
+                return pattern.T.tocsr() if by_rows else pattern
         return None
 
-    def _products(self, equation, points, leaves, by_rows):
+    def _pattern_products(self, equation, points, leaves, by_rows):
         return [self._product(equation, point, leaves, by_rows, "pattern") for point in points]
 
-    def _enlarge(self, equation, x, leaves, row):
-        """Add the entries that J has at x. When there are none, its products are not linear."""
-        coloured, found = self._patterns[equation.layout.space][0], self._probed(equation, [x], leaves)
-        total = pattern_like(coloured.pattern + (dense_pattern(x.size, x.size) if found is None else found))
-        if total.nnz == coloured.pattern.nnz:
+    def _enlarge_pattern(self, equation, x, leaves, row):
+        """Add the entries that J has at x; if there are none, its products are not linear."""
+        coloured = self._patterns[equation.unknowns.space].coloured
+        pattern = self._probed_pattern(equation, [x], leaves)
+        if pattern is None:
+            pattern = dense_pattern(x.size, x.size)
+        union = pattern_like(coloured.pattern + pattern)
+        if union.nnz == coloured.pattern.nnz:
             raise DerivativeError(f"the derivative of {self.name} is not linear in its direction in row {row}")
-        self._colour(total, equation, x, leaves)
+        self._store_coloured(union, equation, x, leaves)
 
 
 def _key(equation, x, leaves):
-    """Of one call alone: what a residual uses beside its arguments may have changed at the next."""
+    """Return the key of a point for one call: what a residual uses beside its arguments may change until the next."""
     return (equation, x, *leaves)
 
 
-def _points(equation, x, leaves):
-    """Points to probe at: near x and at two opposite random ones."""
+def _possible_orientations(equation, x, leaves):
+    """Return False if J can be assembled by JVPs, and True if by VJPs; VJPs if neither works."""
+    has_jvp = _can_derive(pushforward, lambda y: equation(y, *leaves), x, np.ones_like(x))
+    has_vjp = _can_derive(lambda: equation.transposed(x, leaves)(np.ones_like(x)))
+    orientations = []
+    if has_jvp:
+        orientations.append(False)
+    if has_vjp or not has_jvp:
+        orientations.append(True)
+    return orientations
+
+
+def _probing_points(equation, x, leaves):
+    """Return points to probe at: near x, and two opposite random ones, so that each side of a switch occurs."""
     rng = np.random.default_rng(0)
+    distribute = equation.unknowns.distribute
     scale = norm(x) / np.sqrt(max(x.size, 1)) or 1.0
-    far = equation.layout.laid(scale * rng.standard_normal(x.size))
-    near = x * (1 + 0.1 * equation.layout.laid(rng.uniform(-1, 1, x.size)))
-    points = near, far, -far  # opposite: each side of a switch is met
+    far = distribute(scale * rng.standard_normal(x.size))
+    near = x * (1 + 0.1 * distribute(rng.uniform(-1, 1, x.size)))
+    points = [near, far, -far]
     return [point for point in points if _is_valid(equation, point, leaves)] or [x]
 
 
 def _is_valid(equation, x, leaves):
-    """A probed point is ours, not the user's: where the residual refuses it, it is left out."""
+    """Whether the residual accepts a point that was not chosen by the user."""
     try:
         with np.errstate(all="ignore"):
-            return bool(np.all(np.isfinite(equation.layout.tried(equation, x, *leaves))))
+            return bool(np.all(np.isfinite(equation.unknowns.attempt(equation, x, *leaves))))
     except (ValueError, ArithmeticError, ConvergenceError):
         return False
 
 
-def _can(derive, *args):
-    """Whether a derivative can be taken: foreign rules may lack one."""
+def _can_derive(derive, *args):
+    """Whether a derivative can be taken: rules of other packages may lack one."""
     try:
         derive(*args)
     except NO_JVP:
@@ -366,25 +510,28 @@ def _can(derive, *args):
     return True
 
 
-def jacobian_on_unknowns(op, space):
-    """Return a Jacobian that was given as an Operator, between flat unknowns."""
+def jacobian_on_unknowns(op: Operator, space: Space) -> Operator:
+    """Return a Jacobian that the user supplied as an Operator, between flat unknowns."""
     if op.backend.whole_fields:
         return op
     return from_matrix(op.matrix, name=op.name)
 
 
-def _rates(matrix, layout):
-    """The rate at which each unknown relaxes, with the sign of its equation; 0 where it is no equation of rates.
+def _rates(matrix, unknowns):
+    """Return the rate at which each unknown relaxes, with the sign of its equation; 0 if the equation is not a rate.
 
-    Half the sum of a row over its own field: 4 nu / h^2 of a Laplacian in 2-D, |v| / h of convection. The sign is that
-    of the diagonal where it leads the row, else that of the diagonal of the whole field. 0 for a pressure in div v = 0.
+    It is half the sum of the magnitudes in a row over its own field: 4 nu / h^2 of a Laplacian in 2-D, |v| / h of
+    convection. The sign is that of the diagonal entry where it dominates the row, else the sign of the sum of the
+    diagonal over the field; 0 for a pressure in div v = 0.
     """
-    field = np.repeat(np.arange(len(layout.shapes)), np.diff(layout.space.offsets))
-    row, diagonal = rows_of(matrix), matrix.diagonal()
-    inside = field[row] == field[matrix.indices]
-    sums = np.bincount(row[inside], np.abs(matrix.data[inside]), diagonal.size)
-    signs = np.sign(np.bincount(field, diagonal))[field] if field.size else diagonal
-    return 0.5 * sums * np.where(2.1 * np.abs(diagonal) >= sums, np.sign(diagonal), signs)
+    field = np.repeat(np.arange(len(unknowns.shapes)), np.diff(unknowns.space.offsets))
+    row = rows_of(matrix)
+    diagonal = matrix.diagonal()
+    is_inside = field[row] == field[matrix.indices]
+    sums = np.bincount(row[is_inside], np.abs(matrix.data[is_inside]), diagonal.size)
+    field_signs = np.sign(np.bincount(field, diagonal))[field] if field.size else diagonal
+    signs = np.where(2.1 * np.abs(diagonal) >= sums, np.sign(diagonal), field_signs)
+    return 0.5 * sums * signs
 
 
 # ---------------------------------------------------------------- the grid of the Jacobian
@@ -392,35 +539,43 @@ def _rates(matrix, layout):
 
 def _is_symmetric(matrix, space):
     """Whether the matrix, its rows times the volumes of their cells, is symmetric: multigrid needs that."""
-    weighed = sp.csr_array(matrix * space.grid.volumes.reshape(-1, 1))
-    gap = np.max(np.abs((weighed - weighed.T).data), initial=0.0)  # SciPy's own refuses a matrix without rows
-    return bool(gap <= SYMMETRIC * np.max(np.abs(weighed.data), initial=0.0))
+    weighted = sp.csr_array(matrix * space.grid.volumes.reshape(-1, 1))
+    difference = np.max(np.abs((weighted - weighted.T).data), initial=0.0)  # SciPy's max refuses a matrix without rows
+    return bool(difference <= SYMMETRY_TOLERANCE * np.max(np.abs(weighted.data), initial=0.0))
 
 
-def fields_met(equation, x, leaves):
-    """Where the unknowns lie: told from the Operators in the residual.
+def find_fields(equation: Any, x: NDArray[Any], leaves: Sequence[Any]) -> tuple[Space | None, list[tuple[int, ...]]]:
+    """Find out on which fields the unknowns lie, from the Operators that the residual calls.
 
     Parameters
     ----------
     equation : Equation
     x : flat array
-    leaves : tuple of arrays
+    leaves : sequence of arrays
 
     Returns
     -------
     cells : Space or None
-        The cells of a grid, if x is one field on them. On one axis LU needs no geometry.
+        The cells of a grid in 2-D or 3-D, if x is one field on them. On one axis LU needs no geometry.
     shapes : list of tuples of int
-        Of the fields, one after the other, a velocity by its components where all are on one grid; of one dimension.
+        Shapes of the fields, one after the other, all of one dimension. A velocity is given by its components if all
+        fields are on one grid.
     """
     with recording() as calls, np.errstate(all="ignore"):
         equation(x, *leaves)
-    actors = [op.domain for actors in calls.actors.values() for op in actors.values() if isinstance(op, Operator)]
-    met, shapes = {space.shape: space for space in actors[::-1] if space.grid is not None}, equation.layout.shapes
-    spaces = [met[shape] for shape in shapes if shape in met]
+    operators = [op for actors in calls.actors.values() for op in actors.values() if isinstance(op, Operator)]
+    space_of_shape = {}
+    for op in reversed(operators):
+        if op.domain.grid is not None:
+            space_of_shape[op.domain.shape] = op.domain
+    shapes = equation.unknowns.shapes
+    spaces = [space_of_shape[shape] for shape in shapes if shape in space_of_shape]
     if len(spaces) == len(shapes) and len({space.grid for space in spaces}) == 1:
-        one = len(spaces) == 1 and spaces[0].kind == "cells" and len(shapes[0]) > 1
-        return spaces[0] if one and spaces[0].backend.whole_fields else None, [
-            part for space in spaces for part in space.parts
-        ]
-    return None, shapes if len(set(map(len, shapes))) == 1 else [(equation.size,)]
+        parts = [part for space in spaces for part in space.parts]
+        is_one_field_of_cells = len(spaces) == 1 and spaces[0].kind == "cells" and len(shapes[0]) > 1
+        if is_one_field_of_cells and spaces[0].backend.whole_fields:
+            return spaces[0], parts
+        return None, parts
+    if len({len(shape) for shape in shapes}) == 1:
+        return None, shapes
+    return None, [(equation.size,)]

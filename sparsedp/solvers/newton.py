@@ -1,34 +1,44 @@
-"""Newton's method with a line search on flat unknowns, judged in a way that no scaling of the residual changes.
+"""Newton's method with a line search on flat unknowns, accepted by a test that does not depend on scaling.
 
-With F and J at the last iterate, b = J x - F is the right-hand side of the linearised system J y = b. As
-for linear systems (see solve.py), x is accepted when
+Notes
+-----
+With F and J at the last iterate, b = J x - F is the right-hand side of the linearised system J y = b. As for linear
+systems (see solve.py), x is accepted when
 
     |F| <= rtol |b|,    or    |F| <= 8 eps (|J| |x| + |b|)    (converged_at_roundoff).
 
-|J| |x| is taken entry by entry: unknowns of different sizes (species of 1 and 1e-10 with rates of 1e7)
-would else be accepted with errors that add up over many steps. Of a tree of fields each is judged by itself, for
-pressures of 1e6 would hide a temperature that is no solution; a step lowers the sum of all in these units.
+|J| |x| is taken entry by entry: otherwise unknowns of different sizes (species of 1 and 1e-10 with rates of 1e7) would
+be accepted with errors that accumulate over many steps. Each field of a tree must pass the test by itself, because
+pressures of 1e6 would hide a temperature that is no solution. A step must decrease the sum of all fields in these
+units.
 
-A Jacobian serves further steps (simplified Newton) while they leave at most a tenth of the residual and the rest
-of the way is short. Such steps gain digits at a fixed rate, where a Newton step doubles them and most often ends
-far below the tolerance; they go on to rtol / 1000, so that roots found either way are as good.
+A Jacobian is reused for further steps (simplified Newton) while each leaves at most a tenth of the residual and few
+steps remain. Such steps gain digits at a fixed rate, whereas a Newton step doubles them and usually ends far below the
+tolerance. They continue to rtol / 1000, so that roots found either way are equally accurate.
 
-Where no step lowers the residual any more, F may be rounding of terms that cancel (the 1 in exp(x) - 1).
-It is taken for that, and x for converged_at_roundoff, when |F| <= 64 eps (|J| |x| + |b| + the largest |F|
-met + |F_p p|) and J is right about F a thousand steps further: then neither J nor a kink is to blame.
+Where no step decreases the residual, F may be rounding of terms that cancel (the 1 in exp(x) - 1). It counts as
+rounding, and x as converged_at_roundoff, when |F| <= 64 eps (|J| |x| + |b| + the largest |F| so far + |F_p p|) and J
+predicts F a thousand steps further: then neither J nor a kink is the reason.
 
 Where Newton steps stall, far from a root, the solve starts again from the guess in **pseudo-time**: implicit Euler
 steps of x' = -F / sign(D), linearised once each, in units of the time in which each unknown relaxes by itself,
 
     (J + D / tau) s = -F,        tau <- tau |F| / |F_next|      (switched evolution relaxation).
 
-It follows a flow from the guess to its steady state, on which the residual
-may rise for a while. An equation without a rate of its own, as div v = 0 for a pressure, has D = 0. From the longest
-steps on it is Newton's method again.
-Source: Kelley and Keyes, SIAM J. Numer. Anal. 35 (1998); Coffey, Kelley and Keyes, SIAM J. Sci. Comput. 25 (2003).
+This follows a flow from the guess to its steady state, on which the residual may rise for a while. An equation without
+a rate of its own, such as div v = 0 for a pressure, has D = 0. Once tau is large, Newton's method continues.
+
+References
+----------
+C. T. Kelley, D. E. Keyes, Convergence analysis of pseudo-transient continuation, SIAM J. Numer. Anal. 35 (1998)
+508-523.
+T. S. Coffey, C. T. Kelley, D. E. Keyes, Pseudotransient continuation and differential-algebraic equations, SIAM J.
+Sci. Comput. 25 (2003) 553-569.
 """
 
-from typing import Any
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 import autograd.numpy as anp
 import numpy as np
@@ -46,98 +56,115 @@ from sparsedp.solvers.direct import DENSE_UP_TO
 from sparsedp.solvers.nullspace import ROUNDING
 from sparsedp.solvers.scaling import length
 
-__all__ = ["Equation", "Layout", "Newton"]
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
 
-KINDS = "biuf"  # of numbers that unknowns and residuals may hold
-HALVINGS = 30
-DECREASE = 1e-4  # share of the decrease a linear residual would show that a step must reach
-SLOW = 0.25  # a residual that falls by less makes a Jacobian suspect
-FAR = 1024.0  # Newton steps: where rounding is no longer seen
-LOOSEST = 1e-2  # relative residual of the linear solve of a first step
-KEPT, MOST_KEPT = 0.1, 8  # a Jacobian is kept while a step leaves less, and for as many steps to the end
-FURTHER = 1e-3  # of the tolerance, for steps with a Jacobian that was kept
-STALLED, STALLS = 0.9, 2  # so many Newton steps on end that leave more of the residual: pseudo-time
-SHORTEST, FIRST, LONGEST = 1e-3, 10.0, 1e4  # pseudo-time steps; of 1, 10, 100 at first, 10 takes the fewest in cavities
-GROWTH = 10.0  # of a pseudo-time step, at most. A rule that grows 1.5 times faster loses the cavity at Re 1000
-RISE = 2.0  # times the residual at the guess: a step to more is not taken, but a quarter of it in time
-NEAR_FROM = 10_000  # unknowns: the LU factors of a smaller Jacobian are no gain for the next one
-TINY = 1e-8  # an iterate that is smaller than the last one by this share may be on its way to 0
+    from numpy.typing import NDArray
+
+    from sparsedp.solvers.solve import Run
+
+__all__ = ["Equation", "Newton", "Unknowns"]
+
+KINDS = "biuf"  # dtype kinds of numbers that unknowns and residuals may hold
+HALVINGS = 30  # of a step in the line search
+SUFFICIENT_DECREASE = 1e-4  # share of the decrease that a linear residual would show
+SLOW = 0.25  # a step that leaves more than this share of the residual makes its Jacobian suspect
+FAR_STEP = 1024.0  # in units of a Newton step: rounding is negligible there
+LOOSEST_FORCING = 1e-2  # relative residual of the linear solve of a first step
+REUSE_RATIO = 0.1  # a Jacobian is reused while a step leaves at most this share of the residual
+MOST_REUSES = 8  # and while at most this number of steps remains
+REUSE_TOLERANCE = 1e-3  # factor on the tolerance for steps with a reused Jacobian
+STALL_RATIO = 0.9  # a step that leaves more than this share of the residual stalls
+STALLS = 2  # consecutive steps that stall before pseudo-time is tried
+# Pseudo-time steps. Of first steps of 1, 10 and 100, 10 takes the fewest steps in driven cavities.
+SHORTEST_TIME, FIRST_TIME, LONGEST_TIME = 1e-3, 10.0, 1e4
+TIME_GROWTH = 10.0  # largest growth of a pseudo-time step; growing 1.5 times faster loses the cavity at Re 1000
+RESIDUAL_RISE = 2.0  # a pseudo-time step to more than this times the residual at the guess is not taken
+TIME_REDUCTION = 0.25  # then the time step is reduced by this factor
+REUSE_LU_FROM = 10_000  # unknowns: LU factors of a smaller Jacobian are no gain as a preconditioner of the next one
+TINY = 1e-8  # an iterate that shrinks to less than this share of the last one may be converging to 0
 
 
 # ---- the residual as a function of flat unknowns ---------------------------------------------------------------------
 
 
-class Layout:
-    """How the unknowns, an array or a tree of arrays, lie in one flat float64 array, or field on ranks.
+class Unknowns:
+    """How the unknowns, an array or a tree of arrays, are stored in one flat float64 array or distributed field.
 
     Parameters
     ----------
     guess : number, array, or tree of arrays
-        Its shapes and dtypes count, and where it is traced, nothing else of the trace.
+        Only its structure, shapes and dtypes are used; it may be traced.
     name : str
         For messages.
 
     Attributes
     ----------
-    backend : Backend
-        Where the unknowns are stored.
+    tree : tree
+        The structure of the unknowns, with None for each array.
+    shapes : list of tuples of int
+    dtypes : list of dtype
+        Of the solution.
+    size : int
+        Number of unknowns.
     space : Space
         One component for each array of the tree.
+    backend : Backend
+        Where the unknowns are stored.
     """
 
-    def __init__(self, guess, name):
-        found, rebuild = flatten(guess)
-        found = [plain(leaf) for leaf in found]
-        for leaf in found:
+    def __init__(self, guess: Any, name: str) -> None:
+        arrays, rebuild = flatten(guess)
+        arrays = [plain(leaf) for leaf in arrays]
+        for leaf in arrays:
             _check_unknown(leaf, name)
-        # Rebuilt without values: a kept layout must not hold a trace or a large array.
-        self.tree = rebuild([None] * len(found))
+        # Rebuilt without values: this object is kept, and must hold neither a trace nor a large array.
+        self.tree = rebuild([None] * len(arrays))
         _, self.rebuild = flatten(self.tree)
-        self.shapes = [np.shape(leaf) for leaf in found]
-        kinds = [dtype_of(leaf) for leaf in found]
-        self.dtypes = [kind if kind.kind == "f" else np.dtype(float) for kind in kinds]
-        self.scalar = isinstance(guess, (int, float)) and not isinstance(guess, np.generic)
-        self.backend = backend_of(found)
-        self.space = self.backend.implementation(space_of_unknowns)(name, found)
+        self.shapes = [np.shape(leaf) for leaf in arrays]
+        self.dtypes = [_solution_dtype(leaf) for leaf in arrays]
+        self.is_scalar = isinstance(guess, (int, float)) and not isinstance(guess, np.generic)
+        self.backend = backend_of(arrays)
+        self.space = self.backend.implementation(space_of_unknowns)(name, arrays)
         self.size = self.space.size
 
-    def flat(self, guess):
-        """The numbers of the guess, without a trace, as one fresh float64 array."""
-        found = [plain(leaf) for leaf in leaves(guess)]
-        return self.backend.join(self.space, found).astype(float)
+    def flat(self, guess: Any) -> Any:
+        """Return the numbers of a guess, without its trace, in one fresh float64 array."""
+        arrays = [plain(leaf) for leaf in leaves(guess)]
+        return self.backend.join(self.space, arrays).astype(float)
 
-    def split(self, x):
-        """Flat unknowns, traced or not -> the tree of unknowns."""
+    def split(self, x: Any) -> Any:
+        """Return the tree of unknowns of a flat array, which may be traced."""
         return self.rebuild(self._fields(x))
 
     def _fields(self, x):
         return self.backend.split(self.space, x)
 
-    def norms(self, x):
-        """The norm of each field of plain flat unknowns."""
+    def norms(self, x: Any) -> NDArray[Any]:
+        """Return the 2-norm of each field of plain flat unknowns."""
         return np.array([length(self.backend.flat(field)) for field in self._fields(x)])
 
-    def spread(self, numbers):
-        """A number for each field -> the same for all of its unknowns."""
+    def spread(self, numbers: NDArray[Any]) -> Any:
+        """Return flat unknowns in which each field has the value given for it."""
         return self.backend.join(self.space, numbers)
 
-    def laid(self, x):
-        """A flat array that every rank has -> as the unknowns lie."""
+    def distribute(self, x: NDArray[Any]) -> Any:
+        """Return the flat unknowns of an array that every rank has."""
         return self.backend.field(self.space, x)
 
-    def tried(self, act, *args):
-        """act(*args), where the caller goes on in another way if it fails: then all ranks do."""
-        return self.backend.attempt(act, *args)
+    def attempt(self, function: Callable[..., Any], *args: Any) -> Any:
+        """Call a function whose errors the caller handles, and which all processes must see."""
+        return self.backend.attempt(function, *args)
 
-    def rounded(self, x):
-        """The tree of unknowns in the dtypes of the guess; copies, for the rules go on using x."""
-        if self.scalar and not isbox(x):
+    def rounded(self, x: Any) -> Any:
+        """Return the tree of unknowns in the dtypes of the guess; copies, because derivative rules still use x."""
+        if self.is_scalar and not isbox(x):
             return float(x[0])
-        take = np.array if type(x) is np.ndarray else cast
-        return self.rebuild(map(take, self._fields(x), self.dtypes))
+        convert = np.array if type(x) is np.ndarray else cast
+        return self.rebuild(map(convert, self._fields(x), self.dtypes))
 
 
-def space_of_unknowns(name, fields):
+def space_of_unknowns(name: str, fields: Sequence[Any]) -> Space:
     """Return the space of some arrays one after the other."""
     return Space(None, "unknowns", None, [np.shape(field) for field in fields])
 
@@ -152,63 +179,70 @@ def _check_unknown(leaf, name):
         raise TypeError(f"{name} takes a guess of numbers, got {type(leaf).__name__}")
 
 
+def _solution_dtype(leaf):
+    dtype = dtype_of(leaf)
+    return dtype if dtype.kind == "f" else np.dtype(float)
+
+
 class Equation:
-    """The residual as a function of the flat unknowns and the floating leaves of the parameters.
+    """The residual as a function of the flat unknowns and of the floating leaves of the parameters.
 
     Parameters
     ----------
     residual : callable
         ``residual(x, *params)``.
-    layout : Layout
+    unknowns : Unknowns
     params : tuple of trees
-        What is not floating (int, bool, None, str) is part of the equation.
+        Leaves that are not floating (int, bool, None, str) are part of the equation.
     name : str
 
     Attributes
     ----------
     statics : list
-        The leaves of the parameters, None in place of those that are floating.
-    left : float or None
+        The leaves of the parameters, with None for each floating one.
+    root_residual : float or None
         Norm of the residual at the root, once Newton's method has found it.
     """
 
-    left: Any = None
+    root_residual: float | None = None
 
-    def __init__(self, residual, layout, params, name):
-        self.residual, self.layout, self.name = residual, layout, name
+    def __init__(self, residual: Callable[..., Any], unknowns: Unknowns, params: Sequence[Any], name: str) -> None:
+        self.residual = residual
+        self.unknowns = unknowns
+        self.name = name
         check_leaves(f"parameters of {name}", params, containers=False)
-        found, rebuild = flatten(params)
-        self._places = [place for place, leaf in enumerate(found) if is_variable(leaf)]
-        self.statics = [None if is_variable(leaf) else constant(leaf) for leaf in found]
-        _, self._rebuild = flatten(rebuild(self.statics))  # of what is not traced only: equations are kept
+        param_leaves, rebuild = flatten(params)
+        self._variable_places = [place for place, leaf in enumerate(param_leaves) if is_variable(leaf)]
+        self.statics = [None if is_variable(leaf) else constant(leaf) for leaf in param_leaves]
+        _, self._rebuild = flatten(rebuild(self.statics))  # equations are kept, and must hold no trace
 
     @property
-    def size(self):
+    def size(self) -> int:
         """Number of unknowns."""
-        return self.layout.size
+        return self.unknowns.size
 
-    def variables(self, params):
-        """The floating leaves of parameters of this structure, traced or not."""
-        found = leaves(params)
-        return [found[place] for place in self._places]
+    def variables(self, params: Sequence[Any]) -> list[Any]:
+        """Return the floating leaves of parameters of this structure, traced or not."""
+        param_leaves = leaves(params)
+        return [param_leaves[place] for place in self._variable_places]
 
-    def check_finite(self, values):
-        """Refuse NaN and infinity in plain parameters."""
+    def check_finite(self, values: Sequence[Any]) -> None:
+        """Raise NonFiniteError if a plain parameter holds NaN or infinity."""
         for number, param in enumerate(self.params(values)):
             for leaf in leaves(param):
                 if is_variable(leaf):
                     check_finite(f"parameter {number + 1} of {self.name}", as_field(leaf))
 
-    def params(self, values):
-        """Floating leaves -> the tuple of parameters."""
-        return self._rebuild(placed(self.statics, self._places, values))
+    def params(self, values: Sequence[Any]) -> tuple[Any, ...]:
+        """Return the tuple of parameters with these floating leaves."""
+        return self._rebuild(placed(self.statics, self._variable_places, values))
 
-    def __call__(self, x, *values):
-        """The flat residual; differentiable in x and the leaves."""
-        return self._flat(self.residual(self.layout.split(x), *self.params(values)))
+    def __call__(self, x: Any, *values: Any) -> Any:
+        """Return the flat residual; differentiable in x and in the leaves."""
+        return self._flat(self.residual(self.unknowns.split(x), *self.params(values)))
 
-    def value(self, x, values):
-        """The flat residual of plain values."""
+    def value(self, x: Any, values: Sequence[Any]) -> Any:
+        """Return the flat residual of plain values."""
         with np.errstate(all="ignore"):
             result = self(x, *values)
         if isbox(result):
@@ -218,43 +252,71 @@ class Equation:
             )
         return result
 
-    def _parts(self, result):
-        """The leaves of a residual, those of dicts and named tuples in the order of the unknowns.
+    def _residual_leaves(self, result):
+        """Return the leaves of a residual; those of dicts and named tuples in the order of the unknowns.
 
-        Equations that are no tree like the unknowns, such as one array or a list, are taken as they come.
+        A residual of another structure than the unknowns, such as one array or a list, is taken in its own order.
         """
-        unknowns = self.layout.tree
-        if keys(result) is None or keys(unknowns) is None or isinstance(result, dict) != isinstance(unknowns, dict):
+        tree = self.unknowns.tree
+        if keys(result) is None or keys(tree) is None or isinstance(result, dict) != isinstance(tree, dict):
             return leaves(result)
-        if not isinstance(result, dict) and len(result) != len(unknowns):
+        if not isinstance(result, dict) and len(result) != len(tree):
             return leaves(result)
-        return paired(result, unknowns, "residual", f" of {self.name}", "; return a tree like x")
+        return paired(result, tree, "residual", f" of {self.name}", "; return a tree like x")
 
     def _flat(self, result):
-        parts = self._parts(result)
+        parts = self._residual_leaves(result)
         size = sum(int(np.size(plain(part))) for part in parts)
         if size != self.size:
             raise ShapeError(f"the residual of {self.name} must hold {self.size} numbers, as many as x, got {size}")
         if any(dtype_of(part).kind not in KINDS for part in parts):
             raise TypeError(f"the residual of {self.name} must be real; give real and imaginary part as two fields")
-        if not self.layout.backend.whole_fields:
-            return cast(self.layout.backend.join(self.layout.space, parts), np.float64)
+        backend = self.unknowns.backend
+        if not backend.whole_fields:
+            return cast(backend.join(self.unknowns.space, parts), np.float64)
         lines = [anp.reshape(replicated(part), (-1,)) for part in parts]
-        flat = lines[0] if len(lines) == 1 else anp.concatenate(lines) if lines else np.zeros(0)
+        if not lines:
+            flat = np.zeros(0)
+        elif len(lines) == 1:
+            flat = lines[0]
+        else:
+            flat = anp.concatenate(lines)
         return cast(flat, np.float64)
 
     # ------------------------------------------------------------ products with J = dF/dx
 
-    def tangent(self, x, values):
-        """The function v -> J v."""
-        return lambda v: push(lambda y: self(y, *values), x, [v])[1]
+    def tangent(self, x: Any, values: Sequence[Any]) -> Callable[[Any], Any]:
+        """Return the function that maps v to J v."""
 
-    def transposed(self, x, values):
-        """The function g -> J^T g."""
+        def product(v):
+            return push(lambda y: self(y, *values), x, [v])[1]
+
+        return product
+
+    def transposed(self, x: Any, values: Sequence[Any]) -> Callable[[Any], Any]:
+        """Return the function that maps g to J^T g."""
         return pullback(lambda y: self(y, *values), x)[1]
 
 
 # ---- the method ------------------------------------------------------------------------------------------------------
+
+
+class FieldSizes(NamedTuple):
+    """Norms of each field at an iterate.
+
+    Attributes
+    ----------
+    residual : array
+        |F|.
+    data : array
+        |b|, b = J x - F.
+    terms : array
+        |J| |x| + |b|.
+    """
+
+    residual: NDArray[Any]
+    data: NDArray[Any]
+    terms: NDArray[Any]
 
 
 class Newton:
@@ -263,93 +325,143 @@ class Newton:
     Parameters
     ----------
     equation : Equation
-    leaves : tuple of plain arrays
+    leaves : sequence of plain arrays
     jacobians : Jacobians
     rtol : float
     maxiter : int
     run : Run
-        Its figures are filled in.
-    steps : bool
-        Whether it is one of many solves of steps in time. Then the guess, the state before, is only taken for the
-        root where it is one to rounding: what little changes in each of many short steps adds up. And a Jacobian
-        may serve several Newton steps; of larger systems it always may.
+        The record; its figures are set here.
+    is_time_step : bool
+        Whether this is one of many solves of a time integration. Then the guess, the previous state, is accepted as
+        the root only if it is one up to rounding, because small changes add up over many short steps. And a Jacobian
+        may serve several Newton steps; for larger systems it always may.
     """
 
-    def __init__(self, equation, leaves, jacobians, rtol, maxiter, run, steps=False):
-        self.equation, self.leaves, self.jacobians = equation, leaves, jacobians
-        self.rtol, self.maxiter, self.run = rtol, maxiter, run
-        self.x: np.ndarray
+    def __init__(
+        self,
+        equation: Equation,
+        leaves: Sequence[Any],
+        jacobians: Any,
+        rtol: float,
+        maxiter: int,
+        run: Run,
+        is_time_step: bool = False,
+    ) -> None:
+        self.equation = equation
+        self.leaves = leaves
+        self.jacobians = jacobians
+        self.rtol = rtol
+        self.maxiter = maxiter
+        self.run = run
+        self.is_time_step = is_time_step
+        self.may_reuse_jacobian = is_time_step or equation.size > DENSE_UP_TO
+        self.x: Any = None
         self.F: Any = None
-        self.size = 0.0  # |F|, of several fields each in units of the terms that it is the sum of
-        self.units: Any = 1.0  # of each number of F
-        self.steps, self.keeps = steps, steps or equation.size > DENSE_UP_TO
+        self.units: Any = 1.0  # factors of F: of several fields each is in units of its terms
+        self.size = 0.0  # |F| in these units
         self.J: Any = None
-        self.stale = False  # whether J is that of an earlier iterate
-        self.largest: Any = 0.0  # residual met, of each field
-        self.stalls = 0  # Newton steps on end that left nearly all of the residual
-        self.near: Any = None  # the engine of the last Jacobian, where its LU is worth another try
-        # Whether pseudo-time may be tried: once, and where one process knows all rows of the Jacobian.
-        self.evolves = equation.layout.backend.whole_fields and not steps
+        self.is_stale = False  # whether J belongs to an earlier iterate
+        self.largest_residual: Any = 0.0  # of each field, so far
+        self.stalls = 0  # consecutive Newton steps that left nearly all of the residual
+        self.near: Any = None  # the engine of the last Jacobian, if its LU factors can precondition the next one
+        # Pseudo-time is tried once, and only where one process knows all rows of the Jacobian.
+        self.may_use_pseudo_time = equation.unknowns.backend.whole_fields and not is_time_step
 
-    def solve(self, guess, known=None):
-        """From a guess to a root, the first steps with the Jacobian `known` where there is one.
+    def solve(self, guess: Any, jacobian: Any = None) -> Any:
+        """Find a root.
 
-        Raises ConvergenceError with the best iterate.
+        Parameters
+        ----------
+        guess : flat unknowns
+        jacobian : Linearisation, optional
+            A Jacobian for the first steps. Default: that at the guess.
+
+        Returns
+        -------
+        flat unknowns
+
+        Raises
+        ------
+        ConvergenceError
+            With the best iterate.
         """
-        self.x, self.F = self.start = guess, self._first(guess)
+        self.x = guess
+        self.F = self._residual_at_guess(guess)
+        self.start = (guess, self.F)
         self.size = self._measure(self.F)
-        word, forcing = "" if np.any(self.F) else "converged", LOOSEST
-        if not word:
-            if known is None:
-                self._linearise()
-            else:
-                self.J, self.stale = known, True
-            word = self._accepted(0.0 if self.steps else 1.0)
-        while not word:
-            before = self.size
-            if self.run.iterations == self.maxiter:
-                self._fail("max_iterations")
-            step = self._step(forcing)
-            if self._moved(step):
-                self.run.iterations += 1
-                word, forcing = self._after(self.size / before, forcing)
-            elif self.stale or self.jacobians.suspected(self.J):
-                self._linearise()
-            else:
-                word = self._rounding(step)
-                if not word and not self._evolved():
-                    self._fail("stagnated")
-                word = word or self._accepted()
-        self.run.status = word
+        self.run.status = self._iterate(jacobian)
         return self.x
 
-    def _after(self, ratio, forcing):
-        """The status word after a step that left the share `ratio`, and how closely the next one is solved for."""
-        fresh, self.stale = not self.stale, True
-        word = self._accepted(1.0 if fresh else FURTHER)
-        if word or self._keeps(ratio):
-            return word, LOOSEST
-        if ratio > SLOW and fresh:
-            self.jacobians.suspected(self.J)
-        self.stalls = self.stalls + 1 if ratio > STALLED and fresh else 0
-        if self.stalls >= STALLS and self._evolved():
-            return self._accepted(), LOOSEST
+    def _iterate(self, jacobian):
+        """Step until x is accepted, and return the status word."""
+        if not np.any(self.F):
+            return "converged"
+        if jacobian is None:
+            self._linearise()
+        else:
+            self.J = jacobian
+            self.is_stale = True
+        forcing = LOOSEST_FORCING
+        status = self._acceptance(0.0 if self.is_time_step else 1.0)
+        while not status:
+            previous_size = self.size
+            if self.run.iterations == self.maxiter:
+                self._fail("max_iterations")
+            step = self._newton_step(forcing)
+            if self._line_search(step):
+                self.run.iterations += 1
+                status, forcing = self._after_step(self.size / previous_size)
+            elif self.is_stale or self.jacobians.check_after_slow_step(self.J):
+                self._linearise()
+            else:
+                status = self._status_at_rounding(step)
+                if not status:
+                    if not self._reach_by_pseudo_time():
+                        self._fail("stagnated")
+                    status = self._acceptance()
+        return status
+
+    def _after_step(self, ratio):
+        """Decide what follows a step that left the share `ratio` of the residual.
+
+        Returns
+        -------
+        status : str
+            Empty while x is not accepted.
+        forcing : float
+            Relative residual to which the next step is solved for.
+        """
+        is_newton_step = not self.is_stale
+        self.is_stale = True
+        status = self._acceptance(1.0 if is_newton_step else REUSE_TOLERANCE)
+        if status or self._reuses_jacobian(ratio):
+            return status, LOOSEST_FORCING
+        if ratio > SLOW and is_newton_step:
+            self.jacobians.check_after_slow_step(self.J)
+        if ratio > STALL_RATIO and is_newton_step:
+            self.stalls += 1
+        else:
+            self.stalls = 0
+        if self.stalls >= STALLS and self._reach_by_pseudo_time():
+            return self._acceptance(), LOOSEST_FORCING
         self._linearise()
-        return "", float(np.clip(0.9 * ratio**2, self.rtol, LOOSEST)) if fresh else LOOSEST
+        if not is_newton_step:
+            return "", LOOSEST_FORCING
+        return "", float(np.clip(0.9 * ratio**2, self.rtol, LOOSEST_FORCING))
 
-    def _keeps(self, ratio):
-        """Whether the Jacobian is good enough for the rest of the way."""
-        if not self.keeps or ratio > KEPT or not self.run.residual > 0:
+    def _reuses_jacobian(self, ratio):
+        """Whether the Jacobian is good enough for the remaining steps."""
+        if not self.may_reuse_jacobian or ratio > REUSE_RATIO or not self.run.residual > 0:
             return False
-        left = np.log(FURTHER * self.rtol / self.run.residual) / np.log(ratio)
-        return bool(left <= MOST_KEPT)
+        remaining_steps = np.log(REUSE_TOLERANCE * self.rtol / self.run.residual) / np.log(ratio)
+        return bool(remaining_steps <= MOST_REUSES)
 
-    def _first(self, guess):
+    def _residual_at_guess(self, guess):
         name = self.equation.name
         try:
             check_finite(f"the guess of {name}", guess)
             self.equation.check_finite(self.leaves)
-            F = self.equation.layout.tried(self.equation.value, guess, self.leaves)
+            F = self.equation.unknowns.attempt(self.equation.value, guess, self.leaves)
             check_finite(f"the residual of {name} at the guess", F)
         except NonFiniteError:
             self.run.status = "nonfinite_input"
@@ -358,17 +470,20 @@ class Newton:
 
     # ------------------------------------------------------------ one step
 
-    def _lean(self, solver):
-        """Jacobians to come shall try the LU of this one."""
-        factored = getattr(solver.engine, "inner", solver.engine) is not None  # else substitution solves all of it
-        if factored and solver.system.size >= NEAR_FROM and solver.engine.method == "direct" and not self.steps:
+    def _keep_factors(self, solver):
+        """Let the LU factors of a large Jacobian precondition the solves with the next ones."""
+        if self.is_time_step or solver.system.size < REUSE_LU_FROM or solver.engine.method != "direct":
+            return
+        solved_by_substitution = getattr(solver.engine, "inner", solver.engine) is None
+        if not solved_by_substitution:
             self.near = solver.engine
 
     def _linearise(self):
         try:
-            self.J, self.stale = self.jacobians.fresh(self.equation, self.x, self.leaves, self.near), False
-            self._lean(self.J.solver)
-            self._weigh()
+            self.J = self.jacobians.evaluate(self.equation, self.x, self.leaves, self.near)
+            self.is_stale = False
+            self._keep_factors(self.J.solver)
+            self._set_units()
         except ConvergenceError as error:
             self._fail(
                 "setup_failed",
@@ -376,146 +491,162 @@ class Newton:
                 "that is free (of a pressure p: add pin * p, pin 1 in one cell, to its equation)",
             )
 
-    def _weigh(self):
-        """Units for the residual of several fields: the sizes of the terms of each, at this Jacobian."""
-        if len(self.equation.layout.shapes) > 1:
-            sizes = self._sizes()[2]
-            sizes[sizes == 0] = np.max(sizes) or 1.0  # a field that is 0 and solved: in the units of the others
-            self.units = self.equation.layout.spread(1 / sizes)
+    def _set_units(self):
+        """Measure each of several fields in units of the size of its terms at this Jacobian."""
+        if len(self.equation.unknowns.shapes) > 1:
+            terms = self._field_sizes().terms
+            terms[terms == 0] = np.max(terms) or 1.0  # a field that is 0 and solved: in the units of the others
+            self.units = self.equation.unknowns.spread(1 / terms)
             self.size = self._measure(self.F)
 
     def _measure(self, F):
         return length(F * self.units)
 
-    def _step(self, forcing):
+    def _newton_step(self, forcing):
         try:
             return self.J.step(self.F, forcing)
         except ConvergenceError as error:
             self._fail("setup_failed", f"its Newton step cannot be found: {error}")
 
-    def _moved(self, step):
-        """Go along the step, half of it, a quarter ... until the residual falls. False: it never does."""
+    def _line_search(self, step):
+        """Take the step, or half of it, or a quarter, until the residual falls. Return whether it did."""
         share = 1.0
         for _ in range(HALVINGS):
             x = self.x + share * step
             if np.array_equal(x, self.x):
                 return False
-            F = self._value(x)
+            F = self._residual_at_trial(x)
             size = np.inf if F is None else self._measure(F)
-            if F is not None and size <= (1 - DECREASE * share) * self.size:
-                self.x, self.F, self.size = self._at_zero(x, F, size)
+            if F is not None and size <= (1 - SUFFICIENT_DECREASE * share) * self.size:
+                self.x, self.F, self.size = self._zero_or(x, F, size)
                 return True
             share /= 2
         return False
 
-    def _at_zero(self, x, F, size):
-        """Iterates that shrink to 0 have no scale of their own: 0 itself is tried."""
+    def _zero_or(self, x, F, size):
+        """Return 0 in place of an iterate that shrinks to it, if 0 is a root: such iterates have no scale."""
         if size and length(x) <= TINY * length(self.x):
-            at_zero = self._value(np.zeros_like(x))
-            if at_zero is not None and not np.any(at_zero):
-                return np.zeros_like(x), at_zero, 0.0
+            zero = np.zeros_like(x)
+            F_at_zero = self._residual_at_trial(zero)
+            if F_at_zero is not None and not np.any(F_at_zero):
+                return zero, F_at_zero, 0.0
         return x, F, size
 
-    def _value(self, x):
-        """The residual at a trial point, or None where there is none."""
+    def _residual_at_trial(self, x):
+        """Return the residual at a trial point, or None where it is not defined."""
         try:
-            F = self.equation.layout.tried(self.equation.value, x, self.leaves)
+            F = self.equation.unknowns.attempt(self.equation.value, x, self.leaves)
         except (UnstableStepError, NonFiniteError, ConvergenceError):
             return None
         return F if np.all(np.isfinite(F)) else None
 
     # ------------------------------------------------------------ pseudo-time
 
-    def _evolved(self):
-        """Steps in pseudo-time from the guess, once. False: they lead nowhere, and x is left as it was."""
-        if not self.evolves:
+    def _reach_by_pseudo_time(self):
+        """Step in pseudo-time from the guess, once. Return whether that led near a root; else x is unchanged."""
+        if not self.may_use_pseudo_time:
             return False
-        before = self.x, self.F, self.size
-        (self.x, self.F), self.evolves, pace = self.start, False, FIRST
+        self.may_use_pseudo_time = False
         note(self.equation.name, "method", "pseudo-time, as Newton steps stalled")
-        self.size = first = self._measure(self.F)
-        while SHORTEST <= pace <= LONGEST and self.run.iterations < self.maxiter:
+        stalled = (self.x, self.F, self.size)
+        self.x, self.F = self.start
+        self.size = self._measure(self.F)
+        largest_size = RESIDUAL_RISE * self.size
+        time_step = FIRST_TIME
+        while SHORTEST_TIME <= time_step <= LONGEST_TIME and self.run.iterations < self.maxiter:
             self.run.iterations += 1
-            pace *= self._flow(pace, RISE * first)
-        if pace > LONGEST:
+            time_step *= self._pseudo_time_step(time_step, largest_size)
+        if time_step > LONGEST_TIME:
             self._linearise()
             return True
-        self.x, self.F, self.size = before
+        self.x, self.F, self.size = stalled
         return False
 
-    def _flow(self, pace, most):
-        """One step in pseudo-time -> by how much the next one should be longer; 0: there can be none."""
+    def _pseudo_time_step(self, time_step, largest_size):
+        """Take one step in pseudo-time, and return the factor to the next time step; 0 if no step is possible."""
         try:
-            solver = self.jacobians.relaxed(self.equation, self.x, self.leaves, pace, self.near)
+            solver = self.jacobians.relaxed_solver(self.equation, self.x, self.leaves, time_step, self.near)
             if solver is None:
                 return 0.0
-            self._lean(solver)
-            x = self.x + solver.approximate(-self.F, LOOSEST)
+            self._keep_factors(solver)
+            x = self.x + solver.approximate(-self.F, LOOSEST_FORCING)
         except ConvergenceError:
-            return 0.25
-        F = self._value(x)
-        if F is None or not self._measure(F) <= most:
-            return 0.25
-        self.x, self.F, before, self.size = x, F, self.size, self._measure(F)
-        return GROWTH if before >= GROWTH * self.size else max(before / self.size, 0.5)
+            return TIME_REDUCTION
+        F = self._residual_at_trial(x)
+        if F is None:
+            return TIME_REDUCTION
+        size = self._measure(F)
+        if not size <= largest_size:
+            return TIME_REDUCTION
+        previous_size = self.size
+        self.x = x
+        self.F = F
+        self.size = size
+        if previous_size >= TIME_GROWTH * size:
+            return TIME_GROWTH
+        return max(previous_size / size, 0.5)
 
-    # ------------------------------------------------------------ the verdict
+    # ------------------------------------------------------------ acceptance
 
-    def _accepted(self, share=1.0):
-        """The status word, or "" while x is not accepted; `share` of the tolerance."""
+    def _acceptance(self, share=1.0):
+        """Return the status word if x meets this share of the tolerance or is exact up to rounding, else ""."""
         if not self.size:
-            self.run.residual = self.run.backward_error = 0.0
+            self.run.residual = 0.0
+            self.run.backward_error = 0.0
             return "converged"
-        residual, data, size = self._sizes()
-        whole = length(data)
-        self.run.residual = length(residual) / whole if whole else 1.0
-        self.run.backward_error = length(residual) / length(size)
-        self.largest = np.maximum(self.largest, residual)
-        if not np.all(np.isfinite(size)):
+        residual, data, terms = self._field_sizes()
+        data_norm = length(data)
+        self.run.residual = length(residual) / data_norm if data_norm else 1.0
+        self.run.backward_error = length(residual) / length(terms)
+        self.largest_residual = np.maximum(self.largest_residual, residual)
+        if not np.all(np.isfinite(terms)):
             return ""
-        enough = residual <= share * self.rtol * data
-        if enough.all():
+        is_converged = residual <= share * self.rtol * data
+        if is_converged.all():
             return "converged"
-        return "converged_at_roundoff" if np.all(enough | (residual <= ROUNDING * size)) else ""
+        is_exact = residual <= ROUNDING * terms
+        return "converged_at_roundoff" if np.all(is_converged | is_exact) else ""
 
-    def _sizes(self):
-        """|F|, |b| and |J| |x| + |b| of each field."""
+    def _field_sizes(self):
+        norms = self.equation.unknowns.norms
         with np.errstate(over="ignore", invalid="ignore"):
-            norms, J = self.equation.layout.norms, self.J
-            data = norms(J.product(self.x) - self.F)
-            return norms(self.F), data, norms(J.magnitude(np.abs(self.x))) + data
+            data = norms(self.J.product(self.x) - self.F)
+            terms = norms(self.J.magnitude(np.abs(self.x))) + data
+            return FieldSizes(norms(self.F), data, terms)
 
-    def _rounding(self, step):
-        """The status word when what is left of F is rounding, else ""."""
-        residual, _, size = self._sizes()
-        size = size + self.largest + self.equation.layout.norms(self._terms())
-        far = self._value(self.x + FAR * step)
-        if far is None or not np.all(residual <= 8 * ROUNDING * size):
+    def _status_at_rounding(self, step):
+        """Return the status word if F, which no step decreases, is rounding, else ""."""
+        residual, _, terms = self._field_sizes()
+        terms = terms + self.largest_residual + self.equation.unknowns.norms(self._parameter_terms())
+        far_residual = self._residual_at_trial(self.x + FAR_STEP * step)
+        if far_residual is None or not np.all(residual <= 8 * ROUNDING * terms):
             return ""
-        predicted = (1 - FAR) * self.F
-        if length(far - predicted) > 0.05 * length(predicted):
+        predicted = (1 - FAR_STEP) * self.F
+        if length(far_residual - predicted) > 0.05 * length(predicted):
             return ""
-        self.run.backward_error = length(residual) / length(size)
+        self.run.backward_error = length(residual) / length(terms)
         return "converged_at_roundoff"
 
-    def _terms(self):
-        """F_p p: the sum of the terms of F in its parameters, each as often as its degree."""
+    def _parameter_terms(self):
+        """Return F_p p: the sum of the terms of F in its parameters, each as often as its degree."""
         if not self.leaves:
             return np.zeros_like(self.x)
         return push(lambda leaves: self.equation(self.x, *leaves), list(self.leaves), self.leaves)[1]
 
-    def _fail(self, word, reason=""):
-        run, name = self.run, self.equation.name
-        run.status = word
-        residual = number_beside(run.residual, self.rtol, digits=1, style="e")
-        reached = f"relative residual {residual}, wanted {self.rtol:g} ({word})"
+    def _fail(self, status: str, reason: str = "") -> NoReturn:
+        run = self.run
+        run.status = status
+        has_own_reason = bool(reason)
+        if not has_own_reason:
+            residual = number_beside(run.residual, self.rtol, digits=1, style="e")
+            reason = f"relative residual {residual}, wanted {self.rtol:g} ({status})"
         hint = self.jacobians.hint(self.J) if self.J is not None else ""
-        if word == "stagnated" and self.J.singular:
+        if status == "stagnated" and self.J.singular:
             hint += "; its Jacobian is singular there, start from another guess or fix what is free by a constant"
-        elif not (reason or hint or self.steps):
+        elif not (has_own_reason or hint or self.is_time_step):
             hint = "; start from the solution for nearby parameters, or raise maxiter"
         raise ConvergenceError(
-            f"{name} after {run.iterations} Newton steps: {reason or reached}{hint}",
+            f"{self.equation.name} after {run.iterations} Newton steps: {reason}{hint}",
             info=run.info(),
-            best=self.equation.layout.rounded(self.x),
+            best=self.equation.unknowns.rounded(self.x),
         ) from None

@@ -1,14 +1,19 @@
 """Roots of nonlinear systems, differentiable in their parameters by the implicit function theorem.
 
+Notes
+-----
 x(p) with F(x, p) = 0 has, with J = dF/dx,
 
     J x' = -F_p p',                 so for a cotangent g of x, with J^T y = g,   p_bar = -F_p^T y.
 
-Both linear solves are rules of their own, of b, x and p: see adjoint.py.
+Both linear solves are derivative rules themselves, of b, x and p: see adjoint.py.
 """
+
+from __future__ import annotations
 
 from contextlib import contextmanager
 from threading import get_ident
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,53 +29,66 @@ from sparsedp.errors import DerivativeError
 from sparsedp.solvers.adjoint import solve_rule, vary
 from sparsedp.solvers.choose_method import check_settings
 from sparsedp.solvers.jacobian import Jacobians
-from sparsedp.solvers.newton import Equation, Layout, Newton
+from sparsedp.solvers.newton import Equation, Newton, Unknowns
 from sparsedp.solvers.records import SolveLog
 from sparsedp.solvers.scaling import largest, length
 from sparsedp.solvers.solve import Run
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from sparsedp.solvers.jacobian import Linearisation
+
 __all__ = ["Root", "implicit", "steady"]
 
-CHANGED = 1e-4  # relative change of a root by one more Newton step, from which on the residual must be another one
-CANCELS = 1e-12  # residual in units of its terms that is rounding
-LOOSE = 1e4  # the same in units of the tolerance, which is that of the residual
-MORE = 2.0  # times the residual that a solve left: the residual of the same root, with other rounding
+CHANGED_ROOT = 1e-4  # relative change of a root by one more Newton step that shows that its residual has changed
+CHANGED_ROOT_TOLERANCES = 1e4  # the same in units of the tolerance
+CANCELLATION = 1e-12  # a residual below this share of its terms is rounding
+SAME_RESIDUAL = 2.0  # a residual up to this times the first one is one of the same root, with other rounding
 
 
 def implicit(
-    residual, jacobian=None, method="auto", rtol=1e-10, maxiter=50, sparsity=None, nullspace="raise", **options
-):
-    """Residual -> root(guess, *params): x of residual(x, *params) = 0, differentiable in the parameters.
+    residual: Callable[..., Any],
+    jacobian: Callable[..., Any] | None = None,
+    method: str = "auto",
+    rtol: float = 1e-10,
+    maxiter: int = 50,
+    sparsity: Any = None,
+    nullspace: str = "raise",
+    **options: Any,
+) -> Root:
+    """Return the function root(guess, *params) that solves residual(x, *params) = 0, differentiable in the parameters.
 
     Parameters
     ----------
     residual : callable
-        ``residual(x, *params)``: as many real numbers as x has, written with autograd.numpy, Operators
-        and other rules. It uses only its arguments and constants; the backward pass runs it again, so arrays that are
-        no arguments must stay as they are until then.
+        ``residual(x, *params)`` returns as many real numbers as x has. It is written with autograd.numpy, Operators
+        and other differentiable functions, and uses only its arguments and constants. The backward pass calls it
+        again, so arrays that are not arguments must not change until then.
     jacobian : callable, optional
-        ``jacobian(x, *params)``: the derivative of the residual in x as a sparse matrix, 2-D array or
+        ``jacobian(x, *params)`` returns the derivative of the residual in x as a sparse matrix, 2-D array or
         Operator, rows and columns in the order of the flat x. Default: from derivatives of the residual.
     method : str
-        How Newton steps are solved. "auto": the Jacobian is assembled when it is sparse or small, and
-        `inverse` chooses. "krylov": products with the Jacobian only. Else as in `inverse`.
+        How Newton steps are solved. "auto": the Jacobian is assembled where it is sparse or small, and the method is
+        chosen as by `inverse`. "krylov": by products with the Jacobian only. Others as in `inverse`.
     rtol : float
         Relative tolerance of the nonlinear residual, and of each adjoint solve.
     maxiter : int
-        Most Newton steps, those in pseudo-time too.
+        Largest number of Newton steps and pseudo-time steps together.
     sparsity : sparse matrix or 2-D array, optional
         Where the Jacobian may have entries. Default: found by probing.
     nullspace : "raise" or "project"
-        Where the Jacobian is singular at the root: refuse a derivative, or take the one without a part
+        Where the Jacobian is singular at the root: refuse a derivative, or return the one without a component
         along the null space.
     **options
-        Of the method, as in `inverse`.
+        Options of the method, as in `inverse`.
 
     Returns
     -------
     Root
-        in: guess, a number, an array, or a tree of arrays; params, any trees of arrays. out: x, of the
-        shape and dtype of the guess. The derivative in the guess is 0. `root.info` holds the records.
+        Call it as ``root(guess, *params)``: the guess is a number, an array, or a tree of arrays, the params are any
+        trees of arrays, and the result x has the shapes and dtypes of the guess. The derivative in the guess is 0.
+        `root.info` holds the records.
 
     Raises
     ------
@@ -80,26 +98,33 @@ def implicit(
         If a setting is out of range.
     ConvergenceError
         On use, if Newton's method fails; `error.best` is the best iterate, `error.info` the record. Also
-        if a derivative is asked where the Jacobian is singular.
+        if a derivative is requested where the Jacobian is singular.
     NonFiniteError
         On use, if the guess, a parameter or the residual at the guess holds NaN or infinity.
     ShapeError
         On use, if the residual does not have as many numbers as x.
     DerivativeError
-        On use, if the residual uses a traced value that is not an argument, or if `jacobian` or
-        `sparsity` does not fit the residual at a root whose derivative is asked, or what else it uses has changed.
+        On use, if the residual uses a traced value that is not an argument. When a derivative is requested, also if
+        `jacobian` or `sparsity` does not fit the residual at the root, or if something else that the residual uses
+        has changed since the solve.
 
     Notes
     -----
-    Formula: J x' = -F_p p'; one adjoint solve with J^T serves all parameters. Derivatives of every order.
-    Tolerance: see newton.py; the residual may be scaled by any power of two, and each field of a tree is judged by
-    itself. Where steps stall, pseudo-time steps from the guess (not in `stepper`). A trial point where the
-    residual raises UnstableStepError, NonFiniteError or ConvergenceError, or is not finite, is not taken.
-    Cost: per Jacobian one product per colour (3 for three points in 1-D, 5 in 2-D, 7 in 3-D) and one set-up: one
-    for each Newton step, or for several while they contract (more than 64 unknowns, steps of `stepper`); one for
-    each adjoint solve. Products with J^T share one tape. The first call also searches the pattern. J is set up on
-    the grid of the Operators in the residual where it is symmetric there; up to 64 unknowns by dense LU.
-    Ranks: fields in blocks too (`distribute`), where each number meets few, near ones; no pseudo-time, no `sparsity`.
+    **Derivative.** J x' = -F_p p'. For a cotangent g of x: J^T y = g and p_bar = -F_p^T y, one adjoint solve for all
+    parameters. Derivatives of every order exist.
+
+    **Tolerance.** See newton.py. The residual may be scaled by any power of two, and each field of a tree meets the
+    tolerance by itself. Where Newton steps stall, the solve restarts from the guess with pseudo-time steps (not in
+    `stepper`). A trial point is rejected if the residual there is not finite, or raises UnstableStepError,
+    NonFiniteError or ConvergenceError.
+
+    **Cost.** For each Jacobian one product per colour (3 for three points in 1-D, 5 in 2-D, 7 in 3-D) and one set-up.
+    A Jacobian serves one Newton step, or several while they contract (with more than 64 unknowns, and in `stepper`);
+    each adjoint solve has its own. Products with J^T share one tape. The first call also searches the pattern. J is
+    set up on the grid of the Operators in the residual where it is symmetric there; up to 64 unknowns by dense LU.
+
+    **Ranks.** Fields may be distributed (`distribute`) if the residual has local coupling; then without pseudo-time
+    and without `sparsity`.
 
     Examples
     --------
@@ -118,27 +143,28 @@ def implicit(
     return Root(residual, jacobian, sparsity, settings.pop("maxiter"), settings)
 
 
-def steady(residual, guess, *params, **options):
-    """Residual, guess, parameters -> the steady state: x of residual(x, *params) = 0, never by a loop over time.
+def steady(residual: Callable[..., Any], guess: Any, *params: Any, **options: Any) -> Any:
+    """Find a steady state, x with residual(x, *params) = 0, without a loop over time.
 
-    It is ``implicit(residual, **options)(guess, *params)``. Where there are many solves, in a descent say, make the
-    root once: ``root = implicit(residual)`` keeps what it learned of the Jacobian, and its records.
+    This is ``implicit(residual, **options)(guess, *params)``. For many solves, as in a descent, call
+    ``root = implicit(residual)`` once: it keeps the sparsity pattern of the Jacobian, and the records.
 
     Parameters
     ----------
     residual : callable
-        ``residual(x, *params)``: the rate of change of each field, or any equation for it, as a tree like x; entries of
-        dicts are paired by name.
+        ``residual(x, *params)`` returns the rate of change of each field, or any equation for it, as a tree like x;
+        entries of dicts are paired by name.
     guess : number, array, or tree of arrays
-        The state at rest, or that for nearby parameters: ``{"v": faces, "p": cells}`` of a flow.
+        The state at rest, or the solution for nearby parameters: ``{"v": faces, "p": cells}`` of a flow.
     *params : trees of arrays
     **options
-        As of `implicit`: method, rtol, maxiter, jacobian, sparsity, nullspace.
+        Of `implicit`: method, rtol, maxiter, jacobian, sparsity, nullspace.
 
     Returns
     -------
     x, like the guess
-        Differentiable in the parameters; the derivative in the guess is 0. Whether it is stable is not asked.
+        Differentiable in the parameters; the derivative in the guess is 0. The state may be unstable: that is not
+        tested.
 
     Raises
     ------
@@ -151,15 +177,23 @@ def steady(residual, guess, *params, **options):
 
     Notes
     -----
-    Newton's method with a line search; where it stalls, pseudo-time steps from the guess (see newton.py), then Newton
-    again. Each field of a tree meets the tolerance by itself. A field that is known up to a constant needs one value
-    in its equation: ``"p": D(v) + pin * p`` with ``pin`` 1 in one cell and 0 elsewhere, which leaves D(v) = 0 in all
-    cells. Faces in walls need an equation: ``inside(rate) + v - inside(v)``. Differences of states from a near guess
-    (`check.gradient`) see the tolerance: write rtol=1e-13.
-    Cost: sparse LU of the Jacobian; from 10 000 unknowns on one for several steps: GMRES with the LU of a step before
-    does for the next. For a gradient one LU more, kept for each further one.
-    Ranks: fields in blocks too (`distribute`), within the limits of `implicit`: no pseudo-time, no `sparsity`.
-    Source: Kelley and Keyes, SIAM J. Numer. Anal. 35 (1998).
+    Newton's method with a line search; where it stalls, pseudo-time steps from the guess (see newton.py), then
+    Newton's method again. Each field of a tree meets the tolerance by itself.
+
+    A field that is determined up to a constant needs one value in its equation: ``"p": D(v) + pin * p`` with ``pin``
+    1 in one cell and 0 elsewhere, which keeps D(v) = 0 in all cells. Faces in walls need an equation:
+    ``inside(rate) + v - inside(v)``. Differences of states from a near guess (`check.gradient`) resolve the
+    tolerance: write rtol=1e-13.
+
+    **Cost.** Sparse LU of the Jacobian. From 10 000 unknowns on, one LU serves several steps, as the preconditioner
+    of GMRES for the next Jacobians. A gradient takes one more LU, which is kept for further gradients.
+
+    **Ranks.** As for `implicit`: no pseudo-time, no `sparsity`.
+
+    References
+    ----------
+    C. T. Kelley, D. E. Keyes, Convergence analysis of pseudo-transient continuation, SIAM J. Numer. Anal. 35 (1998)
+    508-523.
 
     Examples
     --------
@@ -176,7 +210,14 @@ def steady(residual, guess, *params, **options):
 
 
 class Root(Remade):
-    """root(guess, *params), made by `implicit`.
+    """The differentiable function root(guess, *params) that `implicit` returns.
+
+    Parameters
+    ----------
+    residual, jacobian, sparsity, maxiter
+        As in `implicit`.
+    settings : dict
+        Checked settings of the linear solves.
 
     Attributes
     ----------
@@ -184,22 +225,33 @@ class Root(Remade):
         `.forward`: the last Newton solve (iterations: Newton steps); `.adjoint`: the last adjoint solve.
     """
 
-    def __init__(self, residual, jacobian, sparsity, maxiter, settings):
-        self.residual, self.rtol, self.maxiter = residual, settings["rtol"], maxiter
+    def __init__(
+        self,
+        residual: Callable[..., Any],
+        jacobian: Callable[..., Any] | None,
+        sparsity: Any,
+        maxiter: int,
+        settings: dict[str, Any],
+    ) -> None:
+        self.residual = residual
+        self.rtol: float = settings["rtol"]
+        self.maxiter = maxiter
         self.name = f"implicit({getattr(residual, '__name__', type(residual).__name__)})"
-        self.info, self._settings = SolveLog(), settings
-        self._series: dict = {}  # by thread, inside `series`: size -> Jacobian of the last solve
+        self.info = SolveLog()
+        self._settings = settings
+        # For each thread inside `series`: number of unknowns -> Jacobian of the last solve.
+        self._series: dict[int, dict[int, Linearisation]] = {}
         self._jacobians = Jacobians(self.name, jacobian, sparsity, dict(settings, maxiter=None))
-        self._solution = Rule(self.name, self._newton, self._vjp, self._jvp)
+        self._solution = Rule(self.name, self._forward, self._vjp, self._jvp)
 
-    def recipe(self):
-        """The call that makes it again: see _utils/reconstruction.py."""
-        given, sparsity = self._jacobians.given, self._jacobians.sparsity
-        return Root, (self.residual, given, sparsity, self.maxiter, self._settings)
+    def recipe(self) -> tuple[type[Root], tuple[Any, ...]]:
+        """Return the call that reconstructs this object: see _utils/reconstruction.py."""
+        jacobians = self._jacobians
+        return Root, (self.residual, jacobians.user_jacobian, jacobians.sparsity, self.maxiter, self._settings)
 
     @contextmanager
-    def series(self):
-        """Solves inside have nearly the same Jacobian: each starts with that of the one before."""
+    def series(self) -> Iterator[None]:
+        """Let each solve inside start with the Jacobian of the previous one: the context of a time integration."""
         self._series[get_ident()] = {}
         try:
             yield
@@ -207,7 +259,7 @@ class Root(Remade):
             del self._series[get_ident()]
 
     @public("dp.implicit(residual)")
-    def __call__(self, guess, *params):
+    def __call__(self, guess: Any, *params: Any) -> Any:
         """Solve residual(x, *params) = 0 from a guess.
 
         Parameters
@@ -220,51 +272,61 @@ class Root(Remade):
         x, like the guess
         """
         check_takes(self.name, self.residual, 1 + len(params), "lambda x, p: ..., and root(guess, p)")
-        layout = Layout(guess, self.name)
-        params = mapped(replicated, params) if layout.backend.whole_fields else params
-        equation = Equation(self.residual, layout, params, self.name)
-        given = layout.flat(guess), *equation.variables(params)
-        return layout.rounded(collectively(self.name, (guess, *params), self._solution, equation, *given))
+        unknowns = Unknowns(guess, self.name)
+        if unknowns.backend.whole_fields:
+            params = mapped(replicated, params)
+        equation = Equation(self.residual, unknowns, params, self.name)
+        arguments = (equation, unknowns.flat(guess), *equation.variables(params))
+        return unknowns.rounded(collectively(self.name, (guess, *params), self._solution, *arguments))
 
     # ------------------------------------------------------------ the root as a rule of the parameters
 
-    def _newton(self, equation, guess, *leaves):
-        solved = thread.solve_hooks[-1].root if thread.solve_hooks else Root.solved
-        x = solved(self, equation, guess, leaves)
-        note(self.name, "method", f"Newton's method, Jacobian {self._jacobians.way or 'not needed'}")
+    def _forward(self, equation, guess, *leaves):
+        if thread.solve_hooks:
+            x = thread.solve_hooks[-1].root(self, equation, guess, leaves)
+        else:
+            x = self.newton_solve(equation, guess, leaves)
+        note(self.name, "method", f"Newton's method, Jacobian {self._jacobians.description or 'not needed'}")
         return x
 
-    def corrected(self, equation, x, leaves, share, kept=0.0):
-        """One more Newton step from x, to the residual `kept`; its linear solve to the relative residual `share`."""
-        F = equation.value(x, leaves) - kept
-        return x + self._jacobians.fresh(equation, x, leaves).step(F, share) if np.any(F) else x
+    def newton_correction(
+        self, equation: Equation, x: Any, leaves: Sequence[Any], forcing: float, residual: Any = 0.0
+    ) -> Any:
+        """Take one Newton step from x towards F(x) = residual, solved for to the relative residual `forcing`."""
+        F = equation.value(x, leaves) - residual
+        if not np.any(F):
+            return x
+        return x + self._jacobians.evaluate(equation, x, leaves).step(F, forcing)
 
-    def solved(self, equation, guess, leaves):
-        """Newton's method on flat arrays, recorded in the log."""
-        run, series = Run(), self._series.get(get_ident())
-        newton = Newton(equation, leaves, self._jacobians, self.rtol, self.maxiter, run, series is not None)
+    def newton_solve(self, equation: Equation, guess: Any, leaves: Sequence[Any]) -> Any:
+        """Solve by Newton's method on flat unknowns, and record the solve."""
+        run = Run()
+        series = self._series.get(get_ident())
+        is_time_step = series is not None
+        newton = Newton(equation, leaves, self._jacobians, self.rtol, self.maxiter, run, is_time_step)
         try:
             return newton.solve(guess, (series or {}).get(equation.size))
         finally:
             if newton.F is not None:
-                equation.left = length(newton.F)
-            if run.status:  # else it is an error of the residual
+                equation.root_residual = length(newton.F)
+            if run.status:  # otherwise the residual raised an error
                 self.info.note(run.info(), False)
             if newton.J is not None:
                 self._note_setup(newton.J)
                 if series is not None:
                     series[equation.size] = newton.J
 
-    def _note_setup(self, known):
-        log = known.solver.log
-        self.info.setup_seconds, self.info.hierarchy = log.setup_seconds, log.hierarchy
+    def _note_setup(self, linearisation):
+        log = linearisation.solver.log
+        self.info.setup_seconds = log.setup_seconds
+        self.info.hierarchy = log.hierarchy
 
     def _vjp(self, nums, ans, equation, guess, *leaves):
         places = [num - 2 for num in nums]
         varied, chosen = vary(lambda *values: equation(ans, *values), leaves, places)
 
         def pull(g):
-            y = self._linear(True)(g, equation, ans, *leaves)
+            y = self._linear_solve(True)(g, equation, ans, *leaves)
             F, back = pullback(varied, chosen)
             self._check_root(equation, plain(ans), plain(g), plain(y), plain(F), [plain(leaf) for leaf in leaves])
             return tuple(back(-y))
@@ -272,59 +334,68 @@ class Root(Remade):
         return pull
 
     def _check_root(self, equation, x, g, y, F, leaves):
-        """Refuse a derivative where x is no root any more: the residual uses something that has changed since."""
-        if equation.left is None:  # somebody else gave the root, and answers for it
+        """Refuse a derivative where x is no longer a root, because something that the residual uses has changed.
+
+        To first order the change of the root along g is y.F; one more Newton step then confirms it.
+        """
+        if equation.root_residual is None:  # x was not found by this solver
             return
-        changed = max(CHANGED, LOOSE * self.rtol)
-        if length(F) <= MORE * equation.left:  # as it was left, at a loose tolerance too
+        if length(F) <= SAME_RESIDUAL * equation.root_residual:
             return
-        units = power_of_two(largest(g)), power_of_two(largest(x))  # the products may underflow
-        gap, size = (np.vdot(np.abs(a / units[0]), np.abs(b / units[1])) for a, b in ((y, F), (g, x)))
-        if not gap > changed * size:
+        tolerance = max(CHANGED_ROOT, CHANGED_ROOT_TOLERANCES * self.rtol)
+        g_unit = power_of_two(largest(g))  # otherwise the products may underflow
+        x_unit = power_of_two(largest(x))
+        change = np.vdot(np.abs(y / g_unit), np.abs(F / x_unit))
+        size = np.vdot(np.abs(g / g_unit), np.abs(x / x_unit))
+        if not change > tolerance * size:
             return
-        terms = push(lambda leaves: equation(x, *leaves), leaves, leaves)[1] if leaves else np.zeros(0)
-        if length(F) <= CANCELS * length(terms):  # a root near 0, where what it is made of cancels
+        terms = np.zeros(0)
+        if leaves:
+            terms = push(lambda leaves: equation(x, *leaves), leaves, leaves)[1]
+        if length(F) <= CANCELLATION * length(terms):  # a root near 0, where the terms of the residual cancel
             return
         step = self._solve(False, False, F, equation, x, *leaves)
-        if length(step) > changed * length(x):
+        if length(step) > tolerance * length(x):
             raise DerivativeError(
-                f"{self.name} is not solved any more by what it was: its residual uses something that has changed "
-                "since, such as an array that was written into; make what changes a parameter"
+                f"the root of {self.name} no longer solves its residual: the residual uses something that has changed "
+                "since the solve, such as an array that was written into; make what changes a parameter"
             )
 
     def _jvp(self, nums, tangents, ans, equation, guess, *leaves):
         varied, chosen = vary(lambda *values: equation(ans, *values), leaves, [num - 2 for num in nums])
-        return self._linear(False)(-push(varied, chosen, tangents)[1], equation, ans, *leaves)
+        return self._linear_solve(False)(-push(varied, chosen, tangents)[1], equation, ans, *leaves)
 
     # ------------------------------------------------------------ solves with J and J^T, as rules of x, b and p
 
-    def _linear(self, transposed):
-        """The Rule of (b, equation, x, *leaves): s of J s = b or J^T s = b."""
-        return solve_rule(self.name, self._solve, _back, _product, transposed)
+    def _linear_solve(self, transposed):
+        """Return the Rule of (b, equation, x, *leaves) for s with J s = b or J^T s = b."""
+        return solve_rule(self.name, self._solve, _negative_gradient, _product, transposed)
 
     def _solve(self, transposed, checked, b, equation, x, *leaves):
-        known = self._jacobians.cached(equation, x, leaves)
-        self._note_setup(known)
-        s, info = known.solve(b, transposed)
-        if transposed:
+        linearisation = self._jacobians.cached(equation, x, leaves)
+        self._note_setup(linearisation)
+        s, info = linearisation.solve(b, transposed)
+        if transposed and info is not None:
             self.info.note(info, True)
         return s
 
     # ------------------------------------------------------------ words
 
-    def __repr__(self):
-        return f"<{self.name}: Jacobian {self._jacobians.way or 'not needed yet'}>"
+    def __repr__(self) -> str:
+        return f"<{self.name}: Jacobian {self._jacobians.description or 'not needed yet'}>"
 
-    def __str__(self):
+    def __str__(self) -> str:
         return f"{self!r}\n{self._jacobians}"
 
 
-def _back(point, places, y, s):
-    """-grad <y, J s> = -grad <s, J^T y>: the pullback of (x, p) -> J^T y."""
+def _negative_gradient(point, places, y, s):
+    """Return -grad <y, J s> = -grad <s, J^T y> in the arguments of J at these places."""
     varied, chosen = vary(lambda *point: _product(True, y, *point), point, places)
     return pullback(varied, chosen)[1](-s)
 
 
 def _product(transposed, s, equation, x, *leaves):
-    """J s or J^T s."""
-    return (equation.transposed if transposed else equation.tangent)(x, leaves)(s)
+    """Return J s or J^T s."""
+    if transposed:
+        return equation.transposed(x, leaves)(s)
+    return equation.tangent(x, leaves)(s)

@@ -53,15 +53,15 @@ def test_a_jacobian_that_does_not_contract_is_made_again(monkeypatch):
     u = np.array([1.0, 0.0, 0.0])
     step = dp.stepper("backward_euler", robertson, 50.0)
     count = {"made": 0, "steps": 0}
-    made = Jacobians.fresh
-    monkeypatch.setattr(Jacobians, "fresh", lambda *args: (count.update(made=count["made"] + 1), made(*args))[1])
+    made = Jacobians.evaluate
+    monkeypatch.setattr(Jacobians, "evaluate", lambda *args: (count.update(made=count["made"] + 1), made(*args))[1])
     new = step(u, RATES)
     residual = new - u - 50.0 * robertson(new, RATES)
     assert np.max(np.abs(residual)) <= 1e-8 and 3 < count["made"] <= step.info.forward.iterations + 1
     cubic = dp.stepper("backward_euler", lambda u, p: -p * u**3, 1.0, maxiter=1000)
     cubic(np.ones(3), 2.0)
     careful = cubic.info.forward.iterations
-    monkeypatch.setattr(Newton, "_keeps", lambda self, ratio: True)  # without the check of contraction
+    monkeypatch.setattr(Newton, "_reuses_jacobian", lambda self, ratio: True)  # without the check of contraction
     cubic(np.ones(3), 2.0)
     assert cubic.info.forward.iterations > 2 * careful
 

@@ -16,7 +16,7 @@ from flow_on_ranks import COMM, close, derivatives, lying, on_both, refused
 import sparsedp as dp
 from sparsedp.autodiff.tape import plain
 from sparsedp.solvers.jacobian import Jacobians
-from sparsedp.solvers.newton import Equation, Layout
+from sparsedp.solvers.newton import Equation, Unknowns
 
 PLAIN = dp.Grid((9, 8), size=(1.0, 2.0))
 GRIDS = [
@@ -170,12 +170,12 @@ def bits():
         grid = dp.distribute(one, COMM)
         for make in (diffusion, bratu, species, flux):
             start = guess(make, grid, lying)
-            layout = Layout(start, "f")
+            unknowns = Unknowns(start, "f")
             params = (lying(grid.cells, np.ones(grid.shape)), 0.7)
-            equation = Equation(make(grid), layout, params, "f")
+            equation = Equation(make(grid), unknowns, params, "f")
             settings = dict(method="auto", rtol=1e-10, maxiter=None, nullspace="raise", options={})
-            x = layout.laid(np.sin(np.arange(float(layout.size))))
-            J = Jacobians("f", None, None, settings).fresh(equation, x, equation.variables(params))
+            x = unknowns.distribute(np.sin(np.arange(float(unknowns.size))))
+            J = Jacobians("f", None, None, settings).evaluate(equation, x, equation.variables(params))
             found.update(dp.gather(J.product(x)).tobytes())
     if COMM.rank == 0:
         print(found.hexdigest())

@@ -58,8 +58,8 @@ def test_arrays_of_functions_that_change_before_the_way_back(make):
     else:
         with pytest.raises(
             DerivativeError,
-            match=".* is not solved any more by what it was: its residual uses something that has changed since, such "
-            "as an array that was written into; make what changes a parameter",
+            match="the root of .* no longer solves its residual: the residual uses something that has changed since "
+            "the solve, such as an array that was written into; make what changes a parameter",
         ):
             value_and_grad(loss)(START, True)
 

@@ -12,6 +12,7 @@ from sparsedp._utils.pytree import leaves
 from sparsedp.autodiff.derivative import pullback, pushforward, value_and_grad
 from sparsedp.autodiff.tape import isbox, plain
 from sparsedp.errors import ConvergenceError, DerivativeError
+from sparsedp.solvers import jacobian, sparsity
 from sparsedp.solvers.jacobian import Jacobians, Linearisation
 from sparsedp.solvers.newton import Equation
 from sparsedp.solvers.roots import implicit
@@ -98,6 +99,20 @@ def test_checker_agrees_and_sees_planted_mistakes(monkeypatch):
     right_transposed = Equation.transposed
     monkeypatch.setattr(Equation, "transposed", lambda self, x, values: right_transposed(self, plain(x), values))
     assert abs(curvature() / wanted - 1) > 1e-3
+
+
+def test_a_wrong_guess_of_a_stencil_is_not_used_for_products(monkeypatch):
+    """A random matrix with few entries in the probed columns: neither a stencil nor sparse enough to colour."""
+    monkeypatch.setattr(jacobian, "FULL_AT_MOST", 200)
+    monkeypatch.setattr(sparsity, "ONE_BY_ONE_UP_TO", 200)
+    rng, size = np.random.default_rng(0), 300
+    matrix = sp.random_array((size, size), density=0.1, rng=rng) + 40.0 * sp.eye_array(size)
+    op = dp.from_matrix(matrix)
+    root = implicit(lambda x, p: op(x) + 0.1 * x**3 - p)
+    x = root(np.zeros(size), np.ones(size))
+    assert "products only" in str(root) and "300 products" not in str(root)
+    assert "only products with the operator are known" in str(root)
+    np.testing.assert_allclose(matrix @ x + 0.1 * x**3, 1.0, rtol=1e-9)
 
 
 # ---- how often ---------------------------------------------------------------------------------------------------

@@ -189,7 +189,7 @@ def test_convection_at_32_takes_pseudo_time(monkeypatch):
     scene = Flow(32)
     x = dp.steady(scene.convection, scene.warm, 1e5)
     assert scene.nusselt(x) == pytest.approx(4.519, rel=0.04)  # de Vahl Davis, 1983
-    monkeypatch.setattr(Newton, "_evolved", lambda self: False)
+    monkeypatch.setattr(Newton, "_reach_by_pseudo_time", lambda self: False)
     with pytest.raises(ConvergenceError, match="stagnated"):
         dp.steady(scene.convection, scene.warm, 1e5)
 
@@ -376,7 +376,7 @@ def test_a_jacobian_leans_on_the_factors_of_one_before(monkeypatch, most, own):
     exact = loss(ends)
     monkeypatch.setattr(preconditioners, "direct_engine", lambda system: factored.append(system) or made(system))
     monkeypatch.setattr(preconditioners, "MOST_ITERATIONS", most)
-    monkeypatch.setattr(newton, "NEAR_FROM", 100)
+    monkeypatch.setattr(newton, "REUSE_LU_FROM", 100)
     found = loss(ends)
     again = loss(ends)
     assert found[0] == again[0] and np.array_equal(found[1], again[1]) and bool(factored) == own

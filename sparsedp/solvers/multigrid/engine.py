@@ -215,7 +215,7 @@ class Structured(Engine):
         padded_grid = self.padded_grid
         inverse_root = padded_grid.cells(self.level.inverse_root)
         root = padded_grid.cells(self.level.root_diagonal)
-        # Factors from a right-hand side to that of the matrix with a unit diagonal.
+        # Factors from a right-hand side to the one for the matrix with a unit diagonal.
         self.factors = (inverse_root * volumes, inverse_root)
         # Factors from a residual of that matrix to one of A or A^T, up to 1 / scale: their maximum, and fields over it.
         gauges = (root / volumes, root)
