@@ -1,20 +1,21 @@
-"""Physics that can be differentiated, on grids: operators, solvers, time steps, optimizers, checks of gradients.
+"""Differentiable physics on grids: sparse operators, adjoint solvers, time steps, optimizers, gradient checks.
 
-    import autograd.numpy as np  # NumPy that the library can look through
+    import autograd.numpy as np  # NumPy whose functions are recorded for derivatives
     import sparsedp as dp
 
 ``dir(dp)`` lists the public names, ``help(dp.transport)`` explains one: shapes, units, errors, an example. README.md
-shows how they work together, examples/ what they are for.
+shows how they work together, examples/ applies them to problems.
 
-Every name is imported when it is first used: ``import sparsedp`` loads nothing else.
-A new public name is one word in ``_WINDOW`` and one in ``__init__.pyi``, the copy that type checkers read. A renamed
-one also gets a line in ``_DEPRECATED`` and an alias in ``__init__.pyi``.
+Names are imported when they are first used: ``import sparsedp`` alone loads no other module.
+A new public name needs an entry in ``_PUBLIC_NAMES`` and one in ``__init__.pyi``, which type checkers read. A renamed
+name also needs an entry in ``_DEPRECATED`` and an alias in ``__init__.pyi``.
 """
 
 from importlib import import_module as _import_module
 from types import FunctionType as _FunctionType
+from typing import Any as _Any
 
-_WINDOW = {
+_PUBLIC_NAMES = {
     "grid.grid": "Grid",
     "grid.space": "Space",
     "grid.boundary_conditions": "dirichlet free_slip inflow neumann no_slip outflow robin",
@@ -65,7 +66,7 @@ _DEPRECATED = {  # an old name: the name that replaces it, and the version that 
 }
 _SPARSE = "scipy.sparse.linalg.{0}; SciPy takes an Operator as a LinearOperator on flat arrays"
 _STEP = "dp.stepper('rk4', rate, dt), and dp.rollout(step, start, params, n) for n steps"
-_MEANT = {  # names of the first edition and of other libraries: what to write in their place
+_SUGGESTIONS = {  # names that users of other libraries may try, and what to write instead
     "Adam": "dp.minimize(loss, start, method='adam', rate=0.01)",
     "Field": "a NumPy array of shape grid.shape: fields are plain arrays",
     "LBFGS": "dp.minimize(loss, start)",
@@ -150,23 +151,23 @@ _MEANT = {  # names of the first edition and of other libraries: what to write i
     "write": "dp.save('run.npz', grid, u=u)",
     "zeros": "numpy.zeros(grid.shape): fields are plain arrays",
 }
-_ROOMS = ("check", "errors", "interop", "network", "report")
-_PACKAGES = ("advection", "optimize")  # not public; the error of a call of one says what to write
-_HOME = {name: module for module, names in _WINDOW.items() for name in names.split()}
+_PUBLIC_PACKAGES = ("check", "errors", "interop", "network", "report")
+_CALLED_BY_MISTAKE = ("advection", "optimize")  # internal; the error of a call names the function
+_MODULE_OF = {name: module for module, names in _PUBLIC_NAMES.items() for name in names.split()}
 
-__all__ = sorted([*_HOME, *_ROOMS])
+__all__ = sorted([*_MODULE_OF, *_PUBLIC_PACKAGES])
 
 
-def __getattr__(name):
+def __getattr__(name: str) -> _Any:
     if name in _DEPRECATED:
         new, removal = _DEPRECATED[name]
         _import_module(f"{__name__}._utils.calls").warn_deprecated(f"{__name__}.{name}", f"{__name__}.{new}", removal)
-        return getattr(_import_module(__name__), new)  # not stored: each use warns
-    if name in _HOME:
-        value = getattr(_import_module(f"{__name__}.{_HOME[name]}"), name)
+        return getattr(_import_module(__name__), new)  # not stored, so that each use warns
+    if name in _MODULE_OF:
+        value = getattr(_import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
         if type(value) is _FunctionType:
             value = _import_module(f"{__name__}._utils.calls").public_name(value, __name__, name)
-    elif name in (*_ROOMS, *_PACKAGES):
+    elif name in (*_PUBLIC_PACKAGES, *_CALLED_BY_MISTAKE):
         value = _import_module(f"{__name__}.{name}")
     elif name == "__version__":
         metadata = _import_module("importlib.metadata")
@@ -175,12 +176,14 @@ def __getattr__(name):
         except metadata.PackageNotFoundError:
             value = "0+unknown"  # run from a tree that was never installed
     else:
-        near = _import_module(f"{__name__}._utils.calls").advice_near
-        hint = f"; write {_MEANT[name]}" if name in _MEANT else near(name, __all__)
+        if name in _SUGGESTIONS:
+            hint = f"; write {_SUGGESTIONS[name]}"
+        else:
+            hint = _import_module(f"{__name__}._utils.calls").advice_near(name, __all__)
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
-    globals()[name] = value  # the next look-up does not come here
+    globals()[name] = value  # later look-ups find it there
     return value
 
 
-def __dir__():
+def __dir__() -> list[str]:
     return [*__all__, "__version__"]

@@ -78,13 +78,13 @@ def missing(thing):
     return lacks
 
 
-@pytest.mark.parametrize("name", sorted(sparsedp._HOME))
+@pytest.mark.parametrize("name", sorted(sparsedp._MODULE_OF))
 def test_public_docstring(name):
     lacks = missing(getattr(sparsedp, name))
     assert not lacks, f"dp.{name} lacks: " + "; ".join(lacks)
 
 
-@pytest.mark.parametrize("room", sparsedp._ROOMS)
+@pytest.mark.parametrize("room", sparsedp._PUBLIC_PACKAGES)
 def test_docstrings_of_a_room(room):
     module = getattr(sparsedp, room)
     assert module.__all__, f"dp.{room} needs an __all__"
@@ -93,7 +93,7 @@ def test_docstrings_of_a_room(room):
     assert not any(lacks.values()), {name: what for name, what in lacks.items() if what}
 
 
-@pytest.mark.parametrize("name", sorted(sparsedp._HOME))
+@pytest.mark.parametrize("name", sorted(sparsedp._MODULE_OF))
 def test_public_methods_have_docstrings(name):
     thing = getattr(sparsedp, name)
     if inspect.isclass(thing):

@@ -291,7 +291,7 @@ def test_no_package_shows_a_function_with_the_name_of_its_module():
 
 
 def test_no_public_name_is_a_module():
-    none(f"dp.{name} is also a module" for name in sparsedp._HOME if f"sparsedp.{name}" in names())
+    none(f"dp.{name} is also a module" for name in sparsedp._MODULE_OF if f"sparsedp.{name}" in names())
 
 
 def test_a_new_decorator_does_not_hide_a_compiled_function():
@@ -436,7 +436,7 @@ def test_stub_and_window_agree():
         if isinstance(node, ast.ImportFrom)
         for alias in node.names
     }
-    assert imported == {**sparsedp._HOME, **dict.fromkeys(sparsedp._ROOMS, "")}
+    assert imported == {**sparsedp._MODULE_OF, **dict.fromkeys(sparsedp._PUBLIC_PACKAGES, "")}
     aliases = {
         ast.unparse(node.targets[0]): ast.unparse(node.value) for node in stub.body if isinstance(node, ast.Assign)
     }
@@ -475,7 +475,7 @@ def test_deprecated_names_are_removed_in_time():
     none(f"sparsedp.{old}: remove it" for old in overdue)
 
 
-@pytest.mark.parametrize(("name", "hint"), sparsedp._MEANT.items())
+@pytest.mark.parametrize(("name", "hint"), sparsedp._SUGGESTIONS.items())
 def test_names_from_elsewhere_get_a_hint(name, hint):
     with pytest.raises(AttributeError, match=re.escape(f"module 'sparsedp' has no attribute {name!r}; write {hint}")):
         getattr(sparsedp, name)
@@ -510,5 +510,5 @@ def test_every_builder_is_in_the_catalogue():
         for m in modules()
         if m.package == "sparsedp.operators" and m.place != "operators/operator.py"
         for name in exported(m)
-        if name in sparsedp._HOME and name not in words  # the rest serves the builders
+        if name in sparsedp._MODULE_OF and name not in words  # the rest serves the builders
     )

@@ -186,7 +186,7 @@ def test_message(call, error, message):
     assert str(caught.value) == message
 
 
-FUNCTIONS = sorted(name for name in dp._HOME if hasattr(getattr(dp, name), "__wrapped__"))
+FUNCTIONS = sorted(name for name in dp._MODULE_OF if hasattr(getattr(dp, name), "__wrapped__"))
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
