@@ -165,7 +165,9 @@ class Multigrid(Krylov):
         before, after = sweeps
         self.symmetric = system.symmetric and before == _mirrored(after)
         unit = 2.0 ** -exponent_of(system.norm(False))  # PyAMG prints where entries are far from 1
-        self._scale = unit * system.sign * (system.weights if self.symmetric else 1.0)
+        self._scale: Any = unit * system.sign
+        if self.symmetric:
+            self._scale = self._scale * system.weights
         matrix = csr_array(system.matrix * np.broadcast_to(self._scale, system.size)[:, None])
         hierarchy = ruge_stueben(matrix, strength, levels)
         coarsest = hierarchy[-1].A.shape[0]
@@ -306,7 +308,10 @@ def _without_residues(pyamg_levels: Sequence) -> list[Level]:
     for level in pyamg_levels:
         A = csr_array(level.A)
         sizes = abs(A) @ np.ones(A.shape[0])
-        reference = abs(levels[-1].R) @ reference if levels else sizes
+        if levels:
+            reference = abs(levels[-1].R) @ reference
+        else:
+            reference = sizes
         is_residue = sizes <= RESIDUE * reference
         if is_residue.any():
             A = csr_array(A.multiply(~is_residue[:, None]).multiply(~is_residue))
@@ -322,7 +327,7 @@ def coarse_solver(matrix: csr_array) -> Solve:
     """Return solve(b, transposed) for the matrix of the coarsest level: dense LU without the null modes.
 
     A component whose rows sum to 0 (constants are its null mode) is made regular by adding the mean, scaled to its
-    entries: for data in its range the solution is the one with mean 0, and that of the transposed system likewise.
+    entries: for data in its range the solution has mean 0, and so has the solution of the transposed system.
     Other singular matrices (null vectors that are not constant) get the pseudo-inverse.
     """
     dense = matrix.toarray()

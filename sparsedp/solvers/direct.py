@@ -280,12 +280,16 @@ def _sparse_lu(matrix: csr_array, system: System, single: bool) -> tuple[Solve, 
             blocks = BlockFactors.of(csr_array(matrix))
             if blocks is not None:
                 return blocks.solve, blocks.words
-        options = SYMMETRIC_MODE if symmetric_mode else {}
-        factors = splu(columns, **options)
+        if symmetric_mode:
+            factors = splu(columns, **SYMMETRIC_MODE)
+        else:
+            factors = splu(columns)
     except RuntimeError:  # exactly singular
         return _nan_for(matrix), "sparse LU"
     except MemoryError:
-        advice = "method='krylov', preconditioner='shifted_laplace'" if system.complex else "method='multigrid'"
+        advice = "method='multigrid'"
+        if system.complex:
+            advice = "method='krylov', preconditioner='shifted_laplace'"
         message = f"sparse LU of {system.unscaled} does not fit into memory; write {advice}"
         raise ConvergenceError(message, info=failure("setup_failed")) from None
 

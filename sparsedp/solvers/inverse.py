@@ -261,7 +261,9 @@ class Solution(Structure):
         if x.dtype.kind == "c" and self.dtype.kind != "c":
             return self._product_by_parts(x)
         double = np.result_type(x, float, self.dtype)
-        start = None if self.start is None else self.start.astype(double)
+        start = self.start
+        if start is not None:
+            start = start.astype(double)
         solution = self.solver.solve(x.astype(double, copy=False), self.transposed, self.checked, start)
         dtype = result_dtype(self, x.dtype)
         if dtype == solution.dtype:

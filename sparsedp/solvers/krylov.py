@@ -1,7 +1,7 @@
 """Krylov engines: conjugate gradients for symmetric operators, GMRES for the others, with any preconditioner.
 
-Conjugate gradients use the inner product in which the operator is symmetric: on stretched grids that of the volumes w,
-where W A = A^T W, and for A^T that of 1 / w.
+Conjugate gradients use the inner product in which the operator is symmetric: on stretched grids it is weighted by
+the volumes w, where W A = A^T W, and for A^T by 1 / w.
 
 Both keep the best iterate and return a status word if they fail.
 """
@@ -74,8 +74,9 @@ class Krylov(Engine):
         self.iterations = iterations
         self.refines = iterations is None
         self.maxiter = iterations or system.maxiter or maxiter or int(np.clip(4 * system.size, 100, 20_000))
-        parts = 2 if self.precondition is None else 8
-        self.window = max(50, self.maxiter // parts)  # iterations without progress that are allowed
+        self.window = max(50, self.maxiter // 2)  # iterations without progress that are allowed
+        if self.precondition is not None:
+            self.window = max(50, self.maxiter // 8)
         numbers = max(system.size, 1) * self.dtype.itemsize // 8
         self.restart = int(np.clip(MOST_NUMBERS // numbers, 8, RESTART))
         self.hierarchy = "conjugate gradients"
@@ -85,7 +86,9 @@ class Krylov(Engine):
     def solve(self, b: np.ndarray, goal: float, transposed: bool) -> tuple[np.ndarray, int, str]:
         """Iterate until |b - A x| <= goal."""
         system = self.system
-        goal = 0.9 * goal if self.refines else 0.0  # leaves room for the true residual
+        goal = 0.9 * goal  # leaves room for the true residual
+        if not self.refines:
+            goal = 0.0
         data = norm(b)
         size = system.norm(transposed)
 
@@ -110,9 +113,7 @@ class Krylov(Engine):
 
     def unroll(self, b: Any, goal: float, transposed: bool) -> tuple[Any, int, str]:
         """Iterate as `solve` does; b may be traced, and the iterations are recorded."""
-        op = self.system.unscaled
-        if transposed:
-            op = op.T
+        op = self.system.operator(transposed)
 
         def is_accepted(residual: float, x: np.ndarray) -> bool:
             return residual <= goal and self.refines
@@ -136,7 +137,9 @@ class Krylov(Engine):
         """
         weights = self.system.weights
         is_uniform = np.isscalar(weights)
-        measure = 1.0 / weights if transposed else weights
+        measure = weights
+        if transposed:
+            measure = 1.0 / weights
 
         def inner(x: Any, y: Any) -> Any:
             weighted = x if is_uniform else measure * x
@@ -203,7 +206,10 @@ class Krylov(Engine):
         system = self.system
 
         def precondition(r: np.ndarray) -> np.ndarray:
-            z = r.copy() if self.precondition is None else self.precondition(r, transposed)
+            if self.precondition is None:
+                z = r.copy()
+            else:
+                z = self.precondition(r, transposed)
             return system.null_space.project(z, transposed)
 
         def preconditioned_product(r: np.ndarray) -> np.ndarray:
@@ -247,7 +253,9 @@ def _probed_sign(system: System) -> int:
     if system.diagonal is not None or system.weights is None:
         return 0
     signs = {np.sign(x @ (system.weights * system.product(x))) for x in probes(system.size)}
-    return int(signs.pop()) if len(signs) == 1 else 0
+    if len(signs) != 1:
+        return 0
+    return int(signs.pop())
 
 
 def _reason_without_descent(inner: Callable, pq: float, rz: float, p: Any, q: Any, r: Any, z: Any) -> str:

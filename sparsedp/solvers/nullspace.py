@@ -19,6 +19,8 @@ from sparsedp.operators.structure.base import Turning
 from sparsedp.solvers.scaling import dot, norm
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from scipy.sparse import csr_array
 
 
@@ -28,6 +30,11 @@ ROUNDING = 8 * EPS  # a row whose entries sum to less than this share of their m
 POWER_STEPS = 3
 LARGEST_RESIDUAL = 1e-10  # share of |A| |r| beyond which A r is not 0
 SMALLEST_PRODUCT = 1e-10  # share of |l| |r| below which two null vectors are orthogonal
+
+
+def _unchanged(numbers: Any) -> Any:
+    """Return the argument."""
+    return numbers
 
 
 class NullSpace:
@@ -43,7 +50,10 @@ class NullSpace:
         Number of singular components.
     """
 
-    size_of = staticmethod(norm)
+    # Sums, arrays and norms over all ranks: those of other processes are assigned by a subclass.
+    total: Callable[[Any], Any] = staticmethod(_unchanged)
+    whole: Callable[[Any], Any] = staticmethod(_unchanged)
+    size_of: Callable[[Any], float] = staticmethod(norm)
 
     def __init__(self, labels: np.ndarray | None, right: np.ndarray, left: np.ndarray, count: int) -> None:
         self.labels = labels
@@ -60,20 +70,15 @@ class NullSpace:
         """Return the null space of a regular operator."""
         return cls(None, np.zeros(size), np.zeros(size), 0)
 
-    def total(self, numbers: Any) -> Any:
-        """Return sums over all ranks."""
-        return numbers
-
-    def whole(self, numbers: np.ndarray) -> np.ndarray:
-        """Return the flat array of the entries on all ranks."""
-        return numbers
-
     def _dots(self, side: Any, values: np.ndarray) -> np.ndarray:
         """Return the sum of side * values over each component; `side` is 0 beside them."""
         if self.count != 1:
             return self._sums(side * values)
         with np.errstate(over="ignore", invalid="ignore"):  # the caller tests for NaN and infinity
-            product = dot(side, values) if np.ndim(side) else side * values.sum()
+            if np.ndim(side):
+                product = dot(side, values)
+            else:
+                product = side * values.sum()
             return self.total(np.array([product]))
 
     def _sums(self, values: np.ndarray) -> np.ndarray:
@@ -144,11 +149,13 @@ class NullSpace:
         return np.flatnonzero(self.whole(self.labels) == number)
 
     def anchors(self) -> np.ndarray:
-        """Return one unknown of each component, that of the largest |l r|, which can be pinned."""
+        """Return one unknown of each component that can be pinned: the one with the largest |l r|."""
         if not self.count:
             return np.array([], dtype=int)
         weight = np.abs(self.right * self.left)
-        labels = np.zeros(weight.size, dtype=int) if self.labels is None else self.labels
+        labels = self.labels
+        if labels is None:
+            labels = np.zeros(weight.size, dtype=int)
         order = np.lexsort((-weight, labels))
         _, firsts = np.unique(labels[order], return_index=True)
         anchors = order[firsts]

@@ -95,7 +95,7 @@ class SolveLog:
         """Return a table of both solves for notebooks."""
         records = {"forward": self.forward, "adjoint": self.adjoint}
         rows = [{"": name, **asdict(info)} for name, info in records.items() if info]
-        head = rows[0] if rows else ()
+        head = list(rows[0]) if rows else []
         title = f"set-up {self.setup_seconds:.2g} s"
         if self.hierarchy:
             title = f"{title}: {self.hierarchy}"

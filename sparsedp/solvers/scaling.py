@@ -59,7 +59,7 @@ def norm(x: Any) -> float:
 
 
 def length(x: Any) -> float:
-    """Return the 2-norm of a flat real array of any magnitude; of a field on ranks, that of the whole field."""
+    """Return the 2-norm of a flat real array of any magnitude; a field on ranks counts as a whole."""
     size = norm(x)
     if in_range(size):
         return size
@@ -94,7 +94,9 @@ def in_range(size: float) -> bool:
 
 def largest(x: np.ndarray) -> float:
     """Return the largest magnitude of a real or imaginary part; NaN if there is one."""
-    values = _real_and_imaginary(x) if x.dtype.kind == "c" else x
+    values = x
+    if x.dtype.kind == "c":
+        values = _real_and_imaginary(x)
     top = float(values.max(initial=0.0))
     if np.isnan(top):
         return top
@@ -107,8 +109,9 @@ def shifted(x: np.ndarray, exponent: Any) -> np.ndarray:
     `exponent` is one integer, or one for each entry.
     """
     if x.dtype.kind == "c":
-        exponents = np.repeat(exponent, 2, axis=-1) if np.ndim(exponent) else exponent
-        return shifted(_real_and_imaginary(x), exponents).view(complex).reshape(x.shape)
+        if np.ndim(exponent):
+            exponent = np.repeat(exponent, 2, axis=-1)
+        return shifted(_real_and_imaginary(x), exponent).view(complex).reshape(x.shape)
     with np.errstate(over="ignore", under="ignore"):  # the caller tests for overflow
         if np.max(np.abs(exponent)) < LARGEST_POWER:
             return x * 2.0**exponent

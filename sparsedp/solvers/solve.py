@@ -245,7 +245,7 @@ class Solver(Remade):
             return np.zeros_like(b)
 
         # A tolerance relative to all data would leave no digits to a region with small data. They are scaled up; the
-        # norm of the data stays that of the data as given.
+        # tolerance stays relative to the norm of the unscaled data.
         lift = None
         if self.engine.iterative:
             lift = system.lift(b, data)
@@ -373,7 +373,7 @@ class Solver(Remade):
         """
         system = self.system
         run = Run(transposed, rtol=system.rtol)
-        op = system.unscaled.T if transposed else system.unscaled
+        op = system.operator(transposed)
         r = b * 1.0
         if start is not None:
             r = b - op(start)
@@ -403,7 +403,7 @@ class Solver(Remade):
         largest = system.largest(b)
         if not np.isfinite(largest):
             run.status = "nonfinite_input"
-            space = system.op.domain if run.transposed else system.op.codomain
+            space = system.operator(run.transposed).codomain
             check_finite(self.name, system.shaped(b, space), "takes finite numbers")
         if largest == 0:
             run.status = "exact_zero_rhs"
@@ -470,7 +470,7 @@ class Solver(Remade):
 
     def _not_converged(self, run: Run, x: np.ndarray, how: str = "", why: str = "") -> ConvergenceError:
         """Return the error of a solve whose solution x does not meet the tolerance."""
-        op = self.system.unscaled.T if run.transposed else self.system.unscaled
+        op = self.system.operator(run.transposed)
         reached = number_beside(run.residual, run.rtol, digits=1, style="e")
         return ConvergenceError(
             f"{how}{self.engine.method} on {op}: relative residual {reached} after {run.iterations} "

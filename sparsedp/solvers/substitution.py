@@ -276,7 +276,9 @@ class BlockFactors:
             for low, high, is_large in zip(edges[:-1].tolist(), edges[1:].tolist(), large.tolist(), strict=True)
         ]
         entries = sum(stage.factors.nnz for stage in self.stages)
-        blocks = f" of {len(self.stages)} blocks" if len(self.stages) > 1 else ""
+        blocks = ""
+        if len(self.stages) > 1:
+            blocks = f" of {len(self.stages)} blocks"
         self.words = f"sparse LU{blocks} in block triangular order, {entries} entries in the factors"
 
     def _stage(self, matrix: sp.csr_array, position: np.ndarray, low: int, high: int, is_large: bool) -> Stage:

@@ -103,6 +103,12 @@ class System:
         """Return the Structure of an operator on the entries that this process holds."""
         return op.structure
 
+    def operator(self, transposed: bool) -> Operator:
+        """Return the unscaled operator, or its transpose."""
+        if transposed:
+            return self.unscaled.T
+        return self.unscaled
+
     def applied(self, x: np.ndarray) -> np.ndarray:
         """Return A x for the unscaled operator, in all rows."""
         return self.unscaled._acting.product(x)
@@ -443,7 +449,9 @@ def _without_zero_factors(structure: Structure, leftmost: bool = True) -> Struct
     """Replace zeros of diagonal factors by ones, except in the leftmost factor, which removes rows, not unknowns."""
     if isinstance(structure, Chain):
         members = [_without_zero_factors(member, False) for member in structure.members]
-        return Chain([structure.members[0], *members[1:]] if leftmost else members)
+        if leftmost:
+            members[0] = structure.members[0]
+        return Chain(members)
     if isinstance(structure, Sum):
         # A diagonal among the summands is no factor: its zeros set nothing to 0.
         members = [m for m in structure.members if isinstance(m, Diagonal)]
