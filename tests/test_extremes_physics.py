@@ -285,7 +285,7 @@ ON = dp.forces(GRID, cells=np.ones((3, 4), bool))
 SPLIT = lambda **options: dp.minimize(lambda x: anp.sum(x**2), U, method="admm", weight=0.1, maxiter=1, **options)
 HEAT = dp.flow_step(GRID, 0.1, scalars={"heat": {"source": lambda s, p: p}})
 REFUSED = [
-    (lambda: ON(V + 1e200, U, 1.0), NONFINITE, "what forces finds must be finite, got "),
+    (lambda: ON(V + 1e200, U, 1.0), NONFINITE, "the result of forces must be finite, got "),
     (lambda: HEAT(HEAT.start(V, 1.0, {"heat": U}), np.inf), NONFINITE, "the rate of 'heat' must be finite, got 12"),
     (lambda: SPLIT(prox=0), TypeError, "admm, as prox, takes a function, got int; write lambda v, t: ..."),
     (lambda: SPLIT(operator=np.eye(3)), TypeError, "admm, as operator, takes a function, got ndarray; write lambda x"),

@@ -97,8 +97,8 @@ BUGS = {
     ),
     "a wall that is felt beside the place where it stands": Bug(
         "flow",
-        "reduce(add, bends) / anp.log1p(anp.exp(s))",
-        "reduce(add, bends) / anp.log1p(anp.exp(s + 1.0))",
+        "reduce(add, terms) / anp.log1p(anp.exp(s))",
+        "reduce(add, terms) / anp.log1p(anp.exp(s + 1.0))",
         "tests/flow/test_forces.py",
     ),
     "a force that forgets the momentum that arrives": Bug(

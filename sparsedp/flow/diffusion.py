@@ -64,7 +64,10 @@ class Diffusion:
         self.name = name
         self.coefficient = coefficient
         self.settings = settings
-        self.op = build_operator() if coefficient else None
+        if coefficient:
+            self.op = build_operator()
+        else:
+            self.op = None
         self.solve = None
         self.damping = 0.0
         if self.op is None:

@@ -1,28 +1,32 @@
 """conservation_law: du/dt = -div F(u) + S(u) for any number of fields, by finite volumes with limited slopes.
 
-Along an axis with the widths h of its cells, and for each of the fields,
+Along an axis with cells of widths h, for each field,
 
     du_i/dt = (F_i - F_(i+1)) / h_i + S_i.
 
-At face i the two cells around it offer two values: u_lower = u_(i-1) + ahead and u_upper = u_i - behind, with the
-limited slopes of a scheme of `dp.transport`. The flux between them is that of Harten, Lax and van Leer: with the
-slowest and the fastest wave, a = min(0, slow), b = max(0, fast) over both values,
+At face i the two cells around it give two values: u_lower = u_(i-1) + ahead and u_upper = u_i - behind, with the
+limited slopes of a scheme of `dp.transport`. The flux between them is the flux of Harten, Lax and van Leer: with the
+slowest and the fastest wave, a = min(0, slow) and b = max(0, fast) over both values,
 
     F = (b F(u_lower) - a F(u_upper) + a b (u_upper - u_lower)) / (b - a).
 
-With one speed s for both directions, a = -s and b = s, this is Rusanov's flux.
+With one speed s for both directions, a = -s and b = s, it is Rusanov's flux.
 
-Two ghost cells stand beyond each end of an axis: they go round where it is periodic, repeat the last cell (outflow),
-mirror the cells with the momentum across the wall turned round (free_slip), or hold what is given (inflow).
+There are two ghost cells beyond each end of an axis. They wrap on a periodic axis, repeat the last cell (outflow),
+mirror the cells with the opposite momentum across the wall (free_slip), or have the given values (inflow).
 
 Steady states: with an equilibrium e the slopes are those of u - e, and the rate that the same formulas give for e is
-subtracted. So e stays as it is, to the last bit: a lake at rest over any ground, a gas at rest in its weight. Beyond a
-side of inflow e goes on with its last cell. An inflow that differs from that acts on the field; one that equals it, as
-that of a moving steady state, keeps e.
+subtracted. Then e is preserved to the last bit: a lake at rest over any ground, a gas at rest under gravity. Beyond a
+side of inflow e continues with its last cell. An inflow that differs from it acts on the field; an inflow that equals
+it, such as that of a moving steady state, preserves e.
 
-Everything but the limiter is arithmetic on the tape: its derivatives of every order are those of autograd, and those of
-the user's flux, speed and source. The limiter is one rule, with the derivatives that stand beside its formula.
+Everything except the limiter is arithmetic on the tape: its derivatives of every order are those of autograd and of the
+user's flux, speed and source. The limiter is one rule with first derivatives.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 import autograd.numpy as anp
 import numpy as np
@@ -49,74 +53,92 @@ from sparsedp.grid.boundary_conditions import inflow as inflow_side
 from sparsedp.grid.grid import AXES, check_grid
 from sparsedp.kernels.fluxes import SCHEMES
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from sparsedp.grid.grid import Grid
+    from sparsedp.kernels.fluxes import Scheme
+
 __all__ = ["ConservationLaw", "conservation_law"]
 
 NO_WAVES = "; has the state left where it has waves (a density or a depth below 0)? Take a smaller dt"
 GHOSTS = 2  # cells beyond each end: the slope in the first of them needs the second
-# What a side is -> how np.pad repeats cells there; None: the axis is periodic.
-REPEATED: dict = {None: "wrap", free_slip: "symmetric", outflow: "edge", inflow_side: "edge"}
+# How np.pad repeats cells beyond a side; None: the axis is periodic.
+PAD_MODES: dict[Any, Any] = {None: "wrap", free_slip: "symmetric", outflow: "edge", inflow_side: "edge"}
 
 
 def conservation_law(
-    grid, flux, speed, *, scheme="van_leer", boundary=outflow, momentum=None, inflow=None, source=None, equilibrium=None
-):
-    """Grid, flux F(u), speed of its waves -> the rate of change, ``law(u, params)``: -div F(u) + S(u).
+    grid: Grid,
+    flux: Callable,
+    speed: Callable,
+    *,
+    scheme: str = "van_leer",
+    boundary: Any = outflow,
+    momentum: int | tuple[int, ...] | None = None,
+    inflow: Any = None,
+    source: Callable | None = None,
+    equilibrium: Any = None,
+) -> ConservationLaw:
+    """Return the rate of change ``law(u, params)`` of a conservation law: -div F(u) + S(u).
 
     Parameters
     ----------
     grid : Grid
     flux : callable
-        ``flux(u, params, axis)``: the flux along an axis (0 is x) [unit length / time], of the shape of u. u holds
-        values at faces, first those below all of them, then those above: longer along the axis than the state is.
-        Coefficients that depend on the place are further fields of the state, with a flux of 0.
+        ``flux(u, params, axis)`` returns the flux along an axis (0 is x) [unit length / time], an array of the shape of
+        u. u holds values at faces, first those below all faces, then those above: it is longer along the axis than the
+        state. Write coefficients that depend on the position as further fields of the state with a flux of 0.
     speed : callable
-        ``speed(u, params, axis)``: how fast the fastest wave travels along an axis [length / time], one number for each
-        point, the field's axis left out (Rusanov's flux); or a pair, the slowest and the fastest with their signs
-        (the flux of Harten, Lax and van Leer, which smears less).
+        ``speed(u, params, axis)`` returns the speed of the fastest wave along an axis [length / time], one number for
+        each point, without the axis of the fields (Rusanov's flux); or a pair, the slowest and the fastest wave with
+        their signs (the flux of Harten, Lax and van Leer, which is less diffusive).
     scheme : str
-        How values at faces are made: "van_leer" (limited slopes, second order) or "upwind" (first order), the
-        Eulerian schemes of `dp.transport`.
+        The values at faces: "van_leer" (limited slopes, second order) or "upwind" (first order), the Eulerian schemes
+        of `dp.transport`.
     boundary : condition, or dict of conditions
-        outflow: waves leave. free_slip: a wall, needs `momentum`. inflow: what `inflow` says.
+        outflow: waves leave. free_slip: a wall, needs `momentum`. inflow: the state beyond the side is `inflow`.
     momentum : int or tuple of int, optional
-        Which field is the momentum along each axis: it changes its sign at walls. In 2-D (1, 2) says that u[1] and
+        The field that is the momentum along each axis; it changes its sign at walls. In 2-D, (1, 2) means that u[1] and
         u[2] are the momenta along x and y.
     inflow : number, array, or callable, optional
-        The state beyond sides of inflow, in a shape that fits the state's; or ``inflow(params, axis, side)``, side 0
-        (lower) or 1 (upper).
+        The state beyond sides of inflow, in a shape that broadcasts to the state; or ``inflow(params, axis, side)``,
+        side 0 (lower) or 1 (upper).
     source : callable, optional
-        ``source(u, params)``: S(u) in the cells [unit / time], of the shape of u.
+        ``source(u, params)`` returns S(u) in the cells [unit / time], an array of the shape of u.
     equilibrium : array or callable, optional
-        A state, or ``equilibrium(params)``, that is to stay exactly as it is, at rest or moving. At a side of inflow it
-        stays if its last cell there holds the state that flows in; another inflow disturbs it.
+        A state, or ``equilibrium(params)``, to preserve exactly, at rest or moving. At a side of inflow it is preserved
+        if its last cell there holds the state that flows in; another inflow disturbs it.
 
     Returns
     -------
     ConservationLaw
-        ``law(u, params=None)``: the rate, a `rate` of `stepper`. u of shape (fields, *grid.shape), or grid.shape
-        for one field; differentiable in u and params. ``law.time_step(u, params)``: a stable dt.
+        ``law(u, params=None)`` returns the rate, for `stepper`. u has the shape (fields, *grid.shape), or grid.shape
+        for one field; differentiable in u and params. ``law.time_step(u, params)`` returns a stable dt.
 
     Raises
     ------
     ValueError
-        If scheme, boundary or momentum is none of the above, or something is missing; on use, if a speed is
+        If scheme, boundary or momentum is not one of the above, or `inflow` is missing. On use, if a speed is
         negative, or a function changes its argument in place.
     ShapeError
-        If the state, or what a function returns, has the wrong shape, or the state has no field for a momentum.
+        If the state, or the result of a function, has the wrong shape, or the state has no field for a momentum.
     NonFiniteError
-        If a speed is NaN or infinite, often because a density or a depth has become negative, or the rate is.
+        If a speed is NaN or infinite, often because a density or a depth has become negative, or if the rate is.
     TypeError
-        If a function is none, or it or the state holds no real numbers.
+        If flux, speed or source is not a function, or a function or the state does not hold real numbers.
 
     Notes
     -----
     Order: 2 where the solution is smooth and has no extremum (van_leer), 1 at shocks.
-    Steps: "ssprk3" of `stepper` with a dt of `law.time_step` keeps what one step of Euler keeps; there is no check
-    of dt beyond that of a finite state.
-    Derivatives: limiters, shocks and the largest of two speeds have kinks; `check.gradient` says "inconclusive" there.
+    Time steps: "ssprk3" of `stepper` with a dt of `law.time_step` preserves what one Euler step preserves; dt is not
+    checked otherwise.
+    Derivatives: limiters, shocks and the larger of two speeds have kinks, where `check.gradient` returns
+    "inconclusive".
 
-    Source
-    ------
+    References
+    ----------
     A. Harten, P. D. Lax, B. van Leer, SIAM Review 25 (1983) 35-61.
     B. van Leer, J. Comput. Phys. 32 (1979) 101-136.
     J. P. Berberich, P. Chandrashekar, C. Klingenberg, Computers & Fluids 219 (2021) 104858 (equilibrium).
@@ -141,30 +163,33 @@ def conservation_law(
     """
     check_grid("conservation_law", grid)
     check_choice("scheme of conservation_law", scheme, SCHEMES)
-    for name, function, count in (("flux", flux, 3), ("speed", speed, 3), ("source", source, 2)):
-        if function is not None or name != "source":
-            check_function(f"conservation_law, as {name},", function, _example(name, count), count)
+    check_function("conservation_law, as flux,", flux, "lambda u, params, axis: ...", 3)
+    check_function("conservation_law, as speed,", speed, "lambda u, params, axis: ...", 3)
+    if source is not None:
+        check_function("conservation_law, as source,", source, "lambda u, params: ...", 2)
     sides = resolve(grid, boundary, outflow)
-    conditions = [side for pair in sides for side in pair or ()]
-    for side in conditions:
-        if side not in REPEATED:
-            raise ValueError(f"conservation_law takes outflow, free_slip or inflow, got {side}; write one of them")
+    conditions = [condition for pair in sides for condition in pair or ()]
+    for condition in conditions:
+        if condition not in PAD_MODES:
+            raise ValueError(f"conservation_law takes outflow, free_slip or inflow, got {condition}; write one of them")
     if (inflow_side in conditions) != (inflow is not None):
         raise ValueError(
             "conservation_law got a side of dp.inflow without inflow=, or inflow= without such a side; "
             "give both or none"
         )
-    momentum = _momentum(grid, momentum) if free_slip in conditions else None
-    return ConservationLaw(grid, flux, speed, scheme, sides, momentum, inflow, source, equilibrium)
+    if free_slip in conditions:
+        fields = _momentum_fields(grid, momentum)
+    else:
+        fields = None
+    return ConservationLaw(grid, flux, speed, scheme, sides, fields, inflow, source, equilibrium)
 
 
-def _example(name, count):
-    return f"lambda {', '.join(('u', 'params', 'axis')[:count])}: ..."
-
-
-def _momentum(grid, momentum):
-    """Numbers of the fields that are the momentum along each axis."""
-    fields = momentum if isinstance(momentum, (tuple, list)) else (momentum,)
+def _momentum_fields(grid: Grid, momentum: Any) -> tuple[int, ...]:
+    """Return the numbers of the fields that are the momentum along each axis."""
+    if isinstance(momentum, (tuple, list)):
+        fields = momentum
+    else:
+        fields = (momentum,)
     numbers = {field for field in fields if field is not None and is_whole(field, 0)}
     if not len(fields) == len(numbers) == grid.dim:
         raise ValueError(
@@ -175,107 +200,176 @@ def _momentum(grid, momentum):
 
 
 class ConservationLaw(Remade):
-    """The rate of change of a conservation law, made by `conservation_law`. Call it: ``law(u, params=None)``."""
+    """The rate of change of a conservation law, ``law(u, params=None)``, built by `conservation_law`.
+
+    Parameters
+    ----------
+    grid, flux, speed, scheme, inflow, source, equilibrium
+        As `conservation_law` takes them.
+    sides : tuple
+        The conditions as `resolve` returns them.
+    momentum : tuple of int or None
+        For each axis the field that is the momentum along it.
+
+    Attributes
+    ----------
+    domain : Space
+        The cells.
+    """
 
     name = "conservation_law"
 
-    def __init__(self, grid, flux, speed, scheme, sides, momentum, inflow, source, equilibrium):
-        inflow, equilibrium = constant(inflow), constant(equilibrium)
-        given = grid, flux, speed, scheme, sides, momentum, inflow, source, equilibrium
-        self.made, self.scheme, self.momentum = (ConservationLaw, given), scheme, momentum
-        self.grid, self.domain, self.flux, self.speed = grid, grid.cells, flux, speed
-        self.source, self.equilibrium = source, equilibrium
-        self.axes = [
-            Axis(grid, axis, sides[axis] or (None, None), momentum and momentum[axis], inflow, SCHEMES[scheme])
-            for axis in range(grid.dim if grid.cells.size else 0)
-        ]
+    def __init__(
+        self,
+        grid: Grid,
+        flux: Callable,
+        speed: Callable,
+        scheme: str,
+        sides: tuple,
+        momentum: tuple[int, ...] | None,
+        inflow: Any,
+        source: Callable | None,
+        equilibrium: Any,
+    ) -> None:
+        self.grid = grid
+        self.domain = grid.cells
+        self.flux = flux
+        self.speed = speed
+        self.scheme = scheme
+        self.sides = sides
+        self.momentum = momentum
+        self.inflow = constant(inflow)
+        self.source = source
+        self.equilibrium = constant(equilibrium)
+        self.axes: list[AxisFluxes] = []
+        if not grid.cells.size:
+            return
+        for axis in range(grid.dim):
+            self.axes.append(
+                AxisFluxes(
+                    grid,
+                    axis,
+                    sides[axis] or (None, None),
+                    None if momentum is None else momentum[axis],
+                    self.inflow,
+                    SCHEMES[scheme],
+                )
+            )
+
+    def recipe(self) -> tuple:
+        """Return the call that builds an equal object, for pickling and copying."""
+        return ConservationLaw, (
+            self.grid,
+            self.flux,
+            self.speed,
+            self.scheme,
+            self.sides,
+            self.momentum,
+            self.inflow,
+            self.source,
+            self.equilibrium,
+        )
 
     @public("dp.conservation_law(grid, flux, speed)")
-    def __call__(self, u, params=None):
-        """State -> its rate of change.
+    def __call__(self, u: Any, params: Any = None) -> Any:
+        """Return the rate of change of a state.
 
         Parameters
         ----------
         u : array, shape (fields, *grid.shape) or grid.shape
         params : tree, optional
-            What flux, speed and source get.
+            Passed to flux, speed and source.
 
         Returns
         -------
         array like u
         """
-        u = self._state(u)
-        e = self.equilibrium
-        if e is None:
+        u = self._checked_state(u)
+        if self.equilibrium is None:
             rate = self._rate(u, None, params)
         else:
-            e = _shaped("equilibrium", e(params) if callable(e) else e, u)
-            rate = self._rate(u, e, params) - self._rate(e, e, params, flows=False)
+            equilibrium = self.equilibrium
+            if callable(equilibrium):
+                equilibrium = equilibrium(params)
+            e = _checked_result("equilibrium", equilibrium, u)
+            rate = self._rate(u, e, params) - self._rate(e, e, params, with_inflow=False)
         check_finite("the rate of a conservation_law", plain(rate))
         return cast(rate, dtype_of(u))
 
-    def _state(self, u):
-        """The state, of floating numbers."""
-        values, momentum, shape = field_array(self, plain(u), batch=True), self.momentum, self.grid.shape
-        fields = values.shape[: values.ndim - len(shape)]
+    def _checked_state(self, u: Any) -> Any:
+        """Return a state as floating-point numbers; raise for a wrong shape or kind of numbers."""
+        values = field_array(self, plain(u), batch=True)
+        fields = values.shape[: values.ndim - self.grid.dim]
         if len(fields) > 1:
-            wanted = ", ".join(map(str, ("fields", *shape)))
-            raise ShapeError(f"conservation_law takes u of shape ({wanted}), got {values.shape}")
-        count = fields[0] if fields else 1
-        if momentum and max(momentum) >= count:
+            expected = ", ".join(map(str, ("fields", *self.grid.shape)))
+            raise ShapeError(f"conservation_law takes u of shape ({expected}), got {values.shape}")
+        if fields:
+            count = fields[0]
+        else:
+            count = 1
+        if self.momentum is not None and max(self.momentum) >= count:
             raise ShapeError(
-                f"conservation_law needs a field for each number in momentum={momentum}, got u of shape "
+                f"conservation_law needs a field for each number in momentum={self.momentum}, got u of shape "
                 f"{values.shape}; give a state that holds them all"
             )
         check_kind("u of conservation_law", values.dtype, "real numbers", "; write u.real")
         return frozen(u if isbox(u) else values)
 
-    def _rate(self, u, e, params, flows=True):
-        """The rate; of an equilibrium e only the slopes take notice. `flows`: see `Axis.padded`."""
-        total = np.zeros(u.shape) if self.source is None else _shaped("source", self.source(u, params), u)
+    def _rate(self, u: Any, equilibrium: Any, params: Any, with_inflow: bool = True) -> Any:
+        """Return the rate of a state; `equilibrium` affects the slopes only. See `AxisFluxes.padded`."""
+        if self.source is None:
+            total = np.zeros(u.shape)
+        else:
+            total = _checked_result("source", self.source(u, params), u)
         for axis in self.axes:
-            padded = axis.padded(u, params, flows)
-            if e is None:
+            padded = axis.padded(u, params, with_inflow)
+            if equilibrium is None:
                 lower, upper = axis.beside_faces(padded)
             else:
-                rest = axis.padded(e, params, False)
-                lower, upper = (values + axis.between(rest) for values in axis.beside_faces(padded - rest))
-            f = self._flux(axis, lower, upper, params)
+                at_rest = axis.padded(equilibrium, params, False)
+                at_faces = axis.face_means(at_rest)
+                lower, upper = axis.beside_faces(padded - at_rest)
+                lower = lower + at_faces
+                upper = upper + at_faces
+            f = self._numerical_flux(axis, lower, upper, params)
             total = total + (axis.part(f, 0, -1) - axis.part(f, 1)) / axis.widths
         return total
 
-    def _flux(self, axis, lower, upper, params):
-        """The values below and above each face -> the flux of Harten, Lax and van Leer."""
+    def _numerical_flux(self, axis: AxisFluxes, lower: Any, upper: Any, params: Any) -> Any:
+        """Return the flux of Harten, Lax and van Leer for the values below and above each face."""
         both = frozen(anp.concatenate([lower, upper], axis.place))
-        f_lower, f_upper = axis.halves(_shaped("flux", self.flux(both, params, axis.number), both))
-        slow, fast = map(axis.halves, self._speeds(axis.number, both, params))
-        a, b = anp.minimum(anp.minimum(*slow), 0.0), anp.maximum(anp.maximum(*fast), 0.0)
-        rest = plain(a) == plain(b)  # nothing moves: the mean
-        width = b - a + rest
-        share = (b + 0.5 * rest) / width
+        f_lower, f_upper = axis.halves(_checked_result("flux", self.flux(both, params, axis.number), both))
+        slowest, fastest = self._wave_speeds(axis.number, both, params)
+        a = anp.minimum(anp.minimum(*axis.halves(slowest)), 0.0)
+        b = anp.maximum(anp.maximum(*axis.halves(fastest)), 0.0)
+        no_waves = plain(a) == plain(b)  # both are 0: the flux is the mean
+        width = b - a + no_waves
+        share = (b + 0.5 * no_waves) / width
         return share * f_lower + (1.0 - share) * f_upper + a * b / width * (upper - lower)
 
-    def _speeds(self, axis, u, params):
-        """The slowest and the fastest wave along an axis."""
-        given = self.speed(u, params, axis)
-        given = given if isinstance(given, tuple) else (-given, given)
-        for speed in map(plain, given):
-            _shaped("speed", speed, u[(0,) * (u.ndim - self.grid.dim)])
+    def _wave_speeds(self, axis: int, u: Any, params: Any) -> tuple[Any, Any]:
+        """Return the speeds of the slowest and the fastest wave along an axis."""
+        speeds = self.speed(u, params, axis)
+        if not isinstance(speeds, tuple):
+            speeds = (-speeds, speeds)
+        first_field = u[(0,) * (u.ndim - self.grid.dim)]
+        for speed in map(plain, speeds):
+            _checked_result("speed", speed, first_field)
             check_finite(f"the speed of a conservation_law along {AXES[axis]}", speed, advice=NO_WAVES)
-        if np.any(plain(given[0]) > plain(given[1])):  # no flux would lean against the wind
+        if np.any(plain(speeds[0]) > plain(speeds[1])):  # the flux would not be upwind
             raise ValueError(
                 "the speed of a conservation_law must be >= 0, or a pair, the slowest before the fastest; write abs(u) "
                 "for u, or (u - c, u + c)"
             )
-        return given
+        return speeds
 
-    def time_step(self, u, params=None, cfl=0.4):
+    def time_step(self, u: Any, params: Any = None, cfl: float = 0.4) -> float:
         """Return a stable dt: `cfl` over the largest sum over the axes of speed / width.
 
         Parameters
         ----------
         u : array
-            As for the call. The values in the cells count, and at sides of inflow what flows in.
+            As for the call. The values in the cells count, and the inflow at sides of inflow.
         params : tree, optional
         cfl : float
             Up to 0.5 for limited slopes, up to 1 for "upwind".
@@ -283,119 +377,153 @@ class ConservationLaw(Remade):
         Returns
         -------
         float [time]
-            Infinite where nothing moves. Not differentiated.
+            Infinite if all speeds are 0. Not differentiated.
         """
         check_number("cfl of time_step", cfl, "> 0", "; write cfl=0.4")
-        u, params = mapped(plain, (self._state(u), params))
-        most = np.max(sum(self._fastest(axis, u, params) / axis.widths for axis in self.axes), initial=0.0)
-        return float(cfl / most) if most else np.inf
+        u, params = mapped(plain, (self._checked_state(u), params))
+        rates = sum(self._fastest_waves(axis, u, params) / axis.widths for axis in self.axes)
+        largest = np.max(rates, initial=0.0)
+        if largest:
+            return float(cfl / largest)
+        return np.inf
 
-    def _fastest(self, axis, u, params):
-        """Return the speed of the fastest wave along an axis in each cell, with those that enter it at a side."""
-        speeds = np.max(np.abs(self._speeds(axis.number, u, params)), axis=0)
+    def _fastest_waves(self, axis: AxisFluxes, u: NDArray, params: Any) -> NDArray:
+        """Return the speed of the fastest wave along an axis in each cell, including waves that enter at a side."""
+        speeds = np.max(np.abs(self._wave_speeds(axis.number, u, params)), axis=0)
         for side, edge in ((0, slice(0, 1)), (1, slice(-1, None))):
             if axis.sides[side] == inflow_side:
-                entering = plain(axis.ghosts_beyond(u, params, side))
-                beyond = np.max(np.abs(self._speeds(axis.number, entering, params)), axis=0)
+                entering = plain(axis.ghost_values(u, params, side))
+                beyond = np.max(np.abs(self._wave_speeds(axis.number, entering, params)), axis=0)
                 cells = axis.at(edge)
                 speeds[cells] = np.maximum(speeds[cells], axis.part(beyond, 0, 1))
         return speeds
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"<conservation_law {self.scheme}: {self.grid.cells}>"
 
 
-def _shaped(name, value, u):
-    """What a function of the user returned, of the shape of u."""
+def _checked_result(name: str, value: Any, u: Any) -> Any:
+    """Return the result of a function of the user; raise unless it has the shape of u and real numbers."""
     check_shape(f"the {name} of a conservation_law", value, np.shape(u))
     check_kind(f"the {name} of a conservation_law", dtype_of(value), "real numbers", "; write its .real")
     return value
 
 
-class Axis:
-    """What a conservation law does along one axis of the grid.
+class AxisFluxes:
+    """Ghost cells, limited slopes and face values of a conservation law along one axis of the grid.
 
     Parameters
     ----------
     grid : Grid
     number : int
-        Of the axis.
+        Number of the axis.
     sides : pair of FlowCondition, or of None where the axis is periodic
     momentum : int or None
         The field that changes its sign at walls.
-    inflow : as `conservation_law` takes it
+    inflow : array, number or callable
+        As `conservation_law` takes it.
     scheme : Scheme
     """
 
-    def __init__(self, grid, number, sides, momentum, inflow, scheme):
-        self.number, self.place, self.dim = number, number - grid.dim, grid.dim
-        self.sides, self.momentum, self.inflow = sides, momentum, inflow
-        line, n = grid.widths[number], grid.shape[number]
-        lower, upper = (np.pad(np.arange(n), GHOSTS, REPEATED[side]) for side in sides)
-        self.ghosts = lower[:GHOSTS], upper[-GHOSTS:]  # the cells that those beyond the ends repeat
-        self.widths, padded = self._along(line), np.concatenate([line[lower[:-GHOSTS]], line[upper[-GHOSTS:]]])
-        gaps = padded[1:] + padded[:-1]
-        self.distances = [self._along(gap / padded[1:-1]) for gap in (gaps[:-1], gaps[1:])]
-        ends = () if scheme.limiter is None else (0,) if scheme.symmetric else (0, 1)
-        self.limiters = [self._limiter(scheme.limiter, end) for end in ends]
+    def __init__(
+        self, grid: Grid, number: int, sides: tuple, momentum: int | None, inflow: Any, scheme: Scheme
+    ) -> None:
+        self.number = number
+        self.place = number - grid.dim  # axis of arrays, counted from the last one
+        self.dim = grid.dim
+        self.sides = sides
+        self.momentum = momentum
+        self.inflow = inflow
+        widths = grid.widths[number]
+        cells = np.arange(grid.shape[number])
+        repeated_lower = np.pad(cells, GHOSTS, PAD_MODES[sides[0]])
+        repeated_upper = np.pad(cells, GHOSTS, PAD_MODES[sides[1]])
+        self.ghosts = repeated_lower[:GHOSTS], repeated_upper[-GHOSTS:]  # the cells that ghost cells repeat
+        self.widths = self._along(widths)
+        padded_widths = np.concatenate([widths[repeated_lower[:-GHOSTS]], widths[repeated_upper[-GHOSTS:]]])
+        gaps = padded_widths[1:] + padded_widths[:-1]
+        self.distances = [self._along(gap / padded_widths[1:-1]) for gap in (gaps[:-1], gaps[1:])]
+        self.limiters = []  # for the upper and the lower end of each cell; one if they are the same
+        if scheme.limiter is not None:
+            ends = [0] if scheme.symmetric else [0, 1]
+            self.limiters = [self._limiter(scheme.limiter, end) for end in ends]
 
-    def _along(self, line):
-        """Numbers along this axis, shaped so that they fit fields; one number where all are the same."""
-        return line[0] if np.all(line == line[0]) else line.reshape(-1, *[1] * (-1 - self.place))
+    def _along(self, line: NDArray) -> Any:
+        """Return numbers along this axis in a shape that broadcasts to fields; one number if all are equal."""
+        if np.all(line == line[0]):
+            return line[0]
+        return line.reshape(-1, *[1] * (-1 - self.place))
 
-    def part(self, x, start, stop=None):
-        """The places from start to stop along this axis."""
+    def part(self, x: Any, start: int, stop: int | None = None) -> Any:
+        """Return the entries from start to stop along this axis."""
         return x[self.at(slice(start, stop))]
 
-    def at(self, places):
-        """An index of places along this axis."""
+    def at(self, places: Any) -> tuple:
+        """Return an index of entries along this axis."""
         return (Ellipsis, places, *[slice(None)] * (-1 - self.place))
 
-    def halves(self, x):
-        """What `_flux` put one after the other."""
+    def halves(self, x: Any) -> tuple[Any, Any]:
+        """Return the values below and above faces that stand one after the other along this axis."""
         n = x.shape[self.place] // 2
         return self.part(x, 0, n), self.part(x, n)
 
-    def padded(self, u, params, flows=True):
-        """The field with its ghost cells; `flows`: those beyond an inflow are what flows in, else the last cell."""
-        lower, upper = (self.ghosts_beyond(u, params, upper, flows) for upper in (0, 1))
+    def padded(self, u: Any, params: Any, with_inflow: bool = True) -> Any:
+        """Return a state with its ghost cells.
+
+        Beyond an inflow they hold the state that flows in or, without `with_inflow`, the last cell.
+        """
+        lower = self.ghost_values(u, params, 0, with_inflow)
+        upper = self.ghost_values(u, params, 1, with_inflow)
         return anp.concatenate([lower, u, upper], self.place)
 
-    def ghosts_beyond(self, u, params, upper, flows=True):
-        """What stands beyond an end."""
-        ghosts, side = u[self.at(self.ghosts[upper])], self.sides[upper]
+    def ghost_values(self, u: Any, params: Any, upper: int, with_inflow: bool = True) -> Any:
+        """Return the values of the ghost cells beyond an end."""
+        ghosts = u[self.at(self.ghosts[upper])]
+        side = self.sides[upper]
         if side == free_slip:  # the momentum changes its sign
+            if u.ndim == self.dim:
+                return -ghosts
             signs = 1.0 - 2.0 * (np.arange(len(u)) == self.momentum)
-            return -ghosts if u.ndim == self.dim else ghosts * self._fields(signs)
-        if side != inflow_side or not flows:
+            return ghosts * self._per_field(signs)
+        if side != inflow_side or not with_inflow:
             return ghosts
-        value = self.inflow(params, self.number, upper) if callable(self.inflow) else self.inflow
+        value = self.inflow
+        if callable(value):
+            value = value(params, self.number, upper)
         if np.ndim(value) == 1 and u.ndim > self.dim:
-            value = self._fields(value)
-        return _shaped("inflow", value + 0.0 * plain(ghosts), ghosts)
+            value = self._per_field(value)
+        return _checked_result("inflow", value + 0.0 * plain(ghosts), ghosts)
 
-    def _fields(self, numbers):
-        """A number for each field, shaped so that they fit fields."""
+    def _per_field(self, numbers: Any) -> Any:
+        """Return one number for each field in a shape that broadcasts to fields."""
         return anp.reshape(numbers, (-1,) + (1,) * self.dim)
 
-    def between(self, padded):
-        """Cells with ghost cells -> the means at the faces."""
+    def face_means(self, padded: Any) -> Any:
+        """Return the means of the two cells at each face."""
         return 0.5 * (self.part(padded, 1, -2) + self.part(padded, 2, -1))
 
-    def beside_faces(self, padded):
-        """Cells with ghost cells -> the values below and above each face."""
-        lower, upper = self.part(padded, 1, -2), self.part(padded, 2, -1)
+    def beside_faces(self, padded: Any) -> tuple[Any, Any]:
+        """Return the values below and above each face, for a state with ghost cells."""
+        lower = self.part(padded, 1, -2)
+        upper = self.part(padded, 2, -1)
         if not self.limiters:
             return lower, upper
-        step = self.part(padded, 1) - self.part(padded, 0, -1)
-        below, above = self.part(step, 0, -1), self.part(step, 1)
-        ends = [limiter(below, above) for limiter in self.limiters]
-        return lower + self.part(ends[0], 0, -1), upper - self.part(ends[-1], 1)
+        differences = self.part(padded, 1) - self.part(padded, 0, -1)
+        below = self.part(differences, 0, -1)
+        above = self.part(differences, 1)
+        slopes = [limiter(below, above) for limiter in self.limiters]
+        return lower + self.part(slopes[0], 0, -1), upper - self.part(slopes[-1], 1)
 
-    def _limiter(self, limiter, end):
-        """A rule: differences to the cells below and above -> what the upper (0) or lower (1) end differs by."""
-        return entrywise(
-            "limiter",
-            lambda a, b: limiter(a, b, *self.distances)[end],
-            lambda a, b: limiter(a, b, *self.distances)[2 + 2 * end :][:2],
-        )
+    def _limiter(self, limiter: Callable, end: int) -> Any:
+        """Return the rule from the differences to the cells below and above to the slope at an end (0 upper, 1 lower).
+
+        The derivatives stand behind the two slopes in the result of the limiter.
+        """
+
+        def slope(a, b):
+            return limiter(a, b, *self.distances)[end]
+
+        def derivatives(a, b):
+            return limiter(a, b, *self.distances)[2 + 2 * end : 4 + 2 * end]
+
+        return entrywise("limiter", slope, derivatives)

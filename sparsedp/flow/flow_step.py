@@ -345,7 +345,10 @@ class FlowStep(Remade):
             s = {}
         v = self.project(self._set_inflow(v, params))
         if not isinstance(s, dict) or s.keys() != self.scalars.keys():
-            names = list(s) if isinstance(s, dict) else type(s).__name__
+            if isinstance(s, dict):
+                names = list(s)
+            else:
+                names = type(s).__name__
             raise ShapeError(
                 f"flow_step needs the scalars {sorted(self.scalars)}, got {names}; write step.start(v, params, s)"
             )
@@ -423,7 +426,10 @@ class FlowStep(Remade):
         self, v: Any, params: Any, s: dict[str, Any] | None = None, friction: Any = None, walls: Any = None
     ) -> Any:
         """Return a(v): the explicit terms that the scene has, and friction * v; see the head of this module."""
-        a = 0.0 * v if self.convect is None else -self.convect(v, v, walls)
+        if self.convect is None:
+            a = 0.0 * v
+        else:
+            a = -self.convect(v, v, walls)
         if self.settings.force is not None:
             a = a + self._free_faces(self._force(v, params, s))
         if friction is not None:
@@ -432,8 +438,8 @@ class FlowStep(Remade):
 
     def _force(self, v: Any, params: Any, s: dict[str, Any] | None) -> Any:
         """Return the force on faces; a number applies to all faces."""
-        scalars = (s,) if self.scalars else ()
-        force = self.settings.force(*mapped(frozen, (v, *scalars)), params)
+        fields = [v, s] if self.scalars else [v]
+        force = self.settings.force(*mapped(frozen, fields), params)
         if np.shape(plain(force)) == ():
             return force * np.ones(v.shape, dtype_of(v))
         check_on("flow_step, as force,", force, self.grid.faces, "; join its components with grid.join")

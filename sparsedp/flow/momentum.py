@@ -106,7 +106,10 @@ def face_laplacian(
     sides = resolve(grid, boundary, no_slip)
     free = Mask(free_faces(grid, sides, solid))
     stress = stresses(grid, sides, solid, solid_boundary)
-    structure = compose(free, stress) if solid is None else Matrix(free.explicit() @ stress.explicit())
+    if solid is None:
+        structure = compose(free, stress)
+    else:
+        structure = Matrix(free.explicit() @ stress.explicit())
     return Operator(structure, grid.faces, grid.faces, "face_laplacian")
 
 

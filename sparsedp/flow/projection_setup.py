@@ -6,7 +6,8 @@ and on faces with a given velocity), and A = -D G,
     A p   = D K x,      w = K x + G p,
     A^T q = G^T g,      z = K (g + D^T q).
 
-The second line is the transpose of x -> w. The transpose of x -> p has a source s on cells instead of G^T g, and g = 0.
+The second line is the transpose of the map from x to w. The transpose of the map from x to p has a source s on cells
+instead of G^T g, and g = 0.
 """
 
 from __future__ import annotations
@@ -73,7 +74,10 @@ class ProjectionSetup(Remade):
     def __init__(self, grid: Grid, solid: ArrayLike | None, boundary: Any, settings: dict[str, Any]) -> None:
         self.grid = grid
         self.sides = resolve(grid, boundary, no_slip)
-        self.solid = None if solid is None else check_solid(grid, solid).copy()
+        if solid is None:
+            self.solid = None
+        else:
+            self.solid = check_solid(grid, solid).copy()
         self.settings = settings
         self.pressure_conditions = pressure_conditions(grid, self.sides)
         self.open = faces_that(grid, self.sides, self.solid, lambda condition: not condition.closed)
@@ -173,7 +177,7 @@ class ProjectionSetup(Remade):
         return p
 
     def pressure_transpose(self, source: NDArray, out: NDArray) -> None:
-        """Set `out` to z = K D^T q with A^T q = s for a flat source s on cells: the transpose of x -> p."""
+        """Set `out` to z = K D^T q with A^T q = s: the transposed map to the pressure, for a flat source s."""
         q = self.inverse.solver.solve(source, True, checked=False)
         self.passes[True].push(np.zeros(out.size), q, out)
 
@@ -185,7 +189,10 @@ class ProjectionSetup(Remade):
             axis = int(np.searchsorted(space.offsets, index, side="right")) - 1
             return f"{self.grid.axes[axis]}-face {place(index - space.offsets[axis], space.parts[axis])}"
 
-        name = "the cotangent of projection" if transposed else "the velocity in projection"
+        if transposed:
+            name = "the cotangent of projection"
+        else:
+            name = "the velocity in projection"
         check_finite(name, x, where=place_of_face)
 
     @cached_property

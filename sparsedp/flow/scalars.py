@@ -96,5 +96,8 @@ class Scalar:
         explicit = u + self.dt * (1.5 * rate - 0.5 * previous_rate)
         if self.diffusion.solve is None:
             return explicit
-        wall_part = None if self._wall_part is None else 2.0 * self._wall_part
+        if self._wall_part is None:
+            wall_part = None
+        else:
+            wall_part = 2.0 * self._wall_part
         return self.diffusion.step_implicit(explicit, u, wall_part)
