@@ -99,12 +99,12 @@ def minimize(
         no losses and may converge to another point of the box than the other methods.
     project : callable, optional
         ``project(x)``, a differentiable projection onto a linear or affine space, such as dp.projection(grid): the
-        loss is that of project(x), and the result is project(x). The map is tested at the start and at the result:
-        one that is not affine, as np.clip, or not idempotent is refused. Not together with bounds.
+        loss of project(x) is minimized, and the result is project(x). The map is tested at the start and at the
+        result: one that is not affine, such as np.clip, or not idempotent is refused. Not together with bounds.
     batches : sequence or callable, optional
         The loss of iteration i is ``loss(x, batches[i % len(batches)])``, or ``loss(x, batches(i))``. For gd with a
         rate, adam and half_inverse; the result is the last point, not the best one. Converged when the gradient has
-        been small in as many iterations on end as there are batches, 10 for a function.
+        been small in as many successive iterations as there are batches, 10 for a function.
     checkpoint : path, optional
         A folder that keeps the last two states. If the run was killed, interrupted, or stopped by its callback or by
         maxiter, the same call continues from the last state, to the same bits. A new problem needs a new folder.
@@ -141,15 +141,15 @@ def minimize(
         physical_gradient    rate            1.0           factor of the step
         admm                 weight          required      of the sum of absolute entries (not of an integral)
         admm                 operator        None          K, linear, from x to an array; None: x itself, one array
-        admm                 rho             None          first penalty; None: found from the data
+        admm                 rho             None          first penalty; None: chosen from the data
         admm                 inner           10            steps of lbfgs in a round, or a function, see below
         admm                 prox            None          ``prox(v, t)`` in place of the soft threshold
         ===================  ==============  ============  =============================================================
 
         apart=True is the fast form for samples: the loss takes every leaf of x with a leading axis of copies, one for
         each sample, and a few products give the whole Jacobian.
-        absolute_sigma: whether the residuals are divided by their standard deviations; it decides what `covariance` is,
-        as in scipy.optimize.curve_fit.
+        absolute_sigma: whether the residuals are divided by their standard deviations; it selects the formula of
+        `covariance`, as in scipy.optimize.curve_fit.
         weight: for few jumps on a uniform grid write operator=dp.gradient(grid) and a weight times the volume
         of a cell. inner: ``inner(target, rho, x)`` returns the x that minimizes loss(x) plus rho / 2 times the sum of
         (K x - target)^2; then without bounds. With prox the values are those of the loss alone. Iterations of admm are
@@ -170,7 +170,7 @@ def minimize(
         `gradient`. The message gives the path of the entry.
     ValueError
         If the method is not known, or maxiter, tolerance, bounds or an option is out of range, or the checkpoint
-        folder holds another run: another method, options, bounds, start (static leaves too), loss or batches.
+        folder holds a run with another method, options, bounds, start (static leaves too), loss or batches.
     KeyboardInterrupt
         If Ctrl-C comes before the loss is known at the start, or a second time.
     TypeError

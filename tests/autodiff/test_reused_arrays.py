@@ -12,7 +12,7 @@ import autograd.numpy as anp
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from reused import CALLS, CASES, CONSTANT, LINE, PLACES, entries, field
+from differentiable_cases import CALLS, CASES, CONSTANT, LINE, PLACES, entries, field
 
 import sparsedp as dp
 from sparsedp._utils.pytree import flatten, leaves

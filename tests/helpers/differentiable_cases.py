@@ -1,6 +1,7 @@
 """Differentiable callables with the arrays that they take, for tests in which the caller reuses those arrays.
 
-CASES: name -> (make, public names it is for), with make() -> (fun(*args), for each argument: seed -> array or tree).
+CASES maps a name to a builder and the public names that the case covers. The builder returns the callable and, for each
+of its arguments, a function from a seed to an array or a tree.
 """
 
 import autograd.numpy as anp
@@ -22,7 +23,7 @@ PLACES = sp.diags_array([np.ones(5), np.ones(6), np.ones(5)], offsets=[-1, 0, 1]
 
 
 def entries(seed):
-    """Of a diagonally dominant matrix on PLACES, row by row."""
+    """Return the entries of a diagonally dominant matrix on PLACES, row by row."""
     rows = np.repeat(np.arange(6), np.diff(PLACES.indptr))
     columns = PLACES.indices
     return field(16, seed, -1, 1) + 4.0 * (rows == columns)
@@ -275,7 +276,7 @@ def join():
 
 @case("differentiable")
 def rule_of_a_user():
-    """x, a weight, a tuple, a list, a dict, and an option."""
+    """A rule of x, a weight, a tuple, a list, a dict, and an option."""
 
     def forward(x, w, pair, several, named, power=1.0):
         return x**2 * w + pair[0] * x + several[0] * x + named["c"] * x**3 + power * x
