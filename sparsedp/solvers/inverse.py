@@ -381,17 +381,18 @@ class Inverse(Operator):
             return apply_operator(self, b)
         return self.apply(b)
 
-    def apply_array(self, u: Any, out: np.ndarray | None = None) -> np.ndarray:
-        """Solve for a plain array, without the tape: see `Operator.apply`."""
+    def apply(self, u: Any, out: np.ndarray | None = None) -> Any:
+        """Solve for plain data, without the tape: see `Operator.apply`."""
         if (
             type(u) is np.ndarray
             and u.shape == self.domain.shape
             and u.dtype == self.structure.dtype
             and u.flags.c_contiguous
             and out is None
+            and self.backend.whole_fields
         ):  # one field as the solver takes it: its solution is returned without a copy
             return self.structure.product(u.reshape(-1)).reshape(self.codomain.shape)
-        return super().apply_array(u, out)
+        return super().apply(u, out)
 
     def _solve_from(self, b: Any, start: Any) -> Any:
         """Solve from a first guess, or by iterations that are differentiated."""

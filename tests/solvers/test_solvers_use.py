@@ -3,7 +3,9 @@
 import gc
 import pickle
 import re
+import sys
 import weakref
+from pathlib import Path
 
 import autograd.numpy as anp
 import numpy as np
@@ -309,3 +311,28 @@ def test_a_coefficient_may_be_reused_before_the_pullback():
     pull = pullback(lambda b: solve(k, b), b)[1]
     k *= 5.0
     assert np.array_equal(pull(b), wanted)
+
+
+# ---------------------------------------------------------------- structure
+
+
+def test_a_direct_solve_enters_few_functions():
+    """A reader who follows `inv(b)` sees the whole solve in at most 15 functions of 6 files."""
+    grid = dp.Grid((20, 21), size=1.0)
+    inv = dp.inverse(-dp.laplacian(grid, dp.dirichlet), "direct")
+    b = np.ones(grid.shape)
+    package = str(Path(dp.__file__).parent)
+    entered = set()
+
+    def record(frame, event, argument):
+        code = frame.f_code
+        if event == "call" and code.co_filename.startswith(package):
+            entered.add((code.co_filename, code.co_qualname))
+
+    sys.setprofile(record)
+    try:
+        inv(b)
+    finally:
+        sys.setprofile(None)
+    assert len(entered) <= 15, sorted(entered)
+    assert len({file for file, _ in entered}) <= 6, sorted(entered)
