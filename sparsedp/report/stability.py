@@ -1,12 +1,19 @@
 """The growth factor of a time step: by how much a small change of the state grows in one step; and its map.
 
-A change is carried along the run by the tangent of the step and made small again after each step; what it grows
-by, once the fastest mode has won, is the growth factor (G. Benettin et al., Meccanica 15, 1980). Above 1 is not
-wrong in itself: unstable physics grows. It is the step that is wrong when the fastest mode changes its sign from
-step to step, or when the growth per unit of time falls with the step.
+A change is carried along the run by the tangent of the step and normalized after each step; the factor by which it
+grows once the fastest mode dominates is the growth factor. A factor above 1 need not be wrong: unstable physics
+grows. The step is wrong when the fastest mode changes its sign from step to step, or when the growth per unit of time
+falls with the step.
+
+References
+----------
+G. Benettin, L. Galgani, A. Giorgilli and J.-M. Strelcyn, Lyapunov characteristic exponents, Meccanica 15, 1980.
 """
 
-from typing import NamedTuple
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,67 +25,92 @@ from sparsedp.check.summary import Result
 from sparsedp.check.table import Table
 from sparsedp.errors import SparsedpError
 
-__all__ = ["SEED", "STEADY", "Growth", "StabilityMap", "growth_of", "stability_map"]
+__all__ = ["LARGEST_STEADY_GROWTH", "SEED", "Growth", "StabilityMap", "growth_of", "stability_map"]
 
 SEED = 20240229  # of random changes, here and in the stress cases
-STEPS, SETTLED = 40, 20  # steps in all, and those that are measured
-STEADY = 1.0 + 1e-3  # growth factors up to here do not count as growth
+STEPS = 40
+MEASURED_STEPS = 20  # the last ones
+LARGEST_STEADY_GROWTH = 1.0 + 1e-3  # growth factors up to here do not count as growth
 SHARES = np.geomspace(1e-2, 1e2, 9)  # of the time step and viscosity of the scene, along the axes of the map
 
 
 class Growth(NamedTuple):
-    """Growth factor of one step, NaN where there is none; whether the fastest mode flips its sign; the error."""
+    """Growth in one step.
+
+    Attributes
+    ----------
+    factor : float
+        NaN where there is none.
+    flips : bool
+        Whether the fastest mode changes its sign from step to step.
+    refusal : str
+        Name of the error that the step raised.
+    """
 
     factor: float
     flips: bool = False
     refusal: str = ""
 
 
-class Loop(Exception):
-    """Carries the first rollout out of a loss before it runs; `args` are one step of it, and where it starts."""
+class _FirstRollout(Exception):
+    """Carries the first rollout out of a loss before it runs; `args` are one step of it, and its start."""
 
 
-def growth_of(loss, x, step=None):
-    """Loss and point -> Growth of the step of its first rollout; None without one.
+def growth_of(loss: Callable[[Any], Any], x: Any, step: Callable[[Any], Any] | None = None) -> Growth | None:
+    """Return the growth of the step of the first rollout of a loss; None without one.
 
-    ``step(x) -> (advance, state)`` gives another loop.
+    Parameters
+    ----------
+    loss : callable
+    x : tree of arrays
+    step : callable, optional
+        ``step(x)`` returns (advance, state) of another loop.
     """
     try:
         loop = _first_rollout(loss, x) if step is None else step(x)
-        return loop and _measured(*loop)
+        return loop and _measure_growth(*loop)
     except (SparsedpError, ValueError, ArithmeticError, RuntimeError) as error:
         return Growth(np.nan, refusal=type(error).__name__)
 
 
-def _first_rollout(loss, x):
-    def leave(step, state, params, inputs, n):
-        if n:
-            first = mapped(lambda leaf: leaf[0] if isinstance(leaf, np.ndarray) else leaf, inputs)
-            rest = () if inputs is None else (first,)
-            raise Loop(lambda state: step(state, params, *rest), state)
+def _first_rollout(loss: Callable[[Any], Any], x: Any) -> Any:
+    """Return one step of the first rollout of a loss, and its start; None without one."""
+
+    def leave(step: Any, state: Any, params: Any, inputs: Any, n: int) -> None:
+        if not n:
+            return
+        if inputs is None:
+            raise _FirstRollout(lambda state: step(state, params), state)
+        first_inputs = mapped(lambda leaf: leaf[0] if isinstance(leaf, np.ndarray) else leaf, inputs)
+        raise _FirstRollout(lambda state: step(state, params, first_inputs), state)
 
     thread.loop_hooks.append(leave)
     try:
         loss(x)
-    except Loop as loop:
-        return loop.args
+    except _FirstRollout as rollout:
+        return rollout.args
     finally:
         thread.loop_hooks.remove(leave)
     return None
 
 
-def _measured(advance, state):
-    change, steps = np.random.default_rng(SEED).standard_normal(Point(state).size), []
+def _measure_growth(advance: Callable[[Any], Any], state: Any) -> Growth:
+    """Measure the growth of a random change over the last of some steps."""
+    change = np.random.default_rng(SEED).standard_normal(Point(state).size)
+    rates = []
+    flips = []
     for _ in range(STEPS):
-        point, before = Point(state), change / norm(change)
-        state, moved = jvp(advance, state, point.unpack(before))
-        change = point.pack(moved)
+        point = Point(state)
+        direction = change / norm(change)
+        state, tangent = jvp(advance, state, point.unpack(direction))
+        change = point.pack(tangent)
         size = norm(change)
         if size == 0 or not np.isfinite(size):
             return Growth(float(size), flips=size > 0)
-        steps.append((np.log(size), before @ change < 0))
-    rate, flips = np.mean(steps[-SETTLED:], axis=0)
-    return Growth(float(np.exp(rate)), bool(flips > 0.5))
+        rates.append(np.log(size))
+        flips.append(direction @ change < 0)
+    rate, share_of_flips = np.mean(np.column_stack([rates, flips])[-MEASURED_STEPS:], axis=0)
+    return Growth(float(np.exp(rate)), bool(share_of_flips > 0.5))
 
 
 class StabilityMap(Result):
@@ -96,25 +128,33 @@ class StabilityMap(Result):
 
     _plain = ("time_steps", "viscosities", "factors")
 
-    def parts(self):
-        """The factors."""
+    def parts(self) -> list[str | Table]:
+        """Return the factors."""
         cells = np.where(np.isnan(self.factors), "refused", self.factors.astype(object))
-        rows = [(dt, *row) for dt, row in zip(self.time_steps, cells)]
+        rows = [(time_step, *row) for time_step, row in zip(self.time_steps, cells)]
         return ["growth factor of a step:", Table((" \\ ".join(self.names), *self.viscosities), rows)]
 
 
-def stability_map(scene):
-    """Scene -> StabilityMap, or None where it has no loop, or no named time step and viscosity of one number each."""
-    names = scene.time_step, scene.viscosity
-    here = [scene.leaves[name] for name in names if name]
-    if not scene.growth or scene.growth.refusal or [x.size for x in here] != [1, 1] or min(here) <= 0:
+def stability_map(scene: Any) -> StabilityMap | None:
+    """Return the stability map of a scene; None without a loop and both as single numbers."""
+    time_step_name = scene.time_step
+    viscosity_name = scene.viscosity
+    if not scene.growth or scene.growth.refusal or time_step_name is None or viscosity_name is None:
         return None
-    dt, nu = here
-
-    def factor(longer, stiffer):
-        growth = scene.growth_at(dict(zip(names, (dt * longer, nu * stiffer))))
-        return growth.factor if growth else np.nan
-
-    factors = np.array([[factor(longer, stiffer) for stiffer in SHARES] for longer in SHARES])
-    steps, viscosities, place = dt.item() * SHARES, nu.item() * SHARES, (dt.item(), nu.item())
-    return StabilityMap(names=names, time_steps=steps, viscosities=viscosities, factors=factors, here=place)
+    time_step = scene.leaves[time_step_name]
+    viscosity = scene.leaves[viscosity_name]
+    if time_step.size != 1 or viscosity.size != 1 or min(time_step, viscosity) <= 0:
+        return None
+    factors = np.full((SHARES.size, SHARES.size), np.nan)
+    for row, longer in enumerate(SHARES):
+        for column, stiffer in enumerate(SHARES):
+            growth = scene.growth_at({time_step_name: time_step * longer, viscosity_name: viscosity * stiffer})
+            if growth:
+                factors[row, column] = growth.factor
+    return StabilityMap(
+        names=(time_step_name, viscosity_name),
+        time_steps=time_step.item() * SHARES,
+        viscosities=viscosity.item() * SHARES,
+        factors=factors,
+        here=(time_step.item(), viscosity.item()),
+    )

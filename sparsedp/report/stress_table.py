@@ -1,13 +1,17 @@
 """stress: a scene driven through stiff and extreme cases, one word for each."""
 
+from __future__ import annotations
+
 import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
 from sparsedp._utils.validation import check_choice, check_function
 from sparsedp.autodiff.derivative import unwarned
 from sparsedp.check.summary import Result
-from sparsedp.check.table import table_of
+from sparsedp.check.table import Table, table_of
 from sparsedp.report import plots
 from sparsedp.report.stability import stability_map
 from sparsedp.report.stress_cases import FAILED, GROUPS, WORDS, Scene, cases
@@ -15,14 +19,23 @@ from sparsedp.report.stress_cases import FAILED, GROUPS, WORDS, Scene, cases
 __all__ = ["Stress", "stress"]
 
 COLUMNS = ("group", "parameter", "case", "outcome", "figure", "note")
-ELSEWHERE = (
+NEVER_RUN = (
     "isolated regions, solid cells, 1 cell, prime sizes, anisotropic cells: a loss keeps its grid; stress each",
     "10^4 steps: a loss keeps its number of steps",
 )
+WITH_MAP = "time step and viscosity"
 
 
-def stress(loss, x, ranges=None, step=None, time_step=None, viscosity=None, only=None):
-    """Scene -> what happens to it in stiff and extreme cases: passed, refused correctly, degraded, FAILED.
+def stress(
+    loss: Callable[[Any], Any],
+    x: Any,
+    ranges: Any = None,
+    step: Callable[[Any], Any] | None = None,
+    time_step: str | None = None,
+    viscosity: str | None = None,
+    only: Sequence[str] | None = None,
+) -> Stress:
+    """Run a scene through stiff and extreme cases: each has passed, was refused correctly, is degraded, or FAILED.
 
     Parameters
     ----------
@@ -58,7 +71,7 @@ def stress(loss, x, ranges=None, step=None, time_step=None, viscosity=None, only
     -----
     passed: finite, and the gradient agrees with differences to 1e-5 along a random direction in each leaf (in all
     together of more than eight) and along itself, or the bits are those of the plain case. At x itself, and where a
-    direction does not agree, all evidence is gathered and judged as by `check.gradient`, with its detection limits.
+    direction does not agree, all evidence is gathered and weighed as by `check.gradient`, with its detection limits.
     refused correctly: a typed error. degraded: a finite answer with a gap, shown as the figure; numbers that
     overflow far outside any stated range; a foreign error. FAILED: within the scene's own values or stated ranges
     a number that is not finite, without an error; another gradient than that of the differences; NaN in, finite
@@ -81,27 +94,42 @@ def stress(loss, x, ranges=None, step=None, time_step=None, viscosity=None, only
     for group in only or ():
         check_choice("a group of stress cases", group, GROUPS)
     chosen = [name for name in GROUPS if only is None or name in only]
+    rows = []
+    growth_map = None
     with np.errstate(all="ignore"), unwarned(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the rows say what became of a case
         scene = Scene(loss, x, ranges, step, time_step, viscosity)
-        rows = [dict(zip(COLUMNS, (*names, *judge()))) for *names, judge in cases(scene, chosen)]
-        growth = stability_map(scene) if "time step and viscosity" in chosen else None
-    ran = {row["group"] for row in rows}
-    skipped = [
-        f"{name}: {GROUPS[name].reason if name in chosen else 'not asked for'}" for name in GROUPS if name not in ran
-    ]
+        for group, parameter, case, grade in cases(scene, chosen):
+            rows.append(dict(zip(COLUMNS, (group, parameter, case, *grade()))))
+        if WITH_MAP in chosen:
+            growth_map = stability_map(scene)
+    skipped = _skipped_groups(rows, chosen)
     if scene.growth is None:
         skipped.append("growth in one step: no rollout in the loss; give step=lambda x: (advance, state)")
     counts = {word: sum(row["outcome"] == word for row in rows) for word in WORDS}
     return Stress(
-        rows=rows, counts=counts, failures=[row for row in rows if row["outcome"] == FAILED], map=growth,
-        verdict="disagrees" if counts[FAILED] else "agrees", skipped=[*skipped, *ELSEWHERE],
-        summary=f"stress: {', '.join(f'{many} {word}' for word, many in counts.items())}",
-    )  # fmt: skip
+        rows=rows,
+        counts=counts,
+        failures=[row for row in rows if row["outcome"] == FAILED],
+        map=growth_map,
+        verdict="disagrees" if counts[FAILED] else "agrees",
+        skipped=[*skipped, *NEVER_RUN],
+        summary=f"stress: {', '.join(f'{count} {word}' for word, count in counts.items())}",
+    )
 
 
-def _failure(row):
-    """A row that FAILED as one line, of what is there: parameter and case, and the note."""
+def _skipped_groups(rows: list[dict[str, Any]], chosen: list[str]) -> list[str]:
+    """Return sentences about the groups without a case."""
+    groups_with_rows = {row["group"] for row in rows}
+    sentences = []
+    for name, group in GROUPS.items():
+        if name not in groups_with_rows:
+            sentences.append(f"{name}: {group.reason if name in chosen else 'not asked for'}")
+    return sentences
+
+
+def _failure(row: dict[str, Any]) -> str:
+    """Return a row that FAILED as one line: parameter and case, and the note."""
     case = " ".join(filter(None, (row["parameter"], row["case"])))
     return ": ".join(filter(None, (FAILED, case, row["note"])))
 
@@ -127,14 +155,14 @@ class Stress(Result):
 
     _plain = ("counts", "rows", "skipped", "map")
 
-    def parts(self):
-        """All cases, what was left out, the map, the failures, and the counts."""
+    def parts(self) -> list[str | Table]:
+        """Return all cases, what was skipped, the map, the failures, and the counts."""
         growth = self.map.parts() if self.map else []
-        failed = [_failure(row) for row in self.failures]
-        return ["stress", table_of(self.rows, COLUMNS), *self.omissions(), *growth, *failed, self.summary]
+        failures = [_failure(row) for row in self.failures]
+        return ["stress", table_of(self.rows, COLUMNS), *self.omissions(), *growth, *failures, self.summary]
 
-    def plot(self, ax=None):
-        """Stability map -> picture: growth factor of a step, time step against viscosity.
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the stability map: growth factor of a step, time step against viscosity.
 
         Parameters
         ----------
