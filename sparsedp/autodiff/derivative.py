@@ -1,7 +1,5 @@
 """Derivatives of whole programs: any function of a tree of arrays, forward and backward."""
 
-import gc
-import threading
 import warnings
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -44,7 +42,7 @@ from sparsedp.autodiff.tape_constants import is_fixed
 from sparsedp.errors import DerivativeError, NonFiniteError, NonFiniteGradientWarning, ShapeError, SparsedpError
 
 __all__ = [
-    "NO_JVP", "check_loss", "entrywise", "grad", "gradient_of", "growing", "hvp", "is_finite", "judged",
+    "NO_JVP", "check_loss", "entrywise", "grad", "gradient_of", "hvp", "is_finite", "judged",
     "jvp", "linearised", "name_of", "of_argument", "pullback", "push", "pushforward", "taped", "traced",
     "unwarned", "value_and_grad", "vjp", "witnessed", "zero_like",
 ]  # fmt: skip
@@ -54,26 +52,6 @@ NO_JVP = (DerivativeError, NotImplementedError)
 SPREAD = ": autograd's np.where does not add up what it spreads; multiply by the condition instead, a * c + b * (1 - c)"
 
 LARGE = 1e100  # a cotangent that makes others overflow, through derivatives that do not
-SELDOM = 100_000  # new containers before Python looks for cyclic garbage, while a tape grows
-_lock = threading.Lock()
-_growing: list[tuple] = []  # thresholds to go back to, one for each tape that grows
-
-
-@contextmanager
-def growing():
-    """While a tape grows: it has no cycles, and every search for cyclic garbage would walk all of it."""
-    with _lock:
-        before = gc.get_threshold()
-        _growing.append(_growing[0] if _growing else before)
-        if 0 < before[0] < SELDOM:
-            gc.set_threshold(SELDOM, *before[1:])
-    try:
-        yield
-    finally:
-        with _lock:
-            before = _growing.pop()
-            if not _growing:
-                gc.set_threshold(*before)
 
 
 def pullback(fun, x):
@@ -655,8 +633,7 @@ def value_and_grad(loss, argnum=0):
     def evaluate(*args):
         if len(args) <= argnum:
             raise TypeError(f"the gradient in argument {argnum} of the loss needs it, got {len(args)} arguments")
-        with growing():  # until the tape is gone: a search for cyclic garbage in between would walk all of it
-            return collectively("the loss", args, _value_and_gradient, loss, argnum, args)
+        return collectively("the loss", args, _value_and_gradient, loss, argnum, args)
 
     return Made(evaluate, value_and_grad, loss, argnum)
 

@@ -1,159 +1,147 @@
-"""Derivatives of the commonest calls on a tape: arithmetic, entries of arrays, arrays made of numbers.
+"""Derivatives of the most frequent calls on a tape: arithmetic, entries of arrays, arrays built from numbers.
 
-autograd knows them all, and takes three to ten times as long: it is ready for all kinds of broadcasting, other dtypes
-and traces inside traces. What is here serves float64 alone, and traced operands of the shape of their result; without
-it a gradient of small steps takes twice the time (benchmarks/small.py, 200 steps of rk4).
-
-Two calls stand here because autograd's derivatives of them are wrong: `full_like`, and reductions with options.
+autograd has all of these derivatives, but takes three to ten times as long, because it handles every kind of
+broadcasting, other dtypes and nested traces. The formulas of this module apply only to float64 and to traced operands
+with the shape of the result. Without them a gradient of small steps takes twice the time (benchmarks/small.py, 200
+steps of rk4).
 """
+
+from __future__ import annotations
 
 import operator
 from inspect import unwrap
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.autodiff.backend import ARRAY_KINDS, BOX, formulas_of_kind, is_distributed
+from sparsedp.autodiff.backend import BOX, formulas_of_kind, is_distributed
 from sparsedp.errors import DerivativeError
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import DTypeLike
+
 __all__ = [
-    "ACTS",
     "ARRAY",
+    "BOTH",
     "COPY",
+    "FIRST",
     "FLOAT",
+    "FORMULAS",
     "ITEM",
     "MAKERS",
     "NUMBERS",
     "OPERATORS",
     "PLAIN",
+    "PYTHON_OPERATORS",
     "REAL",
+    "SECOND",
+    "Formula",
     "Part",
     "by_entry",
-    "formulas_of",
+    "denominator_slope",
+    "distributed_formula",
     "in_dtype",
+    "numerator_slope",
     "operand",
     "power_slope",
     "refuse_options",
 ]
 
 FLOAT = np.dtype(float)
+NUMBERS = {np.ndarray, np.float64}  # types with a shape and a dtype
+SCALARS = {np.float64, float}
 REAL = {np.ndarray, np.float64, float, int}
-NUMBERS = {np.ndarray, np.float64}  # that have a shape and a dtype
-PLAIN = {*REAL, slice, tuple, list, bool, type(None), type(Ellipsis)}  # operands that leave all to the traced one
-BASIC = {int, slice, type(None), type(Ellipsis)}  # indices that meet no entry twice
+# Types of operands that have no operator of their own beside a traced value.
+PLAIN = {*REAL, slice, tuple, list, bool, type(None), type(Ellipsis)}
+SEQUENCES = {list, tuple}
+BASIC = {int, slice, type(None), type(Ellipsis)}  # indices that select no entry twice
+# Operators of Python by the name of their method.
 OPERATORS = {
-    "add": anp.add, "sub": anp.subtract, "mul": anp.multiply, "truediv": anp.true_divide, "pow": anp.power,
-}  # fmt: skip
-MAKERS = "_array_from_scalar_or_array", "array_from_args"  # what anp.array calls
-ITEM = unwrap(BOX.__getitem__)
-# Of NumPy's numbers the operators of Python take a tenth of the time; and a step that is run again without a tape has
-# their bits: a power by the function may differ in the last one.
-ACTS = {
-    anp.add: operator.add, anp.subtract: operator.sub, anp.multiply: operator.mul,
-    anp.true_divide: operator.truediv, anp.power: operator.pow, ITEM: operator.getitem,
-}  # fmt: skip
-_constant_full_like = anp.full_like
-REDUCTIONS = "sum", "mean", "prod", "var", "std", "max", "min", "amax", "amin"
-COPY, ARRAY = (unwrap(getattr(anp.numpy_wrapper, name)) for name in MAKERS)
-
-# What of two operands a derivative needs -> what is held of them.
-HELD: dict[tuple, Any] = {
-    (): lambda args: (),
-    (0,): lambda args: (args[0], None),
-    (1,): lambda args: (None, args[1]),
-    (0, 1): lambda args: args,
+    "add": anp.add,
+    "sub": anp.subtract,
+    "mul": anp.multiply,
+    "truediv": anp.true_divide,
+    "pow": anp.power,
 }
-
-
-by_entry: set = set()  # pullbacks that act entry by entry
+MAKERS = "_array_from_scalar_or_array", "array_from_args"  # functions that anp.array calls
+ITEM = unwrap(BOX.__getitem__)
+COPY = unwrap(getattr(anp.numpy_wrapper, MAKERS[0]))
+ARRAY = unwrap(getattr(anp.numpy_wrapper, MAKERS[1]))
+# The operators of Python take a tenth of the time for numbers of NumPy. They also keep the bits of a step that is
+# computed again without a tape: the last bit of a power may differ between the operator and the function.
+PYTHON_OPERATORS = {
+    anp.add: operator.add,
+    anp.subtract: operator.sub,
+    anp.multiply: operator.mul,
+    anp.true_divide: operator.truediv,
+    anp.power: operator.pow,
+    ITEM: operator.getitem,
+}
+REDUCTIONS = "sum", "mean", "prod", "var", "std", "max", "min", "amax", "amin"
+FIRST = (0,)  # positions of the traced operands of a function of two
+SECOND = (1,)
+BOTH = (0, 1)
+by_entry: set = set()  # pullbacks of functions that act entry by entry
 
 
 class Part(tuple):
-    """(g, index, shape): zero outside ``whole[index]``, and g there."""
+    """A cotangent (g, index, shape) of an array of this shape: g at the index, and zero elsewhere."""
 
     __slots__ = ()
 
 
-def formulas_of(fun, value, args, nums):
-    """A call ``value = fun(*args)`` -> its two formulas in FORMULAS; None: autograd knows."""
-    line = FORMULAS.get(fun)  # autograd's own: a primitive that a user made of NumPy's has other derivatives
-    if line is None or type(value) not in NUMBERS or value.dtype is not FLOAT:
-        return formulas_of_kind(fun, value, args, nums) if ARRAY_KINDS else None
-    for num in nums:
-        arg = args[num]
-        if type(arg) not in NUMBERS or arg.dtype is not FLOAT:
-            return formulas_of_kind(fun, value, args, nums) if ARRAY_KINDS else None
-    return line[1:] if line[0](value, nums, args) else None
+class Formula(NamedTuple):
+    """Derivatives of a function of autograd.
+
+    Attributes
+    ----------
+    backward : callable
+        ``backward(value, nums, args)`` returns, for a call with this result and traced arguments at `nums`, a pullback
+        and the tuple `held` of what it needs; None if the formula does not hold for this call. ``pull(g, *held)``
+        returns the cotangents of the arguments `nums`.
+    forward : callable
+        ``forward(g, num, args, shape)``: the tangent of the result, of this shape, for the tangent g of one argument.
+    """
+
+    backward: Callable
+    forward: Callable
 
 
-def _full_like(a, fill_value, *args, **options):
-    """As NumPy's; autograd's takes a traced value to fill with as a constant."""
-    ans = _constant_full_like(a, fill_value, *args, **options)
-    if type(fill_value) is BOX and ans.dtype.kind in "fc":
-        return (np.zeros_like(ans) + fill_value).astype(ans.dtype)
-    return ans
+def distributed_formula(function: Callable, value: Any, args: Sequence, nums: Sequence[int]) -> Formula | None:
+    """Return the formula for a call with a field that is no NumPy array, see `ArrayKind.formulas`; None without one."""
+    formulas = formulas_of_kind(function, value, tuple(args), tuple(nums))
+    if formulas is None:
+        return None
+    backward, forward = formulas
+    return Formula(lambda value, nums, args: backward(nums, args), forward)
 
 
-def refuse_options(fun, options):
-    """Autograd's rules of reductions know neither the entries that are left out nor what is begun with."""
-    if fun.__name__ in REDUCTIONS and {"where", "initial"} & options.keys():
+def refuse_options(function: Callable, options: dict) -> None:
+    """Refuse the options `where` and `initial` of reductions, which autograd's derivatives ignore."""
+    if function.__name__ in REDUCTIONS and {"where", "initial"} & options.keys():
         raise DerivativeError(
-            f"autograd's derivative of {fun.__name__} does not know where= and initial=; choose entries by x[mask] or "
-            "anp.where(mask, x, 0.0), and put what it begins with beside it"
+            f"autograd's derivative of {function.__name__} does not know where= and initial=; choose entries by "
+            "x[mask] or anp.where(mask, x, 0.0), and add the initial value to the result"
         )
 
 
-def in_dtype(value, dtype):
-    """Plain value -> the same numbers in a dtype."""
+def in_dtype(value: Any, dtype: DTypeLike) -> Any:
+    """Return a plain value in a dtype."""
     return value.astype(dtype) if is_distributed(value) else np.asarray(value, dtype)
 
 
-def _entrywise(*acts):
-    """A line for a function entry by entry: for each operand its derivative ``act(g, *args)``, and what that needs.
-
-    A derivative is its own transpose. What is needed is a key of HELD: no array is held in vain.
-    """
-    (act, need), (other, needs) = acts[0], acts[-1]
-    pulls: dict[tuple, Any] = {(0,): (lambda g, *args: (act(g, *args),), HELD[need])}
-    if len(acts) == 2:
-        pulls[1,] = lambda g, *args: (other(g, *args),), HELD[needs]
-        pulls[0, 1] = lambda g, *args: (act(g, *args), other(g, *args)), HELD[need and (0, 1)]
-
-    by_entry.update(pull for pull, _ in pulls.values())
-
-    def fits(value, nums, args):
-        for num in nums:
-            if args[num].shape != value.shape:
-                return False
-        return nums in pulls
-
-    def back(nums, args):
-        pull, hold = pulls[nums]
-        return pull, hold(args if len(nums) == len(args) else [*map(operand, args)])
-
-    return fits, back, lambda g, num, args, shape: acts[num][0](g, *map(operand, args))
+def operand(x: Any) -> Any:
+    """Return a list or tuple as an array, which may hold traced values; all else as it is."""
+    return anp.array(x) if type(x) in SEQUENCES else x
 
 
-def operand(x):
-    """An operand as NumPy takes it: one less than a list is no list, and it may hold traced values."""
-    return anp.array(x) if type(x) is list or type(x) is tuple else x
+# ---- functions entry by entry ----------------------------------------------------------------------------------------
 
 
-def _is_basic(value, nums, args):
-    index = args[1]
-    return type(index) in BASIC or (type(index) is tuple and all(type(one) in BASIC for one in index))
-
-
-def _part(g, place):
-    return (Part((g, *place)),)
-
-
-def _entries(g, nums):
-    return [g[num - 2] for num in nums]
-
-
-def power_slope(g, x, y):
+def power_slope(g: Any, x: Any, y: Any) -> Any:
     """Return g times the derivative of x**y in x, without the overflow of x**(y - 1) for a negative number y."""
     if type(y) in (int, float) and y < 0:
         return g / x * y * x**y
@@ -161,29 +149,125 @@ def power_slope(g, x, y):
     return g * y * x ** where(y, y - 1, 1.0)
 
 
-# The square of a divisor below 1e-162 underflows to 0; the quotient x / y and its derivative may still be finite.
-_quotient = _entrywise((lambda g, x, y: g / y, (1,)), (lambda g, x, y: -g * (x / y) / y, (0, 1)))
+def numerator_slope(g: Any, x: Any, y: Any) -> Any:
+    """Return g times the derivative of x / y in x."""
+    return g / y
 
-# Of a function of autograd: whether the formulas hold, from (value, nums, args); (pull, held), from (nums, args), with
-# ``pull(g, *held)`` the cotangents of args `nums`; what a tangent of one of them gives, from (g, num, args, shape).
-FORMULAS: dict[Any, Any] = {
+
+def denominator_slope(g: Any, x: Any, y: Any) -> Any:
+    """Return g times the derivative of x / y in y, without the square of y, which underflows below 1e-162."""
+    return -g * (x / y) / y
+
+
+def _entrywise(*slopes):
+    """Return the formula of a function that acts entry by entry, which is its own transpose.
+
+    Parameters
+    ----------
+    *slopes : (callable, tuple of int)
+        For each operand ``slope(g, *args)``, g times the derivative in this operand, and the positions of the operands
+        that the derivative needs: the tape holds no others.
+    """
+    slope, needed = slopes[0]
+
+    def pull_first(g, *args):
+        return (slope(g, *args),)
+
+    pulls: dict[tuple[int, ...], tuple[Callable, tuple]] = {FIRST: (pull_first, needed)}
+    if len(slopes) == 2:
+        second_slope, needed_by_second = slopes[1]
+
+        def pull_second(g, *args):
+            return (second_slope(g, *args),)
+
+        def pull_both(g, *args):
+            return slope(g, *args), second_slope(g, *args)
+
+        pulls[SECOND] = pull_second, needed_by_second
+        pulls[BOTH] = pull_both, BOTH if needed else ()
+    by_entry.update(pull for pull, _ in pulls.values())
+
+    def backward(value, nums, args):
+        if type(value) in SCALARS:
+            for num in nums:
+                if type(args[num]) not in SCALARS:
+                    return None
+        elif type(value) is np.ndarray and value.dtype is FLOAT:
+            shape = value.shape
+            for num in nums:
+                arg = args[num]
+                if type(arg) is not np.ndarray or arg.dtype is not FLOAT or arg.shape != shape:
+                    return None
+        else:
+            return None
+        if nums not in pulls:
+            return None
+        pull, needed = pulls[nums]
+        if not needed:
+            return pull, ()
+        if len(nums) < len(args) and (type(args[0]) in SEQUENCES or type(args[1]) in SEQUENCES):
+            args = [operand(arg) for arg in args]
+        if needed == BOTH:
+            return pull, args
+        return pull, (args[0], None) if needed == FIRST else (None, args[1])
+
+    def forward(g, num, args, shape):
+        return slopes[num][0](g, *map(operand, args))
+
+    return Formula(backward, forward)
+
+
+# ---- entries of arrays, and arrays of numbers ------------------------------------------------------------------------
+
+
+def _is_real(value):
+    """Whether a value is a number or array of float64."""
+    return type(value) is np.float64 or (type(value) is np.ndarray and value.dtype is FLOAT)
+
+
+def _pull_part(g, place):
+    return (Part((g, *place)),)
+
+
+def _item_backward(value, nums, args):
+    array, index = args
+    is_basic = type(index) in BASIC or (type(index) is tuple and all(type(one) in BASIC for one in index))
+    if is_basic and _is_real(value) and _is_real(array):
+        return _pull_part, ((index, array.shape),)
+    return None
+
+
+def _item_forward(g, num, args, shape):
+    if type(g) is float:
+        g = np.asarray(g)
+    return g[args[1]]
+
+
+def _pull_entries(g, nums):
+    return [g[num - 2] for num in nums]
+
+
+def _array_backward(value, nums, args):
+    has_options = args[0] or args[1]
+    if has_options or not _is_real(value) or not all(_is_real(args[num]) for num in nums):
+        return None
+    return _pull_entries, (nums,)
+
+
+def _array_forward(g, num, args, shape):
+    return Part((g, num - 2, shape))
+
+
+_quotient = _entrywise((numerator_slope, SECOND), (denominator_slope, BOTH))
+
+FORMULAS: dict[Any, Formula] = {  # by identity: a primitive that a user defines has other derivatives
     anp.add: _entrywise((lambda g, *args: g, ()), (lambda g, *args: g, ())),
     anp.subtract: _entrywise((lambda g, *args: g, ()), (lambda g, *args: -g, ())),
-    anp.multiply: _entrywise((lambda g, x, y: y * g, (1,)), (lambda g, x, y: x * g, (0,))),
+    anp.multiply: _entrywise((lambda g, x, y: y * g, SECOND), (lambda g, x, y: x * g, FIRST)),
     anp.true_divide: _quotient,
     anp.divide: _quotient,
-    anp.power: _entrywise((power_slope, (0, 1))),
+    anp.power: _entrywise((power_slope, BOTH)),
     anp.negative: _entrywise((lambda g, *args: -g, ())),
-    ITEM: (
-        _is_basic,
-        lambda nums, args: (_part, ((args[1], args[0].shape),)),
-        lambda g, num, args, shape: (np.asarray(g) if type(g) is float else g)[args[1]],
-    ),
-    ARRAY: (
-        lambda value, nums, args: not (args[0] or args[1]),
-        lambda nums, args: (_entries, (nums,)),
-        lambda g, num, args, shape: Part((g, num - 2, shape)),
-    ),
+    ITEM: Formula(_item_backward, _item_forward),
+    ARRAY: Formula(_array_backward, _array_forward),
 }
-
-anp.full_like = _full_like

@@ -1,16 +1,21 @@
-"""The tape: rules with hand-written derivatives, the traces they are called on, and the way back through a trace.
+"""The tape: rules with hand-written derivatives, the traces that record their calls, and the backward pass.
 
-Only this file opens autograd. All rules go through one primitive (`_call`), all Operators through a lighter one
-(`apply_operator`): a primitive for each rule would stay in autograd's tables for ever.
+Only this module imports autograd. All rules are calls of one primitive (`_call`) and all Operators of a faster one
+(`apply_operator`): a primitive for each rule would stay in the tables of autograd for the life of the process.
 
-Complex cotangents are autograd's, g = dL/dRe(y) - i dL/dIm(y): the VJP of y = A x is A^T g.
+The traced arrays of autograd (`ArrayBox`) get faster operators. These act on traces of this module alone: for other
+users of autograd every call, its node on their tape and its result stay as they are.
+
+Complex cotangents follow autograd, g = dL/dRe(y) - i dL/dIm(y): the VJP of y = A x is A^T g.
 """
+
+from __future__ import annotations
 
 import inspect
 from contextlib import contextmanager
 from functools import cached_property, partial, wraps
-from itertools import count as numbers_from
-from typing import Any
+from itertools import count as count_from
+from typing import TYPE_CHECKING, Any
 
 import autograd.numpy as anp
 import numpy as np
@@ -20,242 +25,402 @@ from autograd.numpy.numpy_vjps import match_complex, replace_zero, unbroadcast_f
 from autograd.tracer import Node, box_types, getval, isbox, new_box, notrace_primitives, trace_stack
 
 from sparsedp._utils.counters import active, count, note, thread, timed
+from sparsedp._utils.pytree import copied, leaves
 from sparsedp._utils.reconstruction import Remade
+from sparsedp.autodiff.backend import ARRAY_KINDS, BOX, match_value
+from sparsedp.autodiff.fast_derivatives import (
+    ARRAY,
+    BOTH,
+    COPY,
+    FIRST,
+    FLOAT,
+    FORMULAS,
+    ITEM,
+    MAKERS,
+    NUMBERS,
+    OPERATORS,
+    PLAIN,
+    PYTHON_OPERATORS,
+    REAL,
+    SECOND,
+    Part,
+    denominator_slope,
+    distributed_formula,
+    in_dtype,
+    numerator_slope,
+    operand,
+    power_slope,
+    refuse_options,
+)
 from sparsedp.autodiff.tape_constants import FIXED, constant, constant_args, frozen, sparing
 from sparsedp.errors import DerivativeError, ShapeError
 
-# isort: off
-from sparsedp.autodiff.backend import BOX, match_value
-from sparsedp.autodiff.fast_derivatives import (
-    ACTS, ARRAY, COPY, FLOAT, ITEM, MAKERS, NUMBERS, OPERATORS, PLAIN, REAL, Part, formulas_of,
-    in_dtype, operand, power_slope, refuse_options,
-)  # fmt: skip
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
 
-# isort: on
-from sparsedp._utils.pytree import copied, leaves
+    from numpy.typing import DTypeLike
 
 __all__ = [
-    "Recorder", "ReverseNode", "Rule", "VJPNode", "VSpace", "added", "apply_operator", "autograd_rules", "backward",
-    "boxed", "called", "cast", "differentiable", "dtype_of", "fit", "forward_root", "innermost", "is_variable", "isbox",
-    "linear", "new_trace", "plain", "split_boxes", "through", "traces_of", "untaped_root", "untraced",
-]  # fmt: skip
+    "Recorder",
+    "ReverseNode",
+    "Rule",
+    "VJPNode",
+    "VSpace",
+    "added",
+    "apply_operator",
+    "autograd_rules",
+    "backward",
+    "boxed",
+    "called",
+    "cast",
+    "differentiable",
+    "dtype_of",
+    "fit",
+    "forward_root",
+    "innermost",
+    "is_variable",
+    "isbox",
+    "linear",
+    "new_trace",
+    "plain",
+    "split_boxes",
+    "through",
+    "traces_of",
+    "untaped_root",
+    "untraced",
+]
 
 plain = getval  # the value below all boxes
-scaled_rules: dict = {}  # functions of autograd -> functions whose derivatives replace those of autograd on our traces
+# Functions of autograd -> functions whose derivatives replace those of autograd on the traces of this module.
+underflow_safe: dict[Callable, Callable] = {}
 
 
-def autograd_rules(fun):
-    """Return the VJP and the JVP maker of a function of autograd."""
-    fun = scaled_rules.get(fun, fun)
-    return primitive_vjps[fun], primitive_jvps[fun]
+def autograd_rules(function: Callable) -> tuple[Callable, Callable]:
+    """Return the VJP maker and the JVP maker of a function of autograd."""
+    function = underflow_safe.get(function, function)
+    return primitive_vjps[function], primitive_jvps[function]
 
 
-def _scaled(*functions, slopes):
-    """Register ``slopes[k](g, value, *args)`` as the derivative of some functions in their argument k.
+# ---- derivatives that divide by no square ----------------------------------------------------------------------------
+
+
+def _replace_derivatives(*functions, slopes):
+    """Register derivatives of some functions for the traces of this module.
 
     autograd divides by squares in the derivatives of these functions. Below 1e-162 such a square underflows, and the
-    derivative becomes NaN or infinite where it is finite. Other users of autograd keep its derivatives.
+    derivative becomes NaN or infinite where it is finite.
+
+    Parameters
+    ----------
+    *functions : callables
+        Names of the same function of autograd.
+    slopes : sequence of callables
+        For each argument ``slope(g, ans, *args)``: g times the derivative of the result `ans` in this argument.
     """
 
     @primitive
-    def scaled(*args):
+    def replacement(*args):
         return functions[0](*args)
 
-    def in_argument(k, slope):
-        return lambda ans, *args: unbroadcast_f(args[k], lambda g: slope(g, ans, *args))
+    def vjp_in(num, slope):
+        return lambda ans, *args: unbroadcast_f(args[num], lambda g: slope(g, ans, *args))
 
-    def forward(slope):
+    def jvp_in(slope):
         return lambda g, ans, *args: match_complex(ans, slope(g, ans, *args))
 
-    defvjp(scaled, *(in_argument(k, slope) for k, slope in enumerate(slopes)))
-    defjvp(scaled, *map(forward, slopes))
-    scaled_rules.update(dict.fromkeys(functions, scaled))
+    defvjp(replacement, *[vjp_in(num, slope) for num, slope in enumerate(slopes)])
+    defjvp(replacement, *[jvp_in(slope) for slope in slopes])
+    for function in functions:
+        underflow_safe[function] = replacement
 
 
-def _angle_slope(g, ans, x):
+def _without_result(slope):
+    """Return a derivative ``slope(g, *args)`` as one that is also given the result."""
+    return lambda g, ans, *args: slope(g, *args)
+
+
+def _exponent_slope(g, ans, x, y):
+    return g * anp.log(replace_zero(x, 1.0)) * ans
+
+
+def _reciprocal_slope(g, x):
+    return -g / x / x
+
+
+def _angle_slope(g, x):
     size = anp.abs(x)
     return g * (anp.conj(x * 1j) / size) / size
 
 
-def _along_hypotenuse(g, x, y, share):
-    """g times a share of x, y over x^2 + y^2."""
+def _arctan2_first_slope(g, x, y):
     r = anp.hypot(x, y)
-    return g * (share / r) / r
+    return g * (y / r) / r
 
 
-_scaled(
+def _arctan2_second_slope(g, x, y):
+    r = anp.hypot(x, y)
+    return g * (-x / r) / r
+
+
+_replace_derivatives(
     anp.true_divide,
     anp.divide,
-    slopes=(lambda g, ans, x, y: g / y, lambda g, ans, x, y: -g * (x / y) / y),
+    slopes=(_without_result(numerator_slope), _without_result(denominator_slope)),
 )
-_scaled(
-    anp.power,
-    slopes=(
-        lambda g, ans, x, y: power_slope(g, x, y),
-        lambda g, ans, x, y: g * anp.log(replace_zero(x, 1.0)) * ans,
-    ),
-)
-_scaled(anp.reciprocal, slopes=(lambda g, ans, x: -g / x / x,))
-_scaled(anp.angle, slopes=(_angle_slope,))
-_scaled(
+_replace_derivatives(anp.power, slopes=(_without_result(power_slope), _exponent_slope))
+_replace_derivatives(anp.reciprocal, slopes=(_without_result(_reciprocal_slope),))
+_replace_derivatives(anp.angle, slopes=(_without_result(_angle_slope),))
+_replace_derivatives(
     anp.arctan2,
-    slopes=(
-        lambda g, ans, x, y: _along_hypotenuse(g, x, y, y),
-        lambda g, ans, x, y: _along_hypotenuse(g, x, y, -x),
-    ),
+    slopes=(_without_result(_arctan2_first_slope), _without_result(_arctan2_second_slope)),
 )
 
 # ---- traces ----------------------------------------------------------------------------------------------------------
 
 
 class Recorder:
-    """Takes down the calls of reverse-mode traces in order: the backward pass need not sort a graph."""
+    """The calls of a reverse-mode trace in order, so that the backward pass need not sort a graph.
 
-    bytes: Any = None  # while it is a number: of the results, and of what stands beside traced values, is added
-    ended = False  # whether the function has returned: nothing goes back through a later call
+    Parameters
+    ----------
+    *witnesses : callables
+        ``see(node, function, value, arguments, options, numbers)`` is called for every node that is created, beside
+        those of `thread.witnesses`.
 
-    def __init__(self, *witnesses):
-        self.nodes: list = []
-        self.witnesses = *thread.witnesses, *witnesses  # see(node, function, value, arguments, options, numbers)
+    Attributes
+    ----------
+    nodes : list of ReverseNode
+        The recorded calls.
+    bytes : int or None
+        If it is a number, the bytes of results and of arguments that are not traced are added to it.
+    ended : bool
+        Whether the traced function has returned: a later call has no derivative and is refused.
+    """
 
-    def root(self):
-        """A fresh start of a reverse-mode trace, whose calls are taken down here."""
+    def __init__(self, *witnesses: Callable):
+        self.nodes: list[ReverseNode] = []
+        self.witnesses = (*thread.witnesses, *witnesses)
+        self.bytes: int | None = None
+        self.ended = False
+
+    def root(self) -> ReverseNode:
+        """Return the node of a new variable of the trace."""
         return ReverseNode.new_root(self)
 
-    def weigh(self, value, args, nums):
-        """One call."""
+    def weigh(self, value: Any, args: Sequence, nums: Sequence[int]) -> None:
+        """Add the bytes of a call to `bytes`."""
+        size = self.bytes or 0
         for num, held in enumerate((*args, value)):
             if num not in nums and type(held) not in FIXED:
-                self.bytes += sum(getattr(leaf, "nbytes", 0) for leaf in leaves(held))
+                size += sum(getattr(leaf, "nbytes", 0) for leaf in leaves(held))
+        self.bytes = size
 
-    def taken(self):
-        """The calls since it was asked last: it forgets them, for they know it, and a circle is freed late."""
-        nodes, self.nodes = self.nodes, []
+    def taken(self) -> list[ReverseNode]:
+        """Return and clear the recorded nodes; this breaks a reference cycle."""
+        nodes = self.nodes
+        self.nodes = []
         return nodes
 
-    def open(self):
-        """Itself, for one more call; refused after the end."""
+    def check_open(self) -> None:
+        """Refuse a call after the end of the trace."""
         if self.ended:
             raise DerivativeError(
-                "a traced value was stored, and is used after the function or the step that made it has ended: its "
+                "a traced value was stored and used after the function or the step that computed it had ended, so its "
                 "derivative would be lost; return it, from a rollout in the state or by keep"
             )
-        return self
 
 
 class ReverseNode(VJPNode):
-    """A call on a reverse-mode trace. Its pullback ``vjp(g, *held)`` sees the constants of the call as they are now."""
+    """A call on a reverse-mode trace.
 
-    __slots__ = ("held", "recorder")
-    parents: Any
+    A tape has very many nodes, and each object in them that Python's garbage collector tracks costs time: most calls
+    have one or two parents, which are stored without a tuple.
+
+    Attributes
+    ----------
+    vjp : callable
+        The pullback ``vjp(g, *held)``.
+    held : tuple
+        What the pullback needs, constants as they were at the call.
+    recorder : Recorder
+    """
+
+    __slots__ = ("_first", "_rest", "held", "recorder")
     vjp: Any
     held: Any
 
+    @property
+    def parents(self) -> tuple:
+        """Nodes of the traced arguments."""
+        rest = self._rest
+        if rest is None:
+            return () if self._first is None else (self._first,)
+        return (self._first, *rest) if type(rest) is tuple else (self._first, rest)
+
     @classmethod
-    def new_root(cls, recorder):
-        """Begin a trace."""
+    def new_root(cls, recorder: Recorder) -> ReverseNode:
+        """Return the node of a variable."""
         root = cls.__new__(cls)
-        root.parents, root.vjp, root.held, root.recorder = (), None, (), recorder
+        root._first = None
+        root._rest = None
+        root.vjp = None
+        root.held = ()
+        root.recorder = recorder
         return root
 
-    def __init__(self, value, fun, args, options, nums, parents):
-        self.parents, self.recorder = parents, parents[0].recorder.open()
-        formulas = refuse_options(fun, options) if options else formulas_of(fun, value, args, nums)
-        if formulas:
-            self.vjp, held = formulas[0](nums, args)
-            self.held = constant_args(held, nums) if len(nums) < len(held) else held
+    def __init__(self, value: Any, function: Callable, args: Any, options: dict, nums: Any, parents: Any):
+        recorder = parents[0].recorder
+        if recorder.ended:
+            recorder.check_open()
+        self.recorder = recorder
+        self._first = parents[0]
+        self._rest = None
+        if len(parents) > 1:
+            self._rest = parents[1] if len(parents) == 2 else tuple(parents[1:])
+        pullback = None
+        if options:
+            refuse_options(function, options)
         else:
-            if len(nums) < len(args) and fun not in sparing:
-                args = constant_args(args, nums)
-            super().__init__(value, scaled_rules.get(fun, fun), args, constant(options), nums, parents)
-            self.held = OPEN if fun is _primitive and args[0].adds else ()
-            if _kind(fun, value, args, nums) == "c":
-                self._keep_real(args, nums)
-        self.recorder.nodes.append(self)
-        if self.recorder.bytes is not None:
-            self.recorder.weigh(value, args, nums)
-        for see in self.recorder.witnesses:
-            see(self, fun, value, args, options, nums)
+            formula = FORMULAS.get(function)
+            if formula is not None:
+                pullback = formula.backward(value, nums, args)
+            if pullback is None and ARRAY_KINDS:
+                formula = distributed_formula(function, value, args, nums)
+                pullback = formula and formula.backward(value, nums, args)
+        if pullback is None:
+            self._differentiate_by_autograd(value, function, args, options, nums)
+        else:
+            self.vjp, held = pullback
+            if len(nums) < len(held):
+                held = constant_args(held, nums)
+            self.held = held
+        recorder.nodes.append(self)
+        if recorder.bytes is not None:
+            recorder.weigh(value, args, nums)
+        for see in recorder.witnesses:
+            see(self, function, value, args, options, nums)
+
+    def _differentiate_by_autograd(self, value, function, args, options, nums):
+        """Set the pullback to that of a function of autograd, or of a rule."""
+        if len(nums) < len(args) and function not in sparing:
+            args = constant_args(args, nums)
+        known = underflow_safe.get(function, function)
+        self.vjp = VJPNode(value, known, args, constant(options), nums, ()).vjp
+        self.held = SUMS if function is _primitive and args[0].adds else ()
+        if _kind(function, value, args, nums) == "c":
+            self._keep_real(args, nums)
 
     def _keep_real(self, args, nums):
-        """Beside complex values autograd hands complex cotangents on to real ones; a tuple, or entries, are neither."""
-        pull, real = self.vjp, [is_variable(x := plain(args[num])) and dtype_of(x).kind != "c" for num in nums]
-        if any(real):
-            self.vjp = lambda g: [anp.real(back) if one else back for one, back in zip(real, pull(g), strict=True)]
+        """Take the real part of cotangents of real arguments: beside complex ones autograd returns complex ones.
+
+        A tuple, or entries of an array, are neither real nor complex.
+        """
+        pull = self.vjp
+        is_real = []
+        for num in nums:
+            x = plain(args[num])
+            is_real.append(is_variable(x) and dtype_of(x).kind != "c")
+
+        def real_pull(g):
+            cotangents = zip(is_real, pull(g), strict=True)
+            return [anp.real(cotangent) if real else cotangent for real, cotangent in cotangents]
+
+        if any(is_real):
+            self.vjp = real_pull
 
 
 class UntapedNode(Node):
-    """A call of a step that will be run again on a tape: it tells that the result is traced, and holds nothing."""
+    """A call of a step that will be computed again on a tape: it shows that the result is traced, and holds nothing."""
 
     __slots__ = ("recorder",)
     recorder: Any
 
-    def initialize_root(self, recorder):
+    def initialize_root(self, recorder: Recorder) -> None:
         """Begin a trace."""
         self.recorder = recorder
 
-    def __init__(self, value, fun, args, options, nums, parents):
-        self.recorder = parents[0].recorder.open()
+    def __init__(self, value: Any, function: Callable, args: Any, options: dict, nums: Any, parents: Any):
+        self.recorder = parents[0].recorder
+        self.recorder.check_open()
 
 
 class ForwardNode(JVPNode):
-    """A call on a forward-mode trace."""
+    """A call on a forward-mode trace, with its tangent `g`."""
 
     __slots__ = ()
     g: Any
 
-    def __init__(self, value, fun, args, options, nums, parents):
-        if formulas := refuse_options(fun, options) if options else formulas_of(fun, value, args, nums):
-            total: Any = None
-            for num, parent in zip(nums, parents, strict=True):
-                g = formulas[1](parent.g, num, args, value.shape)
-                total = (g, False) if total is None and type(g) in NUMBERS else added(total, g)
-            self.g = total[0]
+    def __init__(self, value: Any, function: Callable, args: Any, options: dict, nums: Any, parents: Any):
+        formula = None
+        if options:
+            refuse_options(function, options)
         else:
-            _kind(fun, value, args, nums)
-            super().__init__(value, scaled_rules.get(fun, fun), args, options, nums, parents)
+            formula = FORMULAS.get(function)
+            if formula is not None and formula.backward(value, nums, args) is None:
+                formula = None
+            if formula is None and ARRAY_KINDS:
+                formula = distributed_formula(function, value, args, nums)
+        if formula is None:
+            _kind(function, value, args, nums)
+            super().__init__(value, underflow_safe.get(function, function), args, options, nums, parents)
+            return
+        total: Any = None
+        for num, parent in zip(nums, parents, strict=True):
+            g = formula.forward(parent.g, num, args, np.shape(value))
+            total = (g, False) if total is None and type(g) in NUMBERS else added(total, g)
+        self.g = total[0]
 
 
-def _kind(fun, value, args, nums):
-    """The kind of dtype of a result. Traced values inside a list escape autograd: what they give is refused.
+def _kind(function, value, args, nums):
+    """Return the kind of dtype of a result; refuse traced values inside a list, which autograd does not see.
 
-    They give an array of objects, or as in a product of two vectors one traced value.
+    They give an array of objects or, as in a product of two vectors, one traced value.
     """
     kind = getattr(plain(value), "dtype", FLOAT).kind
-    beside = (arg for num, arg in enumerate(args) if num not in nums and type(arg) in (list, tuple))
-    if kind == "O" or (isbox(value) and any(map(isbox, leaves([*beside])))):
+    hidden = kind == "O"
+    if isbox(value) and not hidden:
+        constants = [arg for num, arg in enumerate(args) if num not in nums and type(arg) in (list, tuple)]
+        hidden = any(map(isbox, leaves(constants)))
+    if hidden:
         raise DerivativeError(
-            f"{fun.__name__} got a list that holds traced values, and their derivatives would be lost; "
+            f"{function.__name__} got a list that holds traced values, and their derivatives would be lost; "
             "write anp.array([...]) around it, with autograd.numpy as anp"
         )
     return kind
 
 
 untraced = notrace_primitives  # by kind of node, functions that leave the tape
-untraced[ReverseNode] = untraced[UntapedNode] = untraced[VJPNode]
+untraced[ReverseNode] = untraced[VJPNode]
+untraced[UntapedNode] = untraced[VJPNode]
 untraced[ForwardNode] = untraced[JVPNode]
 untaped_root = UntapedNode.new_root
-forward_root = ForwardNode.new_root  # a fresh start of a forward-mode trace, with its tangent
+forward_root = ForwardNode.new_root  # begins a forward-mode trace with its tangent
+OWN_NODES = {ReverseNode, UntapedNode, ForwardNode}
 
-_numbers = numbers_from(trace_stack.top + 1)
+
+_numbers = count_from(trace_stack.top + 1)
 
 
-def new_trace():
-    """The number of a trace that begins: larger than those of the traces it is nested in, and never given twice."""
+def new_trace() -> int:
+    """Return the number of a new trace: larger than those of the traces that it is nested in, and unique."""
     return next(_numbers)
 
 
 @contextmanager
-def _new_trace():
-    """The same for autograd's own traces: it counts up and down, and the inner of two could get the smaller number."""
+def _new_autograd_trace():
+    """Number a trace of autograd in the same sequence.
+
+    autograd counts the open traces of all threads up and down. Of two nested traces, one of them of this module or of
+    another thread, the inner one could get the smaller number, and its derivative would be wrong.
+    """
     yield new_trace()
 
 
-trace_stack.new_trace = _new_trace
+trace_stack.new_trace = _new_autograd_trace
 
 
-def traces_of(values):
-    """The numbers of all traces that lead to some values."""
+def traces_of(values: Iterable) -> set[int]:
+    """Return the numbers of all traces of some values."""
     numbers = set()
     for value in values:
         while isbox(value):
@@ -264,70 +429,114 @@ def traces_of(values):
     return numbers
 
 
-def innermost(values):
-    """Return the numbers of the values on the innermost trace of all, if that is a reverse-mode one."""
-    number = max((value._trace for value in values if isbox(value)), default=None)
-    nums = [num for num, value in enumerate(values) if isbox(value) and value._trace == number]
+def innermost(values: Sequence) -> list[int]:
+    """Return the positions of the values on the innermost trace, if that is a reverse-mode trace; else none."""
+    trace = max((value._trace for value in values if isbox(value)), default=None)
+    nums = [num for num, value in enumerate(values) if isbox(value) and value._trace == trace]
     return nums if any(isinstance(values[num]._node, VJPNode) for num in nums) else []
 
 
-def boxed(values, roots, number):
-    """Values -> the same, those with a root on the trace of this number."""
+def boxed(values: Iterable, roots: Iterable, number: int) -> list:
+    """Return values as a list, those with a root as traced values of the trace with this number."""
     return [x if root is None else new_box(x, number, root) for x, root in zip(values, roots, strict=True)]
 
 
-def split_boxes(values, number):
-    """Values -> those below the boxes of this trace, and the nodes of the boxes (None where there is none)."""
-    below, nodes = list(values), [None] * len(values)
+def split_boxes(values: Iterable, number: int) -> tuple[list, list]:
+    """Split traced values of the trace with this number.
+
+    Returns
+    -------
+    below : list
+        The values; other values are returned as they are.
+    nodes : list
+        The nodes of the traced values; None for other values.
+    """
+    below = list(values)
+    nodes: list = [None] * len(below)
     for k, value in enumerate(below):
-        if isbox(value):
-            if value._trace == number:
-                below[k], nodes[k] = value._value, value._node
-            elif hasattr(value._node, "recorder"):
-                value._node.recorder.open()
+        if not isbox(value):
+            continue
+        if value._trace == number:
+            below[k] = value._value
+            nodes[k] = value._node
+        elif hasattr(value._node, "recorder"):
+            value._node.recorder.check_open()
     return below, nodes
 
 
-def backward(nodes, ends, cotangents, sums):
-    """Hand cotangents of `ends` back through the calls `nodes`, recorded in order.
+# ---- the backward pass -----------------------------------------------------------------------------------------------
 
-    `ends`, `cotangents`: lists, None where there is none. `sums`: {node: (sum so far, whether it may be written to)},
-    to which those of roots, and of calls elsewhere, are added.
+
+def backward(nodes: Sequence[ReverseNode], ends: Sequence, cotangents: Sequence, sums: dict) -> None:
+    """Propagate cotangents through recorded calls.
+
+    Parameters
+    ----------
+    nodes : sequence of ReverseNode
+        In the order of the calls.
+    ends : sequence
+        Nodes of the results, or None.
+    cotangents : sequence
+        Of the results, or None.
+    sums : dict
+        By node, the pair (sum of its cotangents, whether the sum may be written to). The cotangents of roots, and of
+        calls that are not in `nodes`, are added to it.
     """
     for end, g in zip(ends, cotangents, strict=True):
         if end is not None and g is not None:
             sums[end] = added(sums[end], g) if end in sums else (g, False)
     for node in reversed(nodes):
         total = sums.pop(node, None)
-        if total is not None:
-            adds = node.held is OPEN
-            held = [_open(sums.get(parent)) for parent in node.parents] if adds else node.held
-            for parent, g in zip(node.parents, node.vjp(total[0], *held), strict=True):
-                total = sums.get(parent)
-                if total is None and type(g) in NUMBERS:
-                    sums[parent] = g, adds and type(g) is np.ndarray
-                elif not (adds and total is not None and total[0] is g):  # else the rule has added it
-                    sums[parent] = added(total, g)
+        if total is None:
+            continue
+        held = node.held
+        if held is SUMS:
+            _pull_into_sums(node, total[0], sums)
+            continue
+        for parent, g in zip(node.parents, node.vjp(total[0], *held), strict=True):
+            total = sums.get(parent)
+            if total is None and type(g) in NUMBERS:
+                sums[parent] = (g, False)
+            else:
+                sums[parent] = added(total, g)
 
 
-OPEN: tuple = Part()  # held of a call whose pullback gets the sums so far instead
+# Marks a call whose pullback is called ``pull(g, *sums)`` instead of ``pull(g, *held)``, see `Rule`.
+SUMS: tuple = Part()
+
+
+def _pull_into_sums(node, g, sums):
+    """Propagate a cotangent through a call whose pullback may add its results to the sums of its parents."""
+    open_sums = [_open(sums.get(parent)) for parent in node.parents]
+    for parent, cotangent in zip(node.parents, node.vjp(g, *open_sums), strict=True):
+        total = sums.get(parent)
+        if total is None and type(cotangent) in NUMBERS:
+            sums[parent] = (cotangent, type(cotangent) is np.ndarray)
+        elif total is None or total[0] is not cotangent:  # else the pullback has added it
+            sums[parent] = added(total, cotangent)
 
 
 def _open(total):
-    """(Sum so far, whether it may be written to) or None -> the array that may be written to, or None."""
+    """Return the array of a sum of cotangents if it may be written to, else None."""
     return total[0] if total is not None and total[1] and type(total[0]) is np.ndarray else None
 
 
-def added(total, g):
-    """(Sum so far, whether it may be written to) or None, a cotangent -> the new pair."""
+def added(total: tuple | None, g: Any) -> tuple:
+    """Add a cotangent to a sum of cotangents.
+
+    Parameters
+    ----------
+    total : (Any, bool) or None
+        The sum, and whether it may be written to.
+    g : Any
+
+    Returns
+    -------
+    (Any, bool)
+    """
     kind = type(g)
     if kind is Part:
-        g, index, _ = part = g
-        if total is not None and total[1] and type(total[0]) is np.ndarray and type(g) in REAL:
-            total[0][index] += g
-            return total
-        whole = _whole(*part) if total is None else total[0] + _whole(*part)
-        return whole, type(whole) is np.ndarray
+        return _add_part(total, g)
     if total is None or kind is not type(total[0]) or kind not in NUMBERS or total[0].dtype != g.dtype:
         return add_outgrads(total, g)
     if kind is np.float64:
@@ -335,85 +544,166 @@ def added(total, g):
     return np.add(total[0], g, out=total[0] if total[1] else None), True
 
 
+def _add_part(total, part):
+    """Add the cotangent of an entry or part of an array to a sum of cotangents of the array."""
+    g, index, _ = part
+    if total is not None and total[1] and type(total[0]) is np.ndarray and type(g) in REAL:
+        total[0][index] += g
+        return total
+    whole = _whole(*part)
+    if total is not None:
+        whole = total[0] + whole
+    return whole, type(whole) is np.ndarray
+
+
 def _whole(g, index, shape):
-    """A part of a cotangent, traced or not -> the array around it."""
+    """Return an array of zeros around a part of it, which may be traced."""
 
     def around(g):
         whole = np.zeros(shape)
         whole[index] = g
         return whole[()]
 
-    return linear("entries", around, lambda whole: whole[index])[0](g) if isbox(g) else around(g)
+    if not isbox(g):
+        return around(g)
+    embed, _ = linear("entries", around, lambda whole: whole[index])
+    return embed(g)
 
 
 # ---- calls -----------------------------------------------------------------------------------------------------------
 
 
-def direct(function):
-    """A primitive of autograd -> the same, which asks autograd only where traces are nested."""
+def direct(function: Any) -> Callable:
+    """Return a primitive of autograd in a faster form: autograd is called only for its own and for nested traces."""
     raw = function.fun
 
     @wraps(function)
     def call(*args):
-        values, nums, parents, trace = list(args), (), [], None  # type: list, Any, list, Any
+        values: list | None = None
+        nums: tuple[int, ...] = ()
+        parents: tuple = ()
+        trace = 0
         for num, arg in enumerate(args):
-            kind = type(arg)
-            if kind in box_types:
-                value = arg._value
-                if type(value) in box_types or (nums and arg._trace != trace):
-                    return function(*args)
-                values[num], trace = value, arg._trace
-                nums = (*nums, num)
-                parents.append(arg._node)
-        ans = raw(*values)
-        if not nums:
-            return ans
-        return new_box(ans, trace, type(parents[0])(ans, function, values, {}, nums, parents))
+            if type(arg) not in box_types:
+                continue
+            value = arg._value
+            node = arg._node
+            if type(value) in box_types or type(node) not in OWN_NODES:
+                return function(*args)
+            if values is None:
+                values = list(args)
+                trace = arg._trace
+            elif arg._trace != trace:
+                return function(*args)
+            values[num] = value
+            nums = (*nums, num)
+            parents = (*parents, node)
+        if values is None:
+            return raw(*args)
+        answer = raw(*values)
+        return new_box(answer, trace, type(node)(answer, function, values, {}, nums, parents))
 
     return call
 
 
-def _of_two(function):
-    """The same for two operands. One that is not PLAIN may act itself, as NumPy's operators ask: left to autograd."""
-    raw, kinds = function.fun, PLAIN if function is ITEM else PLAIN - {list, tuple}
-    quick = ACTS.get(function, raw)
+def _binary(function):
+    """Return a primitive of autograd for two operands in a faster form, see `direct`.
+
+    An operand whose type is not PLAIN may have an operator of its own, as those of NumPy expect: autograd decides.
+    """
+    raw = function.fun
+    quick = PYTHON_OPERATORS.get(function, raw)
+    plain_types = PLAIN if function is ITEM else PLAIN - {list, tuple}
+
+    def ask_autograd(x, y):
+        if function is ITEM:
+            return function(x, y)
+        return function(operand(x), operand(y))
 
     @wraps(function)
     def call(x, y):
-        left, right = type(x), type(y)
-        if left is BOX and right in kinds:
-            a, b, trace, nums, parents = x._value, y, x._trace, (0,), (x._node,)  # type: Any, Any, Any, tuple, tuple
-        elif left in kinds:  # the other one is traced
-            a, b, trace, nums, parents = x, y._value, y._trace, (1,), (y._node,)
-        elif left is right is BOX and x._trace == y._trace:
-            a, b, trace, nums, parents = x._value, y._value, x._trace, (0, 1), (x._node, y._node)
-        else:
-            return function(x, y) if function is ITEM else function(operand(x), operand(y))
+        nums: tuple[int, ...]
+        parents: tuple
+        if type(x) is BOX:
+            node = x._node
+            if type(node) not in OWN_NODES:
+                return function(x, y)
+            trace = x._trace
+            a = x._value
+            if type(y) is BOX:
+                if y._trace != trace:
+                    return function(x, y)
+                b = y._value
+                nums = BOTH
+                parents = (node, y._node)
+            elif type(y) in plain_types:
+                b = y
+                nums = FIRST
+                parents = (node,)
+            else:
+                return ask_autograd(x, y)
+        else:  # y is traced
+            node = y._node
+            if type(node) not in OWN_NODES:
+                return function(x, y)
+            if type(x) not in plain_types:
+                return ask_autograd(x, y)
+            trace = y._trace
+            a = x
+            b = y._value
+            nums = SECOND
+            parents = (node,)
         if type(a) is BOX or type(b) is BOX:
             return function(x, y)
-        ans = quick(a, b) if type(a) in NUMBERS or type(b) in NUMBERS else raw(a, b)
-        return new_box(ans, trace, type(parents[0])(ans, function, (a, b), {}, nums, parents))
+        answer = quick(a, b) if type(a) in NUMBERS or type(b) in NUMBERS else raw(a, b)
+        node = type(node)(answer, function, (a, b), {}, nums, parents)
+        return BOX(answer, trace, node) if type(answer) in NUMBERS else new_box(answer, trace, node)
 
     return call
 
 
+def _reflected(act):
+    return lambda box, other: act(other, box)
+
+
+def _shape(box):
+    value = box._value
+    return value.shape if type(value) in NUMBERS else np.shape(value)
+
+
 def _install():
-    """Give autograd's traced values quick operators, and its maker of arrays a quick way."""
-    BOX.shape, BOX.__getitem__ = property(lambda box: np.shape(box._value)), _of_two(ITEM)
+    """Give the traced values of autograd the faster operators, which leave all other traces to autograd."""
+    BOX.shape = property(_shape)
+    BOX.__getitem__ = _binary(ITEM)
+    BOX.__neg__ = direct(anp.negative)
     for name, function in OPERATORS.items():
-        act = _of_two(function)
+        act = _binary(function)
         setattr(BOX, f"__{name}__", act)
-        setattr(BOX, f"__r{name}__", lambda box, other, act=act: act(other, box))
-    BOX.__neg__, copy = direct(anp.negative), direct(COPY)
+        setattr(BOX, f"__r{name}__", _reflected(act))
+
+    copy = direct(COPY)
 
     @wraps(COPY)
     def copy_of(args, options, value):
-        """A number needs no copy."""
-        number = type(value) in box_types and type(value._value) is np.float64 and not (args or options)
-        return value if number else copy(args, options, value)
+        if type(value) in box_types and type(value._value) is np.float64 and type(value._node) in OWN_NODES:
+            if not (args or options):
+                return value  # a number needs no copy
+        return copy(args, options, value)
 
-    for name, function in zip(MAKERS, (copy_of, direct(ARRAY)), strict=True):
-        setattr(anp.numpy_wrapper, name, function)
+    setattr(anp.numpy_wrapper, MAKERS[0], copy_of)
+    setattr(anp.numpy_wrapper, MAKERS[1], direct(ARRAY))
+
+    constant_full_like = anp.full_like
+
+    @wraps(constant_full_like)
+    def full_like(a, fill_value, *args, **options):
+        """Fill an array as NumPy does. autograd takes a traced fill value for a constant."""
+        answer = constant_full_like(a, fill_value, *args, **options)
+        if type(fill_value) is BOX and type(fill_value._node) in OWN_NODES and answer.dtype.kind in "fc":
+            return (np.zeros_like(answer) + fill_value).astype(answer.dtype)
+        return answer
+
+    anp.full_like = full_like
 
 
 _install()
@@ -422,32 +712,40 @@ _install()
 # ---- rules -----------------------------------------------------------------------------------------------------------
 
 
-def differentiable(name, forward, vjp=None, jvp=None, keywords=()):
-    """Function + hand-written derivatives -> Rule that autograd can differentiate.
+def differentiable(
+    name: str,
+    forward: Callable,
+    vjp: Callable | None = None,
+    jvp: Callable | None = None,
+    keywords: Sequence[str] = (),
+) -> Rule:
+    """Return a function with hand-written derivatives.
 
     Parameters
     ----------
-    name : str, for errors and counts
+    name : str
+        Shown in errors and counts.
     forward : callable
         ``forward(*args) -> ans`` on plain values; `ans` is an array, a float, or a tuple of arrays.
     vjp : callable, optional
         ``vjp(nums, ans, *args) -> pull``, called once; ``pull(g)`` is a tuple of a cotangent for each place in `nums`.
     jvp : callable, optional
         ``jvp(nums, tangents, ans, *args) -> tangent of ans``.
-    keywords : tuple of str
+    keywords : sequence of str
         Trailing arguments of `forward` that a caller may pass by keyword; they are traced like the others.
 
     Returns
     -------
     Rule
-        Call it like `forward`. `vjp` and `jvp` use `ans`, `args` and `g` only through other rules, Operators or
-        autograd.numpy: then derivatives of every order follow. What the three functions return is copied: each may
-        return one array of its own again and again. Into the arrays that they are given they cannot write.
+        Call it like `forward`. If `vjp` and `jvp` use `ans`, `args` and `g` only through other rules, Operators or
+        autograd.numpy, derivatives of every order follow. What the three functions return is copied: each may return
+        the same array again and again. The arrays that they are given are read-only.
 
     Raises
     ------
     DerivativeError
-        When a traced value comes where there is no derivative, or a cotangent has a wrong number, shape or dtype.
+        On use, if a traced value is given where there is no derivative, or a cotangent has a wrong number, shape or
+        dtype.
 
     Notes
     -----
@@ -461,41 +759,80 @@ def differentiable(name, forward, vjp=None, jvp=None, keywords=()):
     >>> value_and_grad(cube)(2.0)
     (8.0, 12.0)
     """
-    given = name, forward, vjp, jvp, tuple(keywords)
-    made = differentiable, given
-    back = vjp and (lambda *args: _apart(vjp(*map(frozen, args))))
-    along = jvp and _apart(lambda nums, tangents, *args: jvp(nums, [*map(frozen, tangents)], *args))
-    return Rule(name, _apart(forward), back, along, given[-1], made)
+    keywords = tuple(keywords)
+    made = differentiable, (name, forward, vjp, jvp, keywords)
+    isolated_vjp = None if vjp is None else _isolated_vjp(vjp)
+    isolated_jvp = None if jvp is None else _isolated_jvp(jvp)
+    return Rule(name, _isolated(forward), isolated_vjp, isolated_jvp, keywords, made)
 
 
-def _apart(function):
-    """A function of the user apart from the tape: it may write into what it returned, not into what it is given."""
-    return wraps(function)(lambda *args: copied(function(*map(frozen, args))))  # it has the signature of the function
+def _isolated(function):
+    """Return a user's function with read-only arguments and copied results, and with its signature."""
+    return wraps(function)(lambda *args: copied(function(*map(frozen, args))))
+
+
+def _isolated_vjp(vjp):
+    """Return a user's `vjp` with read-only arguments, whose pullback is isolated too."""
+
+    def isolated(*args):
+        return _isolated(vjp(*map(frozen, args)))
+
+    return isolated
+
+
+def _isolated_jvp(jvp):
+    """Return a user's `jvp` with read-only arguments, tangents too, and copied results."""
+
+    def on_frozen_tangents(nums, tangents, *args):
+        return jvp(nums, [frozen(tangent) for tangent in tangents], *args)
+
+    return _isolated(on_frozen_tangents)
 
 
 class Rule(Remade):
-    """A function with hand-written derivatives whose results are fresh arrays. Users make one with `differentiable`.
+    """A function with hand-written derivatives that returns fresh arrays. Users create one with `differentiable`.
 
-    `adds`: what `vjp` returns is called ``pull(g, *sums)``, for each cotangent with an array that holds the sum of
-    others so far, or None. It may add its own to that, and return it; all else that it returns is fresh.
+    Parameters
+    ----------
+    name : str
+    forward, vjp, jvp : callable
+        As of `differentiable`.
+    keywords : tuple of str
+    made : (callable, tuple), optional
+        The function and arguments that construct the rule again; default: this class.
+
+    Attributes
+    ----------
+    adds : bool
+        Whether pullbacks are called ``pull(g, *sums)``, with for each cotangent an array that holds the sum of others,
+        or None. The pullback may add its own cotangent to that array and return it; all else it returns is fresh.
     """
 
     adds = False
 
-    def __init__(self, name, forward, vjp=None, jvp=None, keywords=(), made=None):
+    def __init__(
+        self,
+        name: str,
+        forward: Callable,
+        vjp: Callable | None = None,
+        jvp: Callable | None = None,
+        keywords: tuple[str, ...] = (),
+        made: tuple | None = None,
+    ):
         self.name = name
         self.forward = forward
         self.vjp = vjp
         self.jvp = jvp
         self.keywords = keywords
-        self.made = made or (Rule, (name, forward, vjp, jvp, keywords))  # see _utils/reconstruction.py
+        self.made = made or (Rule, (name, forward, vjp, jvp, keywords))
 
-    def __call__(self, *args, **options):
+    def __call__(self, *args: Any, **options: Any) -> Any:
         if self.keywords or options:
             args = self._positional(args, options)
         return _call(self, *args)
 
     def _positional(self, args, options):
+        """Return all arguments by position."""
         for key in options:
             if key not in self.keywords:
                 raise DerivativeError(f"{self.name} takes no keyword {key!r}; pass the value by position")
@@ -505,7 +842,7 @@ class Rule(Remade):
 
     @cached_property
     def _signature(self):
-        """How it is called. A function that does not tell, as NumPy's own did not in 1.26, takes all by position."""
+        """The signature of the function. One without a signature, as in NumPy 1.26, takes all by position."""
         try:
             return inspect.signature(self.forward)
         except (TypeError, ValueError):
@@ -516,6 +853,7 @@ class Rule(Remade):
 
 
 def _run(rule, *args):
+    """Call the function of a rule on plain values."""
     for arg in args:
         if type(arg) is not np.ndarray and isinstance(arg, (tuple, list, dict)) and any(map(isbox, leaves(arg))):
             raise DerivativeError(
@@ -528,56 +866,66 @@ _primitive = primitive(_run)
 _call = direct(_primitive)
 
 
-def through(rule, nums, *args):
-    """A call of a rule whose forward and VJP take values of outer traces, and hand their cotangents on.
+def through(rule: Rule, nums: Sequence[int], *args: Any) -> Any:
+    """Call a rule whose functions take values of outer traces and propagate their cotangents themselves.
 
-    Only the innermost trace, of the arguments `nums`, gets a node; all others go through those functions.
+    Only the innermost trace, which is that of the arguments `nums`, gets a node.
     """
     if not nums:
         return _run(rule, *args)
     values = [arg._value if num in nums else arg for num, arg in enumerate(args)]
     parents = [args[num]._node for num in nums]
-    ans = _run(rule, *values)
-    node = type(parents[0])(ans, through, (rule, *values), {}, [num + 1 for num in nums], parents)
-    return new_box(ans, args[nums[0]]._trace, node)
+    answer = _run(rule, *values)
+    node = type(parents[0])(answer, through, (rule, *values), {}, [num + 1 for num in nums], parents)
+    return new_box(answer, args[nums[0]]._trace, node)
 
 
-def _call_vjp(argnums, ans, args, kwargs):
-    rule, nums = args[0], tuple([num - 1 for num in argnums])
+def _call_vjp(argnums, ans, args, options):
+    """Return the pullback of a call of a rule, which checks what the rule returns."""
+    rule = args[0]
+    nums = tuple([num - 1 for num in argnums])
     if rule.vjp is None:
         raise DerivativeError(f"{rule.name} has no VJP; give differentiable(...) a vjp")
     values = constant_args(args[1:], nums)
     if active:
-        names = list(rule._signature.parameters)  # of the arguments that could have a derivative, and nobody asks for
-        for num, value in enumerate(values):
-            if num not in nums and is_variable(value):
-                note(rule.name, "not asked", names[min(num, len(names) - 1)])
+        _note_not_asked(rule, nums, values)
     pull = rule.vjp(nums, ans, *values)
 
     def checked_pull(g, *sums):
-        backs = timed(rule.name, "vjp", pull, g, *sums)
-        several = isinstance(backs, (tuple, list))
-        if not several or len(backs) != len(nums):  # autograd would accept it silently
-            returned = len(backs) if several else type(backs).__name__
+        cotangents = timed(rule.name, "vjp", pull, g, *sums)
+        is_sequence = isinstance(cotangents, (tuple, list))
+        if not is_sequence or len(cotangents) != len(nums):  # autograd would accept it silently
+            returned = len(cotangents) if is_sequence else type(cotangents).__name__
             raise DerivativeError(
                 f"{rule.name} must return one derivative for each of the {len(nums)} values asked for, "
                 f"got {returned}; return a tuple"
             )
-        return [fit(rule.name, values[num], back, g) for num, back in zip(nums, backs, strict=True)]
+        pairs = zip(nums, cotangents, strict=True)
+        return [fit(rule.name, values[num], cotangent, g) for num, cotangent in pairs]
 
     return checked_pull
 
 
-def _call_jvp(argnums, tangents, ans, args, kwargs):
+def _note_not_asked(rule, nums, values):
+    """Note the arguments of a rule that could have a derivative, but are not traced."""
+    names = list(rule._signature.parameters)
+    for num, value in enumerate(values):
+        if num not in nums and is_variable(value):
+            note(rule.name, "not asked", names[min(num, len(names) - 1)])
+
+
+def _call_jvp(argnums, tangents, ans, args, options):
+    """Return the tangent of a call of a rule."""
     rule = args[0]
     if rule.jvp is None:
         raise DerivativeError(f"{rule.name} has no JVP; give differentiable(...) a jvp")
-    if any(map(isbox, (*tangents, *args))):  # inside a reverse-mode trace: its pullback runs later
+    if any(map(isbox, (*tangents, *args))):  # inside a reverse-mode trace, whose pullback runs later
         args = constant_args(args, argnums)
     count(rule.name, "jvp")
     tangent = rule.jvp(tuple(num - 1 for num in argnums), tangents, ans, *args[1:])
-    # Several results come as a tuple, and the rule itself checks each.
-    return tangent if isinstance(plain(ans), tuple) else fit(rule.name, ans, tangent, tangents[0])
+    if isinstance(plain(ans), tuple):  # the rule itself checks each result
+        return tangent
+    return fit(rule.name, ans, tangent, tangents[0])
 
 
 defvjp_argnums(_primitive, _call_vjp)
@@ -585,34 +933,60 @@ defvjp_argnums(through, _call_vjp)
 defjvp_argnums(_primitive, _call_jvp)
 
 
-def fit(name, value, cotangent, g):
-    """Check a derivative of `value` that was computed from `g`, and give it the dtype of `value`."""
+def fit(name: str, value: Any, cotangent: Any, g: Any) -> Any:
+    """Check a derivative of a value, and convert it to the dtype of the value.
+
+    Parameters
+    ----------
+    name : str
+        Of the rule that returned the derivative.
+    value : Any
+        Plain or traced.
+    cotangent : Any
+        The derivative.
+    g : Any
+        The cotangent or tangent from which it was computed.
+
+    Raises
+    ------
+    ShapeError
+        If it has another shape than the value.
+    DerivativeError
+        If it is complex and the value real, or its dtype cannot be converted.
+    """
     if type(cotangent) is type(value) and type(value) in NUMBERS:
         if cotangent.shape == value.shape and cotangent.dtype == value.dtype:
             return cotangent
-    cotangent = match_value(np.asarray(cotangent) if isinstance(cotangent, list) else cotangent, value)
-    shape, wanted = np.shape(plain(cotangent)), np.shape(plain(value))
-    if shape != wanted:
-        raise ShapeError(f"{name} returned a derivative of shape {shape} where {wanted} is needed")
+    if isinstance(cotangent, list):
+        cotangent = np.asarray(cotangent)
+    cotangent = match_value(cotangent, value)
+    shape = np.shape(plain(cotangent))
+    expected_shape = np.shape(plain(value))
+    if shape != expected_shape:
+        raise ShapeError(f"{name} returned a derivative of shape {shape} where {expected_shape} is needed")
     if type(cotangent) is np.ndarray and not isinstance(plain(value), np.ndarray):
         cotangent = cotangent[()]  # a number, as the value is
-    kind, precise = dtype_of(cotangent), dtype_of(value)
-    if kind == precise:
+    dtype = dtype_of(cotangent)
+    precise = dtype_of(value)
+    if dtype == precise:
         return cotangent
-    if kind.kind == "c" != precise.kind:
+    if dtype.kind == "c" != precise.kind:
         raise DerivativeError(f"{name} returned a complex derivative of a real value; take its real part")
-    if kind.kind not in "fc" or np.finfo(kind).eps > max(np.finfo(dtype_of(x)).eps for x in leaves((value, plain(g)))):
-        raise DerivativeError(f"{name} returned a derivative of dtype {kind} where {precise} is needed")
+    if dtype.kind not in "fc" or np.finfo(dtype).eps > max(
+        np.finfo(dtype_of(x)).eps for x in leaves((value, plain(g)))
+    ):
+        raise DerivativeError(f"{name} returned a derivative of dtype {dtype} where {precise} is needed")
     return cast(cotangent, precise)
 
 
-def dtype_of(value):
+def dtype_of(value: Any) -> np.dtype:
+    """Return the dtype of a value, plain or traced."""
     value = plain(value)
     return value.dtype if hasattr(value, "dtype") else np.asarray(value).dtype
 
 
-def cast(g, dtype):
-    """Array or traced array -> the same numbers in `dtype` (real part if `dtype` is real)."""
+def cast(g: Any, dtype: DTypeLike) -> Any:
+    """Return an array, plain or traced, in another dtype; its real part if the dtype is real."""
     if dtype_of(g).kind == "c" and np.dtype(dtype).kind == "f":
         g = anp.real(g)
     if dtype_of(g) == dtype:
@@ -625,14 +999,22 @@ def cast(g, dtype):
     return rule(g)
 
 
-def linear(name, forward, transpose):
-    """Name, linear ``forward(x)``, its ``transpose(g)`` on plain arrays -> two rules, each the other's derivative."""
-    there = Rule(name, forward)
-    back = Rule(f"{name}.T", transpose)
-    for rule, transposed in ((there, back), (back, there)):
-        rule.vjp = lambda nums, ans, x, act=transposed: lambda g: (act(g),)
-        rule.jvp = lambda nums, tangents, ans, x, act=rule: act(tangents[0])
-    return there, back
+def linear(name: str, forward: Callable, transpose: Callable) -> tuple[Rule, Rule]:
+    """Return a linear function and its transpose as two rules, each the derivative of the other.
+
+    Parameters
+    ----------
+    name : str
+    forward, transpose : callable
+        ``forward(x)`` and ``transpose(g)``, on plain arrays.
+    """
+    act = Rule(name, forward)
+    transposed = Rule(f"{name}.T", transpose)
+    act.vjp = lambda nums, ans, x: lambda g: (transposed(g),)
+    act.jvp = lambda nums, tangents, ans, x: act(tangents[0])
+    transposed.vjp = lambda nums, ans, x: lambda g: (act(g),)
+    transposed.jvp = lambda nums, tangents, ans, x: transposed(tangents[0])
+    return act, transposed
 
 
 def _apply(op, u):
@@ -640,10 +1022,10 @@ def _apply(op, u):
 
 
 _operator = primitive(_apply)
-apply_operator = direct(_operator)  # a field through an Operator: half a rule's cost
+apply_operator = direct(_operator)  # ``apply_operator(op, u)`` costs half of a call of a rule
 
 
-def _operator_vjp(argnums, ans, args, kwargs):
+def _operator_vjp(argnums, ans, args, options):
     op, u = args
     dtype = u.dtype
     reference = op.backend.reference(u)  # the tape does not keep u
@@ -651,30 +1033,30 @@ def _operator_vjp(argnums, ans, args, kwargs):
 
     def pull(g):
         act = partial(apply_operator, op.T) if isbox(g) else op.T.apply
-        back = timed(op.name, "vjp", act, g)
-        return (cast(match_value(back, reference), dtype),)
+        cotangent = timed(op.name, "vjp", act, g)
+        return (cast(match_value(cotangent, reference), dtype),)
 
     return pull
 
 
-def _operator_jvp(argnums, tangents, ans, args, kwargs):
+def _operator_jvp(argnums, tangents, ans, args, options):
     op = args[0]
     count(op.name, "jvp")
     tangent = tangents[0]
     return apply_operator(op.tangent, tangent) if isbox(tangent) else op.tangent.apply(tangent)
 
 
-# Shapes of their constants are all they need, or they call `constant_args` themselves.
+# Their pullbacks need only the shapes of constants, or call `constant_args` themselves.
 sparing.update((_primitive, _operator, through, anp.add, anp.subtract, anp.concatenate_args, ARRAY, COPY))
 defvjp_argnums(_operator, _operator_vjp)
 defjvp_argnums(_operator, _operator_jvp)
 
 
-def is_variable(leaf):
-    """Whether a leaf can carry a derivative: a floating number or array, or a traced one."""
+def is_variable(leaf: Any) -> bool:
+    """Whether a leaf can have a derivative: a floating number or array, plain or traced."""
     return isbox(leaf) or isinstance(leaf, (float, complex)) or getattr(getattr(leaf, "dtype", 0), "kind", "-") in "fc"
 
 
-def called(fun, args):
-    """The rule or Operator behind a node that called fun(*args); for autograd's own functions `fun`."""
-    return args[0] if fun in (_primitive, _operator, through) else fun
+def called(function: Callable, args: Sequence) -> Any:
+    """Return the rule or Operator of a recorded call ``function(*args)``; for functions of autograd `function`."""
+    return args[0] if function in (_primitive, _operator, through) else function

@@ -3,7 +3,7 @@
 import numpy as np
 
 from sparsedp._utils.validation import check_precision
-from sparsedp.autodiff.derivative import gradient_of, growing, linearised
+from sparsedp.autodiff.derivative import gradient_of, linearised
 
 __all__ = ["owned", "parts", "recorded"]
 
@@ -13,8 +13,7 @@ def recorded(fun, arrays, moving):
 
     ``gradients(cotangents)``: of all leaves of the result, None where there is none -> those of the arrays that move.
     """
-    with growing():
-        values, rebuild, pull = linearised(fun, arrays, moving)
+    values, rebuild, pull = linearised(fun, arrays, moving)
 
     def gradients(cotangents):
         slopes = zip(arrays, pull(cotangents), moving, strict=True)

@@ -55,7 +55,7 @@ TABLE = [
         lambda: value_and_grad(lambda x: np.sum(x, where=np.array([True, False])))(np.ones(2)),
         DERIVATIVE,
         "autograd's derivative of sum does not know where= and initial=; choose entries by x[mask] or "
-        "anp.where(mask, x, 0.0), and put what it begins with beside it",
+        "anp.where(mask, x, 0.0), and add the initial value to the result",
     ),
     # functions of separable operators
     (

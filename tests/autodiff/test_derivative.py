@@ -116,7 +116,7 @@ def test_reductions_of_some_entries_are_refused(name, library):
                 derive(x)
             assert str(refused.value) == (
                 f"autograd's derivative of {told} does not know where= and initial=; choose entries by x[mask] or "
-                "anp.where(mask, x, 0.0), and put what it begins with beside it"
+                "anp.where(mask, x, 0.0), and add the initial value to the result"
             )
 
 

@@ -12,7 +12,7 @@ from autograd.tracer import getval
 
 import sparsedp as dp
 from sparsedp.autodiff.derivative import pushforward
-from sparsedp.autodiff.tape import primitive_jvps, primitive_vjps, scaled_rules
+from sparsedp.autodiff.tape import primitive_jvps, primitive_vjps, underflow_safe
 from sparsedp.errors import DerivativeError
 
 RNG = np.random.default_rng(3)
@@ -47,7 +47,7 @@ FORMULAS = {
 @pytest.fixture
 def scaled_quotients(monkeypatch):
     """Give autograd the derivatives of quotients that do not divide by squares, as the tape has them."""
-    for fun, scaled in scaled_rules.items():
+    for fun, scaled in underflow_safe.items():
         for rules in (primitive_vjps, primitive_jvps):
             monkeypatch.setitem(rules, fun, rules[scaled])
 
@@ -96,7 +96,7 @@ def test_derivatives_of_quotients_of_small_numbers(name):
 
 
 def test_quotients_keep_their_derivatives_for_other_users_of_autograd():
-    assert not any(primitive_vjps[fun] is primitive_vjps[scaled] for fun, scaled in scaled_rules.items())
+    assert not any(primitive_vjps[fun] is primitive_vjps[scaled] for fun, scaled in underflow_safe.items())
 
 
 def test_a_list_of_exponents():

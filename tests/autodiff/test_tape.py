@@ -242,7 +242,7 @@ def test_a_function_that_does_not_tell_how_it_is_called():
 
 @pytest.mark.parametrize("inner", [autograd.grad, lambda f: lambda x: value_and_grad(f)(x)[1]], ids=["autograd", "own"])
 @pytest.mark.parametrize("outer", [autograd.grad, lambda f: lambda x: value_and_grad(f)(x)[1]], ids=["autograd", "own"])
-def test_no_number_of_a_trace_is_given_twice(outer, inner):
+def test_trace_numbers_increase(outer, inner):
     """Of two that are nested the inner one has the larger number, and a later one has a larger one than both."""
     numbers = []
 

@@ -27,7 +27,7 @@ def test_a_name_that_is_not_there():
 
 @pytest.mark.parametrize(("library", "extra"), [("jax", "jax"), ("torch", "torch"), ("xarray", "files")])
 def test_a_library_that_is_not_installed(library, extra, monkeypatch):
-    for module in (f"interop.{library}_bridge", "storage.labelled"):
+    for module in (f"interop.{library}_bridge", "io.labelled"):
         monkeypatch.delitem(sys.modules, f"sparsedp.{module}", raising=False)
     monkeypatch.setitem(sys.modules, library, None)
     monkeypatch.delitem(vars(dp.interop), f"to_{library}", raising=False)  # kept since its first use

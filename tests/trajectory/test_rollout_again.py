@@ -378,7 +378,7 @@ def test_a_value_stored_by_an_earlier_gradient_is_refused():
     for again in (loss, lambda p: seen["k"]):
         with pytest.raises(
             DerivativeError,
-            match="^a traced value was stored, and is used after the function or the step that made it has ended: its "
-            "derivative would be lost; return it, from a rollout in the state or by keep$",
+            match="^a traced value was stored and used after the function or the step that computed it had ended, so "
+            "its derivative would be lost; return it, from a rollout in the state or by keep$",
         ):
             dp.value_and_grad(again)(0.5)
