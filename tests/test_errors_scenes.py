@@ -256,7 +256,7 @@ TABLE = [
     (
         lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(3), "admm", weight=1.0, operator=Growing(), inner=stay),
         SHAPE,
-        "what the operator of admm gives must have shape (3,), got (6,); it must not change from call to call",
+        "the result of the operator of admm must have shape (3,), got (6,); it must not change from call to call",
     ),
     (
         lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(3), "admm", weight=0.0),
@@ -359,12 +359,12 @@ TABLE = [
     (
         lambda: dp.smoothness(LINE)(np.ones(4, complex)),
         TYPE,
-        "smoothness must hold real numbers, got dtype complex128; add that of u.real and that of u.imag",
+        "smoothness must hold real numbers, got dtype complex128; add the values of u.real and u.imag",
     ),
     (
         lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(3), "admm", weight=1.0, inner=stay, bounds=(0, 1)),
         TYPE,
-        "admm with a function as inner does not use bounds; leave them out, or keep to them in inner",
+        "admm with a function as inner does not use bounds; leave them out, or apply them in inner",
     ),
     (
         lambda: dp.vjp(dp.projection(BOX).pressure, np.zeros(40))[1](np.where(np.eye(4) > 0, np.nan, 1.0)),

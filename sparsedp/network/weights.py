@@ -161,5 +161,5 @@ def load(path: str | os.PathLike[str]) -> Any:
     """
     content = load_tree(path, FORMAT)
     if content is None:
-        raise ValueError(f"{path} was not written by dp.network.save, or is damaged; write it anew")
+        raise ValueError(f"{path} was not written by dp.network.save, or is damaged; save the parameters again")
     return content[0]

@@ -121,9 +121,7 @@ class ADMM:
         Minimum
         """
         if callable(self.inner) and bounds is not None:
-            raise TypeError(
-                "admm with a function as inner does not use bounds; leave them out, or keep to them in inner"
-            )
+            raise TypeError("admm with a function as inner does not use bounds; leave them out, or apply them in inner")
         run = _Run(self, loss, start, bounds, minimize_smooth)
         message = f"stopped after {maxiter} rounds, the limit maxiter"
         converged = False
@@ -205,7 +203,7 @@ class _Run:
         else:
             self.x, evaluations = self._minimized_by_lbfgs(self.z - self._w, rho)
         image, pull = pullback(self._operator, self.x)
-        check_shape("what the operator of admm gives", image, self.z.shape, "; it must not change from call to call")
+        check_shape("the result of the operator of admm", image, self.z.shape, "; it must not change from call to call")
         z_before = self.z
         self.z = self._prox(image + self._w, self._weight / rho)
         self._w = self._w + image - self.z

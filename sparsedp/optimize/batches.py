@@ -41,7 +41,7 @@ class Batches:
                 "write list(batches)"
             )
         if isinstance(batches, Sequence) and not batches:
-            raise ValueError("batches is empty; leave it out, and the loss is called with x alone")
+            raise ValueError("batches is empty; leave it out to call the loss with x alone")
         self.varied = batches is not None
         self.period = PERIOD_OF_FUNCTION
         if isinstance(batches, Sequence):

@@ -90,7 +90,7 @@ class LeastSquaresMethod(Method):
         self.absolute_sigma = bool(self.absolute_sigma)
 
 
-def damped_step(
+def _damped_step(
     current: Evaluation, linearization: Linearization, objective: Objective, damping: float, unit: float
 ) -> NDArray[np.float64]:
     """Return the minimum d of |J d + r|^2 + damping |unit d|^2 for which the current point + d is inside the box."""
@@ -110,7 +110,7 @@ def _unbounded_step(linearization, r, damping, unit):
         jacobian = linearization.jacobian()
         if unit != 1:
             jacobian = jacobian / unit
-        return -_negative_dense_step(jacobian, r, damping) / unit
+        return -_negated_dense_step(jacobian, r, damping) / unit
     product = LinearOperator(
         linearization.shape,
         lambda v: linearization.jvp(v / unit),
@@ -121,7 +121,7 @@ def _unbounded_step(linearization, r, damping, unit):
     return -solution[0] / unit
 
 
-def _negative_dense_step(jacobian, r, damping):
+def _negated_dense_step(jacobian, r, damping):
     """Return -d for the minimum d of |J d + r|^2 + damping |d|^2.
 
     Where that is exact, by Cholesky of J J^T + damping or J^T J + damping: far faster than by singular values.
@@ -142,7 +142,7 @@ def _negative_dense_step(jacobian, r, damping):
     return solution
 
 
-def advance_damped(
+def _advance_damped(
     state: SquaresState, linearization: Linearization, objective: Objective, failure: str
 ) -> SquaresState:
     """Return the state after a step with as much damping as it takes to lower the loss.
@@ -160,7 +160,7 @@ def advance_damped(
         damping = state.damping
         growth = 2.0
         for _ in range(HALVINGS):
-            step = damped_step(current, linearization, objective, damping, unit)
+            step = _damped_step(current, linearization, objective, damping, unit)
             point = objective.box.moved(current.point, step)
             change = linearization.jvp(point - current.point)
             yield point, -float(np.dot(change, linearization.flat + 0.5 * change)), damping
@@ -170,13 +170,15 @@ def advance_damped(
     try:
         evaluation, share_of_decrease, damping = objective.first_lower(current, candidates(), failure)
     except NoStepFound as error:
-        check_rounding(error, current, linearization, objective)
+        _check_rounding(error, current, linearization, objective)
         raise NoStepFound(failure) from None
     damping *= max(1 / 3, 1 - (2 * share_of_decrease - 1) ** 3)
     return state._replace(current=evaluation, damping=damping)
 
 
-def check_rounding(error: NoStepFound, current: Evaluation, linearization: Linearization, objective: Objective) -> None:
+def _check_rounding(
+    error: NoStepFound, current: Evaluation, linearization: Linearization, objective: Objective
+) -> None:
     """Raise a RoundingReached of a search again, unless a gradient step promises a visible decrease."""
     if isinstance(error, RoundingReached):
         gradient_step = BoundedLeastSquares(current, linearization, objective.box, 0.0, 1.0).gradient_step()
@@ -184,7 +186,7 @@ def check_rounding(error: NoStepFound, current: Evaluation, linearization: Linea
             raise error
 
 
-def largest_column_norm(linearization: Linearization) -> float:
+def _largest_column_norm(linearization: Linearization) -> float:
     """Return the norm of the largest column of J; where J is not formed, its norm along the gradient."""
     if linearization.dense:
         jacobian = linearization.jacobian()
@@ -232,26 +234,26 @@ class GaussNewton(LeastSquaresMethod):
         """Return the state after one iteration. Raises NoStepFound if no lower point is found."""
         current = state.current
         linearization = objective.linearization(current)
-        unit = state.unit or safe_unit(largest_column_norm(linearization))
+        unit = state.unit or safe_unit(_largest_column_norm(linearization))
         state = state._replace(unit=unit)
         if not state.damping:
-            step = damped_step(current, linearization, objective, 0.0, unit)
+            step = _damped_step(current, linearization, objective, 0.0, unit)
             try:
                 evaluation, _, share_of_decrease = backtracked(
                     current, step, objective, "the Gauss-Newton step", UNDAMPED_LENGTHS
                 )
             except NoStepFound as error:
-                check_rounding(error, current, linearization, objective)
+                _check_rounding(error, current, linearization, objective)
             else:
                 damping = 0.0
                 if share_of_decrease < POOR:
-                    damping = FIRST_DAMPING * (largest_column_norm(linearization) / unit) ** 2
+                    damping = FIRST_DAMPING * (_largest_column_norm(linearization) / unit) ** 2
                 return state._replace(current=evaluation, damping=damping)
-        largest_diagonal = (largest_column_norm(linearization) / unit) ** 2
+        largest_diagonal = (_largest_column_norm(linearization) / unit) ** 2
         if not state.damping:
             state = state._replace(damping=FIRST_DAMPING * largest_diagonal or 1.0)
         failure = "no lower point along the Gauss-Newton step, damped or not"
-        state = advance_damped(state, linearization, objective, failure)
+        state = _advance_damped(state, linearization, objective, failure)
         if state.damping <= LEAST_DAMPING * largest_diagonal:
             state = state._replace(damping=0.0)
         return state
@@ -293,10 +295,10 @@ class LevenbergMarquardt(LeastSquaresMethod):
         """Return the state after one iteration. Raises NoStepFound if no damping is large enough."""
         linearization = objective.linearization(state.current)
         if not state.unit:
-            size = largest_column_norm(linearization)
+            size = _largest_column_norm(linearization)
             unit = safe_unit(size)
             state = state._replace(unit=unit, damping=self.damping * (size / unit) ** 2 or 1.0)
-        return advance_damped(state, linearization, objective, "no damping gives a lower point")
+        return _advance_damped(state, linearization, objective, "no damping gives a lower point")
 
 
 @dataclass

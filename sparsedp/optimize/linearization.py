@@ -37,7 +37,7 @@ NOT_FORMED = (
 )
 NOT_APART = (
     "with apart=True every leaf of x gets a leading axis of {} copies, one for each sample, and the outputs do not "
-    "follow them; let the function broadcast over it"
+    "follow them; write a function that broadcasts over it"
 )
 
 

@@ -158,7 +158,7 @@ def _squared_slope(grid, name, solid):
 
     def squared_slope(u, small=None):
         check_native(name, u)
-        check_kind(f"u of {name}", dtype_of(u), "real numbers", "; add that of u.real and that of u.imag")
+        check_kind(f"u of {name}", dtype_of(u), "real numbers", "; add the values of u.real and u.imag")
         slopes = open_faces(slope(u))
         unit = 1.0
         if small is not None and not is_distributed(u):

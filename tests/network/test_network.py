@@ -156,7 +156,9 @@ def test_saved_parameters_are_loaded(tmp_path, rng):
     (tmp_path / "half.npz").write_bytes((tmp_path / "net.npz").read_bytes()[:100])
     np.savez(tmp_path / "foreign.npz", np.frombuffer(json.dumps({"format": "x"}).encode(), np.uint8))
     for name in ("half.npz", "foreign.npz"):
-        with pytest.raises(ValueError, match=".* was not written by dp.network.save, or is damaged; write it anew"):
+        with pytest.raises(
+            ValueError, match=".* was not written by dp.network.save, or is damaged; save the parameters again"
+        ):
             nn.load(tmp_path / name)
 
 

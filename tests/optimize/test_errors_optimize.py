@@ -36,7 +36,7 @@ WRONG = [
         TypeError,
         "batches must be a list or a function of the iteration, got int; write list(batches)",
     ),
-    (run(method="adam", batches=[]), ValueError, "batches is empty; leave it out, and the loss is called with x alone"),
+    (run(method="adam", batches=[]), ValueError, "batches is empty; leave it out to call the loss with x alone"),
     (
         run(bounds=3),
         ValueError,
@@ -149,7 +149,7 @@ WRONG = [
         direction(lambda u: anp.ones((6, 2)) @ anp.reshape(u, (-1, 2))[0], apart=True, method="dense"),
         ShapeError,
         "with apart=True every leaf of x gets a leading axis of 6 copies, one for each sample, and the outputs do not "
-        "follow them; let the function broadcast over it",
+        "follow them; write a function that broadcasts over it",
     ),
     (
         lambda: dp.physical_gradient(lambda x: x, lambda y, x: y, rate=0),
