@@ -3,13 +3,17 @@
 Figures are in units of rounding times the size of the operator; each check is a function of random fields, and a row.
 """
 
+from __future__ import annotations
+
 import warnings
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from math import inf, isnan, log10, prod, sqrt
-from typing import Any
+from typing import Any, NamedTuple
 
 import autograd.numpy as anp
 import numpy as np
+from numpy.typing import DTypeLike, NDArray
 
 from sparsedp._utils.pytree import norm
 from sparsedp._utils.validation import EPS
@@ -17,8 +21,10 @@ from sparsedp.autodiff.derivative import hvp, pullback, pushforward, unwarned
 from sparsedp.check.point import audit_generator
 from sparsedp.check.properties import facts_of
 from sparsedp.check.summary import Row, Summary, error_text
+from sparsedp.check.table import Table
 from sparsedp.errors import DerivativeError
 from sparsedp.operators.given import check_operator
+from sparsedp.operators.operator import Operator
 from sparsedp.operators.structure.base import Matrix
 
 __all__ = ["OperatorSummary", "fault_of", "field", "layouts", "operator", "transpose", "twin"]
@@ -27,13 +33,16 @@ LIMIT = Summary.limit
 DTYPES = ("float64", "complex128", "float32", "complex64")
 LARGEST = 2**21  # unknowns above which no matrix is built for a check
 MOST_COLUMNS = 512  # columns that are computed one application at a time
-ROUGHLY = 1e-6  # share of the result up to which A (i u) is i A u
-POWERS = 8  # products of a power iteration
+LINEAR_SHARE = 1e-6  # share of the result up to which A (i u) is i A u
+POWER_ITERATIONS = 8
 DECADES = {"float32": 25, "float64": 290}  # sizes 10^+-d of operators fit into a dtype, with room for the fields
+SCALING = 900  # power of two of the scaled fields
+
+Rng = int | np.random.Generator | None
 
 
-def field(rng, shape, dtype):
-    """Random normal field of a dtype."""
+def field(rng: np.random.Generator, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+    """Return a random normal field of a dtype."""
     values = rng.standard_normal(shape)
     if np.dtype(dtype).kind == "c":
         values = values + 1j * rng.standard_normal(shape)
@@ -63,75 +72,91 @@ class Probe:
     matrix : sparse matrix
         The entries, where they can.
     bounds : tuple of functions
-        |u| -> what rounding in A u and in A^T u is relative to, entry by entry: |A| |u|. Empty without entries.
+        For A and A^T: |u| to |A| |u|, what rounding in A u is relative to, entry by entry. Empty without entries.
     size : float
         sqrt(|A|_1 |A|_inf), or a lower bound of the 2-norm from products. A bound from below makes the tests
-        stricter, never laxer.
+        stricter, never weaker.
     """
 
-    def __init__(self, op, seeds=1, rng=None):
-        self.op, self.rng, self.seeds = op.tangent, audit_generator(rng), max(seeds, 1)
+    def __init__(self, op: Operator, seeds: int = 1, rng: Rng = None) -> None:
+        self.op = op.tangent
+        self.rng = audit_generator(rng)
+        self.seeds = max(seeds, 1)
         self.real = op.dtype.kind != "c"
-        structure, self.tolerance = self.op.structure, tolerance_of(self.op.structure)
-        self.real_linear = "" if self.real or structure.has_entries else self._real_side()
-        limit = LARGEST if structure.has_entries else MOST_COLUMNS
-        self.listed = max(op.shape) <= limit and not self.real_linear  # a matrix is linear over complex numbers
-        entries = self.listed and structure.has_entries
-        self.bounds: tuple = (structure.magnitude(), structure.transpose().magnitude()) if entries else ()
-        self.size = self._size() if entries else self._norm()
-        self.forms: tuple = (self.op.explicit(), self.op.matrix_free()) if self.listed else ()
-        self.matrix: Any = next((form.matrix for form in self.forms), None)
+        structure = self.op.structure
+        self.tolerance = tolerance_of(structure)
+        self.real_linear = "" if self.real or structure.has_entries else self._find_real_side()
+        largest = LARGEST if structure.has_entries else MOST_COLUMNS
+        self.listed = max(op.shape) <= largest and not self.real_linear  # a matrix is linear over complex numbers
+        self.bounds: tuple[Callable[[Any], Any], ...] = ()
+        if self.listed and structure.has_entries:
+            self.bounds = (structure.magnitude(), structure.transpose().magnitude())
+        self.size = self._size_from_entries() if self.bounds else self._size_from_products()
+        self.forms: tuple[Operator, ...] = ()
+        self.matrix: Any = None
+        if self.listed:
+            self.forms = (self.op.explicit(), self.op.matrix_free())
+            self.matrix = self.forms[0].matrix
 
     @cached_property
-    def turned(self):
+    def transposed_forms(self) -> list[Any]:
         """The forms of the transpose, and the entries that it assembles by itself."""
         return [self.op.structure.transpose().explicit(), *(form.T for form in self.forms)]
 
-    def domain(self, dtype=float):
-        """Random field of the domain."""
+    def domain(self, dtype: DTypeLike = float) -> NDArray[Any]:
+        """Return a random field of the domain."""
         return field(self.rng, self.op.domain.shape, dtype)
 
-    def codomain(self, dtype=float):
-        """Random field of the codomain, complex where the operator is."""
-        return field(self.rng, self.op.codomain.shape, dtype if self.real else np.result_type(dtype, np.complex64))
+    def codomain(self, dtype: DTypeLike = float) -> NDArray[Any]:
+        """Return a random field of the codomain, complex where the operator is."""
+        if not self.real:
+            dtype = np.result_type(dtype, np.complex64)
+        return field(self.rng, self.op.codomain.shape, dtype)
 
-    def rows(self, name, dtypes=()):
-        """A row for each dtype (default: those of KINDS): how far the sides of an identity are apart, at worst."""
+    def rows(self, name: str, dtypes: Sequence[str] = ()) -> list[Row]:
+        """Return for each dtype (default: those of the identity) how far its two sides are apart, at worst."""
         rows: list[Row] = []
-        dtypes = [np.dtype(dtype) for dtype in dtypes or KINDS.get(name, DTYPES[: 1 if self.real else 2])]
-        for dtype in dtypes:
+        default = IDENTITIES[name].dtypes or DTYPES[: 1 if self.real else 2]
+        for dtype in map(np.dtype, dtypes or default):
             if self.real_linear == "domain" and dtype.kind == "c":
                 continue
             # A clean refusal of complex fields is fine where real fields work.
-            optional = dtype.kind == "c" and self.real and rows[0].ok is True
-            rows.append(self._row(name, dtype, optional))
+            is_optional = dtype.kind == "c" and self.real and rows[0].ok is True
+            rows.append(self._row(name, dtype, is_optional))
         return rows
 
-    def _row(self, name, dtype, optional):
-        """Row of an identity in one dtype; where it is not optional, an error fails: functions may raise anything."""
+    def _row(self, name: str, dtype: np.dtype[Any], is_optional: bool) -> Row:
+        """Return the row of an identity in one dtype; where it is not optional, an error fails."""
         label = f"{name}, {dtype}"
-        if self.size and abs(log10(self.size)) >= DECADES[np.finfo(dtype).dtype.name] / EXPONENTS.get(name, 1):
+        decades = DECADES[np.finfo(dtype).dtype.name] / IDENTITIES[name].power_of_size
+        if self.size and abs(log10(self.size)) >= decades:
             return Row(label, note=f"entries of size {self.size:.1e} leave the range of {dtype}")
         try:
             gap = float(self.gap(name, dtype))
-        except Exception as error:
+        except Exception as error:  # a function may raise anything
             note = error_text(error)
-            return Row(label, note=f"refused, {note}") if optional else Row(label, inf, LIMIT, False, note)
+            return Row(label, note=f"refused, {note}") if is_optional else Row(label, inf, LIMIT, False, note)
         return Row(label, inf if isnan(gap) else gap, LIMIT, gap <= LIMIT)
 
-    def gap(self, name, dtype):
-        """Distance of the two sides of an identity in units of rounding, at worst over entries and seeds."""
-        worst, rounding = 0.0, max(0.0 if name in EXACT else self.tolerance, float(np.finfo(dtype).eps))
+    def gap(self, name: str, dtype: np.dtype[Any]) -> float:
+        """Return the distance of the two sides of an identity in units of rounding, at worst over entries and seeds."""
+        identity = IDENTITIES[name]
+        tolerance = 0.0 if identity.is_exact else self.tolerance
+        rounding = max(tolerance, float(np.finfo(dtype).eps))
+        worst: Any = 0.0
         for _ in range(self.seeds):
-            left, right, bound = IDENTITIES[name](self, self.domain(dtype), self.domain(dtype), self.codomain(dtype))
+            u = self.domain(dtype)
+            v = self.domain(dtype)
+            g = self.codomain(dtype)
+            left, right, bound = identity.sides(self, u, v, g)
             gaps = np.abs(left - right).reshape(-1, max(np.size(bound), 1))
             with np.errstate(all="ignore"):
                 shares = np.where(gaps == 0, 0.0, gaps / (bound * rounding))
             worst = np.maximum(worst, np.max(shares, initial=0.0))  # NaN stays NaN
         return worst
 
-    def bound(self, u, transposed=False):
-        """What rounding is relative to in A u: |A| |u|, entry by entry.
+    def bound(self, u: NDArray[Any], transposed: bool = False) -> Any:
+        """Return what rounding in A u is relative to: |A| |u|, entry by entry.
 
         Functions round relative to the whole result (transforms, solves): |A| |u| in norms.
         """
@@ -139,122 +164,194 @@ class Probe:
             return self.bounds[transposed](np.abs(u).ravel().astype(float))
         return self.size * norm(u)
 
-    def product(self, a, b):
-        """Sum of a b; its real part where only that is the same for an operator and its transpose."""
-        return np.real(_dot(a, b)) if self.real_linear else _dot(a, b)
+    def product(self, a: NDArray[Any], b: NDArray[Any]) -> Any:
+        """Return the sum of a b; its real part where only that is the same for an operator and its transpose."""
+        product = np.sum(a * b.astype(np.result_type(b, float)))  # in double precision: the sum is not what is tested
+        return np.real(product) if self.real_linear else product
 
-    def transposed(self, g, real):
-        """A^T g by the transposed matrix, or by `.T` when no matrix can be listed; its real part, of real fields."""
-        back = (self.matrix.T @ g.ravel()).reshape(self.op.domain.shape) if self.listed else self.op.T.apply(g)
-        return back.real if real else back
+    def transposed(self, g: NDArray[Any], real: bool) -> NDArray[Any]:
+        """Return A^T g by the transposed matrix, or by `.T` without one; of real fields the real part."""
+        if self.listed:
+            result = (self.matrix.T @ g.ravel()).reshape(self.op.domain.shape)
+        else:
+            result = self.op.T.apply(g)
+        return result.real if real else result
 
-    def _real_side(self):
-        """Which fields of an operator are real, if it is not linear over the complex numbers."""
+    def _find_real_side(self) -> str:
+        """Return which fields of an operator are real, if it is not linear over the complex numbers."""
         u = self.domain()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # NumPy may say that it discards imaginary parts
-            straight = self.op.apply(u)
+            of_real = self.op.apply(u)
             try:
-                turned = self.op.apply(1j * u)
+                of_imaginary = self.op.apply(1j * u)
             except Exception:  # a foreign function may refuse complex fields in any way
                 return "domain"
-            if norm(turned - 1j * straight) <= ROUGHLY * norm(straight):
+            if norm(of_imaginary - 1j * of_real) <= LINEAR_SHARE * norm(of_real):
                 return ""
-            if not np.any(turned):
+            if not np.any(of_imaginary):
                 return "domain"
-            return "" if np.any(np.imag([straight, turned])) else "codomain"
+            return "" if np.any(np.imag([of_real, of_imaginary])) else "codomain"
 
-    def _size(self):
-        """sqrt(|A|_1 |A|_inf)."""
+    def _size_from_entries(self) -> float:
+        """Return sqrt(|A|_1 |A|_inf)."""
         sums = [bound(np.ones(n)) for bound, n in zip(self.bounds, reversed(self.op.shape))]
         return prod(sqrt(np.max(sizes, initial=0.0)) for sizes in sums)
 
-    def _norm(self):
-        """The 2-norm, from below, by power iteration; only products of A itself count."""
-        size, x = 0.0, self.domain()
-        for _ in range(POWERS):
+    def _size_from_products(self) -> float:
+        """Return the 2-norm, from below, by power iteration; only products of A itself count."""
+        size = 0.0
+        x = self.domain()
+        for _ in range(POWER_ITERATIONS):
             y = self.op.apply(x / (norm(x) or 1.0))
             size = max(size, norm(y))
             try:
                 x = self.op.T.apply(y)
-                x = x.real if self.real_linear == "domain" else x
+                if self.real_linear == "domain":
+                    x = x.real
             except DerivativeError:  # it has no transpose
                 x = self.domain()
         return size
 
 
-def _scaled(op, u):
-    """Results for a field times 2^900 and 2^-900, scaled back: the same digits."""
-    return np.stack([op.apply(u * 2.0**k) * 2.0**-k for k in (900, -900)])
-
-
-def _twice(op, u):
-    """The result for a field and the field itself, of a second application and of a first: the same bits."""
-    before, first = u.copy(), op.apply(u)
-    return np.append(op.apply(u), u), np.append(first, before), 0.0
-
-
-def _dot(a, b):
-    """Summed in double precision: the sums are not what is tested."""
-    return np.sum(a * b.astype(np.result_type(b, float)))
-
-
-# Identities of a right operator: left side, right side, and what their rounding is relative to.
-IDENTITIES = {
-    "linearity": lambda p, u, v, g: (
-        p.op.apply(0.75 * u - v),
-        0.75 * p.op.apply(u) - p.op.apply(v),
-        p.bound(u) + p.bound(v),
-    ),
-    "JVP": lambda p, u, v, g: (pushforward(p.op, u, v)[1], p.op.apply(v), p.bound(v)),
-    "VJP": lambda p, u, v, g: (pullback(p.op, u)[1](g), p.transposed(g, u.dtype.kind != "c"), p.bound(g, True)),
-    "transpose": lambda p, u, v, g: (
-        p.product(p.op.apply(u), g),
-        p.product(u, p.op.T.apply(g)),
-        p.size * norm(u) * norm(g),
-    ),
-    "second order": lambda p, u, v, g: (
-        hvp(lambda x: anp.sum(anp.real(p.op(x) ** 2)) / 2, u, v),
-        p.transposed(p.op.apply(v), True),
-        p.size * p.size * norm(v),
-    ),
-    "scaling by 2^+-900": lambda p, u, v, g: (_scaled(p.op, u), p.op.apply(u), p.bound(u)),
-    "scaling by 2^+-900, transposed": lambda p, u, v, g: (_scaled(p.op.T, g), p.op.T.apply(g), p.bound(g, True)),
-    "same bits twice": lambda p, u, v, g: _twice(p.op, u),
-    "same bits twice, transposed": lambda p, u, v, g: _twice(p.op.T, g),
-    "forward": lambda p, u, v, g: (
-        p.matrix @ u.ravel(),
-        np.stack([form @ u.ravel() for form in p.forms]),
-        p.bound(u),
-    ),
-    "transposed": lambda p, u, v, g: (
-        p.matrix.T @ g.ravel(),
-        np.stack([form @ g.ravel() for form in p.turned]),
-        p.bound(g, True),
-    ),
-}
-FORMS = "forward", "transposed"  # identities of an operator that can be listed
-# Those that are not tried in double precision alone, and those in real numbers only.
-KINDS = {"transpose": DTYPES, "forward": DTYPES[:3], "transposed": DTYPES[:3], "second order": DTYPES[:1]}
-EXACT = "scaling by 2^+-900", "scaling by 2^+-900, transposed"  # identities that no solve may blur
-# Which power of the size of an operator has to be a number of the dtype, with room for the fields.
-EXPONENTS = {"second order": 2} | dict.fromkeys(EXACT, 10)
-
-
-def tolerance_of(structure):
-    """Of a structure that solves, or has members that do, the largest; else 0.
+def tolerance_of(structure: Any) -> float:
+    """Return the largest tolerance of a structure that solves, or has members that do; else 0.
 
     An inverse has it in `solver.system.rtol`: its residual is accepted there, whatever the method.
     """
     system = getattr(getattr(structure, "solver", None), "system", structure)
-    return max(float(getattr(system, "rtol", 0.0)), *map(tolerance_of, getattr(structure, "members", ())), 0.0)
+    members = getattr(structure, "members", ())
+    return max(float(getattr(system, "rtol", 0.0)), *map(tolerance_of, members), 0.0)
+
+
+# ------------------------------------------------------------ identities of a right operator
+# Each returns the left side, the right side, and what their rounding is relative to.
+
+Sides = tuple[Any, Any, Any]
+Array = NDArray[Any]
+
+
+def _linearity(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
+    """A (3/4 u - v) = 3/4 A u - A v."""
+    apply = probe.op.apply
+    return apply(0.75 * u - v), 0.75 * apply(u) - apply(v), probe.bound(u) + probe.bound(v)
+
+
+def _jvp(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
+    """The JVP along v is A v."""
+    _, tangent = pushforward(probe.op, u, v)
+    return tangent, probe.op.apply(v), probe.bound(v)
+
+
+def _vjp(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
+    """The VJP of g is A^T g."""
+    _, pull = pullback(probe.op, u)
+    return pull(g), probe.transposed(g, u.dtype.kind != "c"), probe.bound(g, True)
+
+
+def _dot_test(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
+    """<A u, g> = <u, A^T g>."""
+    left = probe.product(probe.op.apply(u), g)
+    right = probe.product(u, probe.op.T.apply(g))
+    return left, right, probe.size * norm(u) * norm(g)
+
+
+def _second_order(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
+    """The Hessian product of |A u|^2 / 2 along v is A^T A v."""
+
+    def half_square(x: Any) -> Any:
+        return anp.sum(anp.real(probe.op(x) ** 2)) / 2
+
+    right = probe.transposed(probe.op.apply(v), True)
+    return hvp(half_square, u, v), right, probe.size * probe.size * norm(v)
+
+
+def _scaled_results(op: Any, u: Array) -> Array:
+    """Return the results for a field times 2^+-SCALING, scaled back."""
+    return np.stack([op.apply(u * 2.0**k) * 2.0**-k for k in (SCALING, -SCALING)])
+
+
+def _scaling(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
+    """The same digits for a field times 2^+-900."""
+    return _scaled_results(probe.op, u), probe.op.apply(u), probe.bound(u)
+
+
+def _scaling_transposed(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
+    """The same digits for a cotangent times 2^+-900."""
+    return _scaled_results(probe.op.T, g), probe.op.T.apply(g), probe.bound(g, True)
+
+
+def _results_of_two_applications(op: Any, u: Array) -> Sides:
+    """Return the result of a second application and of a first one, each with the field after and before."""
+    before = u.copy()
+    first = op.apply(u)
+    return np.append(op.apply(u), u), np.append(first, before), 0.0
+
+
+def _same_bits(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
+    """Two applications have the same bits, and do not modify their argument."""
+    return _results_of_two_applications(probe.op, u)
+
+
+def _same_bits_transposed(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
+    """The same for the transpose."""
+    return _results_of_two_applications(probe.op.T, g)
+
+
+def _forms_agree(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
+    """All forms give the product with the matrix."""
+    products = np.stack([form @ u.ravel() for form in probe.forms])
+    return probe.matrix @ u.ravel(), products, probe.bound(u)
+
+
+def _transposed_forms_agree(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
+    """All forms of the transpose give the product with the transposed matrix."""
+    products = np.stack([form @ g.ravel() for form in probe.transposed_forms])
+    return probe.matrix.T @ g.ravel(), products, probe.bound(g, True)
+
+
+class Identity(NamedTuple):
+    """An identity of a right operator.
+
+    Attributes
+    ----------
+    sides : callable
+        ``sides(probe, u, v, g)`` with random fields u and v of the domain and g of the codomain.
+    dtypes : tuple of str
+        Default: float64, and complex128 of a complex operator.
+    is_exact : bool
+        Whether the tolerance of a solve does not enter.
+    power_of_size : int
+        Which power of the size of an operator has to be a number of the dtype, with room for the fields.
+    """
+
+    sides: Callable[[Probe, Array, Array, Array], Sides]
+    dtypes: tuple[str, ...] = ()
+    is_exact: bool = False
+    power_of_size: int = 1
+
+
+IDENTITIES = {
+    "linearity": Identity(_linearity),
+    "JVP": Identity(_jvp),
+    "VJP": Identity(_vjp),
+    "transpose": Identity(_dot_test, DTYPES),
+    "second order": Identity(_second_order, DTYPES[:1], power_of_size=2),
+    "scaling by 2^+-900": Identity(_scaling, is_exact=True, power_of_size=10),
+    "scaling by 2^+-900, transposed": Identity(_scaling_transposed, is_exact=True, power_of_size=10),
+    "same bits twice": Identity(_same_bits),
+    "same bits twice, transposed": Identity(_same_bits_transposed),
+    "forward": Identity(_forms_agree, DTYPES[:3]),
+    "transposed": Identity(_transposed_forms_agree, DTYPES[:3]),
+}
+FORM_IDENTITIES = ("forward", "transposed")  # of an operator whose entries can be listed
 
 
 # ------------------------------------------------------------ transpose
 
 
-def transpose(op, seeds=5, rng=None):
-    """Operator -> summary of the scaled dot test, |<A u, v> - <u, A^T v>| / (eps sqrt(|A|_1 |A|_inf) |u| |v|).
+def transpose(op: Operator, seeds: int = 5, rng: Rng = None) -> Summary:
+    """Compare an operator with its transpose by the scaled dot test.
 
     Parameters
     ----------
@@ -272,10 +369,11 @@ def transpose(op, seeds=5, rng=None):
 
     Notes
     -----
-    The products are plain, without conjugation, as `.T` is; of an operator that is linear over the real numbers only
-    (see `operator`) their real parts are compared. The norms come from the entries; without
-    entries they are lower bounds from products with A, which makes the test stricter. An operator
-    that contains a solve is judged by the tolerance of the solve in place of eps.
+    The figure is |<A u, v> - <u, A^T v>| / (eps sqrt(|A|_1 |A|_inf) |u| |v|). The products are plain, without
+    conjugation, as `.T` is; of an operator that is linear over the real numbers only (see `operator`) their real parts
+    are compared. The norms come from the entries; without entries they are lower bounds from products with A, which
+    makes the test stricter. An operator that contains a solve is measured by the tolerance of the solve in place of
+    eps.
 
     Examples
     --------
@@ -293,8 +391,8 @@ def transpose(op, seeds=5, rng=None):
 # ------------------------------------------------------------ agreement of forms
 
 
-def twin(op, seeds=3, rng=None):
-    """Operator -> summary: its matrix against its matrix-free form, forward and transposed.
+def twin(op: Operator, seeds: int = 3, rng: Rng = None) -> Summary:
+    """Compare the matrix of an operator with its matrix-free form, forward and transposed.
 
     Parameters
     ----------
@@ -325,41 +423,46 @@ def twin(op, seeds=3, rng=None):
     'agrees'
     """
     check_operator("check.twin", op)
-    return Summary(f"twin of {op.name}, explicit against matrix-free", _form_rows(Probe(op, seeds, rng)))
+    return Summary(f"twin of {op.name}, explicit against matrix-free", _rows_of_forms(Probe(op, seeds, rng)))
 
 
-def _form_rows(probe):
-    """Rows: both products in three dtypes, entry by entry."""
+def _rows_of_forms(probe: Probe) -> list[Row]:
+    """Return the rows that compare both forms in three dtypes, entry by entry."""
     if probe.real_linear:
         return [Row("forms", note="one form: given by functions, and no matrix of complex numbers stands for it")]
-    rows = [Row("forms", note=_forms(probe.op.structure, probe.listed))]
-    for name in FORMS if probe.listed else ():
-        rows += probe.rows(name)
+    rows = [Row("forms", note=_forms_in_words(probe.op.structure, probe.listed))]
+    if probe.listed:
+        for name in FORM_IDENTITIES:
+            rows += probe.rows(name)
     return rows
 
 
-def _forms(structure, listed):
+def _forms_in_words(structure: Any, listed: bool) -> str:
+    """Say which forms an operator has."""
     if isinstance(structure, Matrix):
         return "one form: given as a matrix; compared with the product by SciPy"
     if structure.has_entries:
         return "both" if listed else "too large: the matrix was not built for this test"
-    return f"one form: given by functions{'; compared with' if listed else ', and too large to list'} its columns"
+    compared = "; compared with" if listed else ", and too large to list"
+    return f"one form: given by functions{compared} its columns"
 
 
-def fault_of(op, rng):
-    """Operator -> what is wrong with its linearity or its transpose, in words; "" if nothing."""
+def fault_of(op: Operator, rng: np.random.Generator) -> str:
+    """Return in words what is wrong with the linearity or the transpose of an operator; empty if nothing."""
     probe = Probe(op, 1, rng)
-    kinds = DTYPES[:1] if probe.real or probe.real_linear == "domain" else DTYPES[1:2]
-    failed = [one for name in ("linearity", "transpose") for one in probe.rows(name, kinds) if one.ok is False]
+    dtypes = DTYPES[:1] if probe.real or probe.real_linear == "domain" else DTYPES[1:2]
+    failed = []
+    for name in ("linearity", "transpose"):
+        failed += [row for row in probe.rows(name, dtypes) if row.ok is False]
     if not failed:
         return ""
-    worst = max(failed, key=lambda one: one.figure)
-    how = worst.note or f"is off by about {worst.figure * max(probe.tolerance, EPS):.0e}"
+    worst = max(failed, key=lambda row: row.figure or 0.0)
+    how = worst.note or f"is off by about {(worst.figure or 0.0) * max(probe.tolerance, EPS):.0e}"
     return f"its {worst.name.split(',')[0]} {how}"
 
 
-def layouts(u):
-    """Array -> its name in words: the same numbers, laid out otherwise in memory."""
+def layouts(u: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """Return the same numbers in other layouts in memory, by name."""
     return {
         "Fortran order": np.asfortranarray(u),
         "strided": np.stack([u, np.nan * u], axis=-1)[..., 0],
@@ -371,8 +474,8 @@ def layouts(u):
 # ------------------------------------------------------------ the summary
 
 
-def operator(op, seeds=3, rng=None):
-    """Operator -> its summary: spaces, form, entries, and one row for each property of a right operator.
+def operator(op: Operator, seeds: int = 3, rng: Rng = None) -> OperatorSummary:
+    """Check all properties of a right operator, and summarize its spaces, form and entries.
 
     Parameters
     ----------
@@ -395,7 +498,7 @@ def operator(op, seeds=3, rng=None):
     forward and transposed), JVP, VJP, second order, same bits twice, the same digits for a field times 2^+-900.
     Beside them stand facts without a verdict (`facts`): row sums, spectrum, the largest stable step. Whether an
     operator is the derivative that it should be, and of which order, `check.order` tells. Figures are in units of
-    rounding; an inverse is judged by the tolerance of its solve, without its check of primal data. Shapes, dtypes,
+    rounding; an inverse is measured by the tolerance of its solve, without its check of primal data. Shapes, dtypes,
     integers, batches and memory layouts are the same code for every Operator: no rows.
 
     An operator with ``dtype=complex`` whose domain or codomain is real (a real FFT, or its inverse) is linear over the
@@ -428,10 +531,15 @@ REAL_SIDES = {
 }
 
 
-def _rows(probe):
-    rows = [Row("linear over", note=REAL_SIDES[probe.real_linear])] if probe.real_linear else []
-    rows += [one for name in IDENTITIES if name not in FORMS for one in probe.rows(name)]
-    return rows + [one._replace(name=f"twin, {one.name}") for one in _form_rows(probe)]
+def _rows(probe: Probe) -> list[Row]:
+    """Return the rows of all identities."""
+    rows = []
+    if probe.real_linear:
+        rows.append(Row("linear over", note=REAL_SIDES[probe.real_linear]))
+    for name in IDENTITIES:
+        if name not in FORM_IDENTITIES:
+            rows += probe.rows(name)
+    return rows + [row._replace(name=f"twin, {row.name}") for row in _rows_of_forms(probe)]
 
 
 class OperatorSummary(Summary):
@@ -450,25 +558,34 @@ class OperatorSummary(Summary):
         are asked for; what cannot be computed at a fair price is left out.
     """
 
-    def __init__(self, op, probe, rows):
-        nnz = int(op.matrix.nnz) if probe and probe.bounds else None
-        super().__init__(f"{op.name}: {op.domain} -> {op.codomain}", rows, op=op, size=probe and probe.size, nnz=nnz)
+    def __init__(self, op: Operator, probe: Probe | None, rows: Sequence[Row]) -> None:
+        size = None
+        nnz = None
+        if probe is not None:
+            size = probe.size
+            if probe.bounds:
+                nnz = int(op.matrix.nnz)
+        super().__init__(f"{op.name}: {op.domain} -> {op.codomain}", rows, op=op, size=size, nnz=nnz)
 
     @cached_property
-    def facts(self):
+    def facts(self) -> dict[str, Any]:
         """Dict of what the operator is."""
         op = self.op
-        basic = {"domain": str(op.domain), "codomain": str(op.codomain), "form": op.form, "dtype": str(op.dtype)}
-        basic |= {"nnz": self.nnz, "size": self.size}
-        # One that cannot even be applied has no facts.
-        return basic | (facts_of(op, self.nnz is not None, not self.failed) if self.size is not None else {})
+        facts = {"domain": str(op.domain), "codomain": str(op.codomain), "form": op.form, "dtype": str(op.dtype)}
+        facts |= {"nnz": self.nnz, "size": self.size}
+        if self.size is not None:  # an operator that cannot be applied has no other facts
+            facts |= facts_of(op, self.nnz is not None, not self.failed)
+        return facts
 
-    def to_dict(self):
-        """The summary as plain numbers, strings and lists."""
+    def to_dict(self) -> dict[str, Any]:
+        """Return the summary as plain numbers, strings and lists."""
         return super().to_dict() | self.facts
 
-    def parts(self):
-        """The verdict, the facts, and the rows."""
+    def parts(self) -> list[str | Table]:
+        """Return the verdict, the facts, and the rows."""
         verdict, rows = super().parts()
-        texts = ((name, f"{value:.4g}" if isinstance(value, float) else value) for name, value in self.facts.items())
-        return [verdict, *(f"  {name}: {value}" for name, value in texts if value is not None), rows]
+        lines = []
+        for name, value in self.facts.items():
+            if value is not None:
+                lines.append(f"  {name}: {value:.4g}" if isinstance(value, float) else f"  {name}: {value}")
+        return [verdict, *lines, rows]

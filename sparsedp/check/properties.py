@@ -3,82 +3,108 @@
 Facts for the summary of an operator, not verdicts.
 """
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse.linalg import ArpackError, eigs, eigsh
 
 from sparsedp.grid.space import fits
+from sparsedp.operators.operator import Operator
 
 __all__ = ["facts_of"]
 
-DENSE_UP_TO = 256  # rows up to which all eigenvalues are computed
-LARGEST_SPECTRUM = 100_000  # rows above which no eigenvalue is sought
-ZERO = 1e-10  # of the largest: a smaller eigenvalue or row sum is 0
-OUTER = 1e-4  # the same where only the ends of the spectrum are computed
-SYMMETRIC = 1e-13
+MOST_DENSE_ROWS = 256  # up to which all eigenvalues are computed
+MOST_ROWS = 100_000  # above which no eigenvalue is computed
+ZERO_SHARE = 1e-10  # of the largest: a smaller eigenvalue or row sum is 0
+ZERO_SHARE_OF_ENDS = 1e-4  # the same where only the ends of the spectrum are computed
+SYMMETRIC_SHARE = 1e-13
 
 
 @np.errstate(all="ignore")
-def facts_of(op, listed, right):
-    """Operator -> dict of what it is.
+def facts_of(op: Operator, listed: bool, is_right: bool) -> dict[str, Any]:
+    """Return what an operator is, by name.
 
     Parameters
     ----------
     op : Operator
     listed : bool
         Whether its entries are listed.
-    right : bool
-        Whether nothing is wrong with it: else its spectrum is left out.
+    is_right : bool
+        Whether nothing is wrong with it: otherwise its spectrum is omitted.
     """
-    square = fits(op.domain, op.codomain)
-    facts = _signs(op.matrix, square) if listed else {}
-    spectrum = right and square and op.dtype.kind != "c"
-    if spectrum and 0 < op.shape[0] <= (LARGEST_SPECTRUM if listed else DENSE_UP_TO):
-        facts |= _spectrum(op.tangent, facts.get("symmetric", False))
+    is_square = fits(op.domain, op.codomain)
+    facts: dict[str, Any] = _facts_of_entries(op.matrix, is_square) if listed else {}
+    most_rows = MOST_ROWS if listed else MOST_DENSE_ROWS
+    if is_right and is_square and op.dtype.kind != "c" and 0 < op.shape[0] <= most_rows:
+        facts |= _facts_of_spectrum(op.tangent, facts.get("symmetric", False))
     return facts
 
 
-# ------------------------------------------------------------ entries and eigenvalues
-
-
-def _signs(A, square):
-    """Row sums and symmetry, from the entries."""
-    sums, largest = A.sum(axis=1), np.max(abs(A).sum(axis=1), initial=0.0)
-    still = np.all(np.abs(sums) <= ZERO * largest)
-    facts: dict[str, Any] = {"row sums": "0" if still else f"{sums.real.min():.3g} to {sums.real.max():.3g}"}
-    if square:
-        facts["symmetric"] = not A.nnz or bool(abs(A - A.T).max() <= SYMMETRIC * abs(A).max())
+def _facts_of_entries(A: Any, is_square: bool) -> dict[str, Any]:
+    """Return row sums and symmetry."""
+    sums = A.sum(axis=1)
+    largest = np.max(abs(A).sum(axis=1), initial=0.0)
+    facts: dict[str, Any] = {"row sums": "0"}
+    if not np.all(np.abs(sums) <= ZERO_SHARE * largest):
+        facts["row sums"] = f"{sums.real.min():.3g} to {sums.real.max():.3g}"
+    if is_square:
+        facts["symmetric"] = not A.nnz or bool(abs(A - A.T).max() <= SYMMETRIC_SHARE * abs(A).max())
     return facts
 
 
-def _spectrum(op, symmetric):
-    """Spectral radius, definiteness, null space and the largest stable step of u' = A u.
+def _facts_of_spectrum(op: Operator, is_symmetric: bool) -> dict[str, Any]:
+    """Return spectral radius, definiteness, null space and the largest stable step of u' = A u.
 
     All eigenvalues of a small operator; of a large one the ends only, by Lanczos or Arnoldi from a fixed start.
     Explicit Euler is stable when |1 + dt e| <= 1 for every eigenvalue e: dt <= -2 Re(e) / |e|^2.
     """
-    whole = op.shape[0] <= DENSE_UP_TO
-    if whole:
-        entries = op.matrix.toarray()
-        values = np.linalg.eigvalsh(entries) if symmetric else np.linalg.eigvals(entries)
-    else:
-        options = {"v0": np.random.default_rng(0).standard_normal(op.shape[0]), "tol": 1e-6}
-        search, ends = (eigsh, {"k": 2, "which": "BE"}) if symmetric else (eigs, {"k": 1, "which": "LM"})
-        try:
-            values = search(op.to_scipy(), **ends, **options, return_eigenvectors=False)
-        except ArpackError:
-            return {}
+    is_whole = op.shape[0] <= MOST_DENSE_ROWS
+    values = _all_eigenvalues(op, is_symmetric) if is_whole else _ends_of_spectrum(op, is_symmetric)
+    if values is None:
+        return {}
     radius = np.max(np.abs(values))
-    kept = values[np.abs(values) > (ZERO if whole else OUTER) * radius]
+    nonzero = values[np.abs(values) > (ZERO_SHARE if is_whole else ZERO_SHARE_OF_ENDS) * radius]
     facts: dict[str, Any] = {"spectral radius": float(radius)}
-    if whole:
-        facts["null space"] = values.size - kept.size
-    if symmetric:
-        kind = "semidefinite" if kept.size < values.size else "definite" if whole else "definite or semidefinite"
-        side = "positive" if np.all(kept > 0) else "negative" if np.all(kept < 0) else ""
-        facts["definite"] = f"{side} {kind}" if side else "indefinite"
-    if whole or symmetric:
-        step = float(np.min(-2 * np.minimum(kept.real, 0.0) / np.abs(kept) / np.abs(kept), initial=np.inf))
-        facts["stable step"] = 0.0 if step * radius <= ZERO else step
+    if is_whole:
+        facts["null space"] = values.size - nonzero.size
+    if is_symmetric:
+        facts["definite"] = _definiteness(values, nonzero, is_whole)
+    if is_whole or is_symmetric:
+        steps = -2 * np.minimum(nonzero.real, 0.0) / np.abs(nonzero) / np.abs(nonzero)
+        step = float(np.min(steps, initial=np.inf))
+        facts["stable step"] = 0.0 if step * radius <= ZERO_SHARE else step
     return facts
+
+
+def _all_eigenvalues(op: Operator, is_symmetric: bool) -> NDArray[Any]:
+    """Return all eigenvalues of a small operator."""
+    entries = op.matrix.toarray()
+    return np.linalg.eigvalsh(entries) if is_symmetric else np.linalg.eigvals(entries)
+
+
+def _ends_of_spectrum(op: Operator, is_symmetric: bool) -> NDArray[Any] | None:
+    """Return both ends of a real spectrum, or the largest eigenvalue; None where the iteration fails."""
+    start = np.random.default_rng(0).standard_normal(op.shape[0])
+    options = {"v0": start, "tol": 1e-6, "return_eigenvectors": False}
+    try:
+        if is_symmetric:
+            return eigsh(op.to_scipy(), k=2, which="BE", **options)
+        return eigs(op.to_scipy(), k=1, which="LM", **options)
+    except ArpackError:
+        return None
+
+
+def _definiteness(values: NDArray[Any], nonzero: NDArray[Any], is_whole: bool) -> str:
+    """Return in words whether a symmetric operator is definite."""
+    if np.all(nonzero > 0):
+        sign = "positive"
+    elif np.all(nonzero < 0):
+        sign = "negative"
+    else:
+        return "indefinite"
+    if nonzero.size < values.size:
+        return f"{sign} semidefinite"
+    return f"{sign} definite" if is_whole else f"{sign} definite or semidefinite"

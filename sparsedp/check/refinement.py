@@ -1,7 +1,11 @@
 """Order of accuracy: how the error falls when the grid is refined."""
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from math import inf, isnan, nan
 from statistics import linear_regression
+from typing import Any
 
 import numpy as np
 
@@ -11,9 +15,13 @@ from sparsedp.check.table import Table
 
 __all__ = ["Refinement", "order"]
 
+MARGIN = 0.1  # on both sides of an expected number
 
-def order(error_at, sizes=(16, 32, 64, 128), expected=None):
-    """Function from a grid size to an error -> the observed order of accuracy.
+
+def order(
+    error_at: Callable[[int], float], sizes: Sequence[int] = (16, 32, 64, 128), expected: Any = None
+) -> Refinement:
+    """Measure the order of accuracy: how the error falls when the grid is refined.
 
     Parameters
     ----------
@@ -49,7 +57,7 @@ def order(error_at, sizes=(16, 32, 64, 128), expected=None):
     if len(sizes) < 3 or any(a >= b for a, b in zip(sizes, sizes[1:])) or sizes[0] < 1:
         raise ValueError(f"order needs at least three increasing sizes, got {sizes}")
     if expected is not None and np.ndim(expected) == 0:
-        expected = expected - 0.1, expected + 0.1
+        expected = (expected - MARGIN, expected + MARGIN)
     errors = tuple(float(error_at(n)) for n in sizes)
     rise = np.log([error if 0 < error < inf else nan for error in errors])
     run = -np.log(sizes)
@@ -85,11 +93,11 @@ class Refinement(Result):
         Why the verdict is what it is.
     """
 
-    def __float__(self):
+    def __float__(self) -> float:
         return self.order
 
-    def parts(self):
-        """The order, and the error on each grid with the order of the step to it."""
+    def parts(self) -> list[str | Table]:
+        """Return the order, and the error on each grid with the order of the step to it."""
         orders = ("", *(f"{slope:.2f}" for slope in self.orders))
         head = f"order {self.order:.2f} over the last three sizes: {self.verdict} ({self.reason})"
         return [head, Table(("n", "error", "order"), list(zip(self.sizes, self.errors, orders)))]
