@@ -266,6 +266,12 @@ BUGS = {
         "values = anp.concatenate([u, plain(inflow)])",
         "tests/advection/test_transport_rules.py",
     ),
+    "a rate of version 0.2 that keeps its old unit": Bug(
+        "optimize",
+        "rate * template.gradient_unit, share",
+        "rate, share",
+        "tests/optimize/test_checkpoints.py",
+    ),
     "a checkpoint that misses a vector of the optimizer": Bug(
         "optimize",
         '            state = flatten(template)[1](content["state"])',

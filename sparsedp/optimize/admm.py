@@ -84,7 +84,7 @@ class ADMM:
     inner: int | Callable[[Any, float, Any], Any] = 10
     prox: Callable[[Any, float], Any] | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.weight is None:
             raise TypeError("admm needs the weight of the sum of absolute values; write weight=0.1")
         check_number("weight of admm", self.weight, "> 0", "; write weight=0.1")

@@ -78,7 +78,7 @@ class GradientDescent(Method):
     momentum: float = 0.0
     line_search: str | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.rate is not None:
             check_number("rate of gd", self.rate, "> 0", "; leave it out and it is searched for")
         check_number("momentum of gd", self.momentum, "from 0 to below 1", "; leave it out for none")
@@ -256,7 +256,7 @@ class Adam(Method):
     betas: tuple[float, float] = (0.9, 0.999)
     epsilon: float = 1e-8
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_number("rate of adam", self.rate, "> 0", "; the default is 1e-3")
         if np.shape(self.betas) != (2,) or not all(is_number(beta) and 0 <= beta < 1 for beta in self.betas):
             raise ValueError(f"adam needs two betas from 0 to below 1, got {self.betas}; the default is (0.9, 0.999)")

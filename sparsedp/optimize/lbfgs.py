@@ -79,7 +79,7 @@ class LBFGS(Method):
     memory: int = 10
     line_search: int = 20
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         self.memory = check_whole("memory of lbfgs", self.memory, 1, "; the default is 10")
         self.line_search = check_whole("line_search of lbfgs", self.line_search, 2, "; the default is 20")
 

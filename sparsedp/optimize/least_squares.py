@@ -226,7 +226,7 @@ class GaussNewton(LeastSquaresMethod):
     dense: bool | None = None
     absolute_sigma: bool = False
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         self._check_common_options()
         self.forms_jacobian = self.dense
 
@@ -286,7 +286,7 @@ class LevenbergMarquardt(LeastSquaresMethod):
     dense: bool | None = None
     absolute_sigma: bool = False
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_number("damping of levenberg_marquardt", self.damping, "> 0", "; the default is 1e-3")
         self._check_common_options()
         self.forms_jacobian = self.dense
@@ -340,7 +340,7 @@ class HalfInverse(LeastSquaresMethod):
     form: str = "auto"
     absolute_sigma: bool = False
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_number("rate of half_inverse", self.rate, "> 0", "; the default is 1")
         self.forms_jacobian = forms_jacobian(self.form)
         self._check_common_options()

@@ -71,7 +71,7 @@ class NewtonCG(Method):
     name: ClassVar[str] = "newton_cg"
     inner: int = 200
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         self.inner = check_whole("inner of newton_cg", self.inner, 1, "; the default is 200")
 
     def begin(self, first: Evaluation) -> NewtonState:

@@ -119,7 +119,7 @@ class PhysicalGradient(Method):
     inverse: Callable[[Any, Any], Any] | None = None
     rate: float = 1.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.physics is None or self.inverse is None:
             raise TypeError(
                 "physical_gradient needs physics and inverse; write minimize(loss_of_y, x, 'physical_gradient', "

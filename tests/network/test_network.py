@@ -46,10 +46,10 @@ def setting(rng, widths, cells, samples=3, inputs=2, outputs=4):
 def test_convolution_against_a_sum_of_shifted_fields(rng, widths, cells, padding):
     p, x = setting(rng, widths, cells)
     y, pull = pullback(lambda a: nn.convolution(a[0], a[1], padding), (p, x))
-    known, pull_known = pullback(lambda a: twin(a[0], a[1], padding), (p, x))
+    expected_y, pull_expected = pullback(lambda a: twin(a[0], a[1], padding), (p, x))
     g = rng.standard_normal(y.shape)
-    assert np.allclose(y, known, rtol=1e-12, atol=1e-12)
-    for a, b in zip(pytree.leaves(pull(g)), pytree.leaves(pull_known(g))):
+    assert np.allclose(y, expected_y, rtol=1e-12, atol=1e-12)
+    for a, b in zip(pytree.leaves(pull(g)), pytree.leaves(pull_expected(g))):
         assert np.allclose(a, b, rtol=1e-12, atol=1e-12)
     direction = ({"weight": rng.standard_normal(p["weight"].shape), "bias": rng.standard_normal(4)}, x[::-1])
     slope = pushforward(lambda a: nn.convolution(a[0], a[1], padding), (p, x), direction)[1]
@@ -96,9 +96,9 @@ def test_dense(rng):
     x = rng.standard_normal((5, 3))
     loss = lambda f: lambda a: anp.sum(anp.sin(f(a[0], a[1])))
     value, slopes = value_and_grad(loss(nn.dense))((p, x))
-    known, expected = value_and_grad(loss(lambda p, x: anp.dot(x, p["weight"]) + p["bias"]))((p, x))
-    assert value == pytest.approx(known, rel=1e-14)
-    assert all(np.allclose(a, b, rtol=1e-12) for a, b in zip(pytree.leaves(slopes), pytree.leaves(expected)))
+    expected_value, expected_slopes = value_and_grad(loss(lambda p, x: anp.dot(x, p["weight"]) + p["bias"]))((p, x))
+    assert value == pytest.approx(expected_value, rel=1e-14)
+    assert all(np.allclose(a, b, rtol=1e-12) for a, b in zip(pytree.leaves(slopes), pytree.leaves(expected_slopes)))
     assert dp.check.gradient(loss(nn.dense), (p, x), quick=True)
     copies = {name: np.stack([value] * 5) for name, value in p.items()}
     assert np.allclose(nn.dense(copies, x), nn.dense(p, x), rtol=1e-13)
@@ -198,7 +198,7 @@ def test_small_and_empty_fields(rng, cells, padding):
     loss = lambda f: lambda a: anp.sum(f(a[0], a[1], padding) ** 2)
     value, slopes = value_and_grad(loss(nn.convolution))((p, x))
     if x.size:
-        known, expected = value_and_grad(loss(twin))((p, x))
-        assert value == pytest.approx(known)
-        assert all(np.allclose(a, b) for a, b in zip(pytree.leaves(slopes), pytree.leaves(expected)))
+        expected_value, expected_slopes = value_and_grad(loss(twin))((p, x))
+        assert value == pytest.approx(expected_value)
+        assert all(np.allclose(a, b) for a, b in zip(pytree.leaves(slopes), pytree.leaves(expected_slopes)))
     assert nn.convolution(p, x[:0], padding).shape == (0, 4, *cells)

@@ -142,14 +142,14 @@ def test_another_run_is_refused(tmp_path, change, name):
     assert f"another {name};" in str(refused.value)
 
 
-def refused(tmp_path, name, begun, given, **both):
+def refused(tmp_path, name, first_arguments, other_arguments, **both):
     """Check that a folder refuses other arguments, and that the run continues with its own."""
     both = {"maxiter": 6, "tolerance": 0, "checkpoint": tmp_path, **both}
-    dp.minimize(**begun, **{**both, "maxiter": 3})
+    dp.minimize(**first_arguments, **{**both, "maxiter": 3})
     with pytest.raises(ValueError, match=f"holds a run with another {name}; call minimize as that run began"):
-        dp.minimize(**given, **both)
-    whole = dp.minimize(**begun, **{**both, "checkpoint": None})
-    assert same(dp.minimize(**begun, **both), whole)
+        dp.minimize(**other_arguments, **both)
+    whole = dp.minimize(**first_arguments, **{**both, "checkpoint": None})
+    assert same(dp.minimize(**first_arguments, **both), whole)
 
 
 TREE = {"x": START, "n": 2, "word": "a", "none": None, "flag": True, "pair": (1.0, np.arange(3))}
@@ -187,17 +187,17 @@ BATCHES = [np.full(1, 1e-3 * i) for i in range(5)]
 
 
 @pytest.mark.parametrize(
-    "given",
+    "other_arguments",
     [
         [BATCHES[0], BATCHES[1], BATCHES[1], BATCHES[3], BATCHES[4]],
         BATCHES[:2],
         lambda i: BATCHES[(2 * i) % 5],
     ],
 )
-@pytest.mark.parametrize("begun", [BATCHES, lambda i: BATCHES[i % 5]])
-def test_other_batches_are_refused(tmp_path, begun, given):
+@pytest.mark.parametrize("first_arguments", [BATCHES, lambda i: BATCHES[i % 5]])
+def test_other_batches_are_refused(tmp_path, first_arguments, other_arguments):
     run = {"loss": residuals, "start": START, "method": "half_inverse", "rate": 0.1}
-    refused(tmp_path, "list of batches", {"batches": begun}, {"batches": given}, **run)
+    refused(tmp_path, "list of batches", {"batches": first_arguments}, {"batches": other_arguments}, **run)
 
 
 def test_batches_of_later_iterations_may_change(tmp_path):
@@ -224,9 +224,9 @@ def test_bounds_with_equal_text_are_distinguished(tmp_path):
         other[place] += change
         assert repr(other) == repr(lower)
         folder = tmp_path / str(place)
-        begun = {"bounds": (lower, None)}
-        given = {"bounds": (other, None)}
-        refused(folder, "pair of bounds", begun, given, loss=valley, start=start)
+        first_arguments = {"bounds": (lower, None)}
+        other_arguments = {"bounds": (other, None)}
+        refused(folder, "pair of bounds", first_arguments, other_arguments, loss=valley, start=start)
 
 
 def test_a_loss_that_differs_away_from_the_start_is_refused(tmp_path):

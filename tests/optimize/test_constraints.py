@@ -24,9 +24,9 @@ def test_bounds_against_scipy(rng, method):
     data = 3 * rng.standard_normal(10)
     loss = lambda x: 0.5 * anp.sum(x * (matrix @ x)) - anp.sum(data * x)
     best = dp.minimize(loss, np.full(10, 0.1), method, bounds=(0.0, 0.3), maxiter=3000, tolerance=1e-9)
-    known = minimize(loss, np.full(10, 0.1), jac=lambda x: matrix @ x - data, bounds=[(0, 0.3)] * 10, tol=1e-14)
+    expected = minimize(loss, np.full(10, 0.1), jac=lambda x: matrix @ x - data, bounds=[(0, 0.3)] * 10, tol=1e-14)
     assert np.all(best.x >= 0) and np.all(best.x <= 0.3)
-    assert np.allclose(best.x, known.x, atol=1e-5)
+    assert np.allclose(best.x, expected.x, atol=1e-5)
 
 
 @pytest.mark.parametrize("method", ["levenberg_marquardt", "gauss_newton"])
@@ -37,14 +37,14 @@ def test_bounded_least_squares_against_scipy(rng, method, options):
     data = 3 * rng.standard_normal(12)
     misses = lambda x: anp.sum(matrix * x, axis=-1) - data  # of copies of x too
     best = dp.minimize(misses, np.zeros(8), method, bounds=(-0.3, 0.4), **options)
-    known = lsq_linear(matrix, data, bounds=(-0.3, 0.4), tol=1e-14)
-    assert best.converged and np.allclose(best.x, known.x, atol=1e-7)
+    expected = lsq_linear(matrix, data, bounds=(-0.3, 0.4), tol=1e-14)
+    assert best.converged and np.allclose(best.x, expected.x, atol=1e-7)
     options = {name: value for name, value in options.items() if name != "apart"}
     bent = lambda x: anp.concatenate([10 * (x[1:] - x[:-1] ** 2), 1 - x[:-1]])
     start = np.array([-0.5, 0.3, -0.5, 0.4])
     best = dp.minimize(bent, start, method, bounds=(-1.0, 0.5), **options)
-    known = least_squares(bent, start, bounds=(-1.0, 0.5), xtol=1e-15, ftol=1e-15, gtol=1e-15)
-    assert best.converged and best.value == pytest.approx(known.cost, rel=1e-9)
+    expected = least_squares(bent, start, bounds=(-1.0, 0.5), xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    assert best.converged and best.value == pytest.approx(expected.cost, rel=1e-9)
 
 
 def test_half_inverse_keeps_entries_at_active_bounds():

@@ -57,14 +57,14 @@ def refused(result):
 
 
 def test_nested_leaves_keep_their_kinds():
-    given = start()
-    best = dp.minimize(nested, given)
+    initial = start()
+    best = dp.minimize(nested, initial)
     assert best.converged and best.method == "lbfgs"
     assert np.allclose(best.x["a"], 1, atol=1e-4)
     assert best.x["n"] == 3 and best.x["word"] == "x" and best.x["rest"].nothing is None
     assert isinstance(best.x["rest"], Rest) and isinstance(best.x["rest"].b[0], np.float32)
     assert isinstance(best.x["rest"].b[1], float)
-    assert np.array_equal(given["a"], start()["a"])
+    assert np.array_equal(initial["a"], start()["a"])
     assert best.value == pytest.approx(float(nested(best.x)), abs=1e-12)
 
 
@@ -117,8 +117,10 @@ def test_single_precision_and_complex_leaves():
     best = dp.minimize(lambda z: anp.sum(anp.abs(z - target) ** 2), np.array([1 + 1j, 2 - 1j]))
     assert np.allclose(best.x, target)
     assert dp.minimize(lambda z: anp.abs(z - 1j) ** 2, 0.5 + 0j).x == pytest.approx(1j)
-    own = dp.minimize(lambda z: np.sum(np.abs(z - target) ** 2), 0 * target, gradient=lambda z: 2 * np.conj(z - target))
-    assert np.allclose(own.x, target)
+    best = dp.minimize(
+        lambda z: np.sum(np.abs(z - target) ** 2), 0 * target, gradient=lambda z: 2 * np.conj(z - target)
+    )
+    assert np.allclose(best.x, target)
 
 
 def test_an_untraced_loss_with_a_user_gradient():

@@ -47,7 +47,7 @@ def test_starts_on_bounds_and_close_to_them(seed):
     start = [lower, near, np.where(rng.random(n) < 0.5, lower + 1e-9, upper - 1e-9)][seed % 3]
     loss = lambda x: 0.5 * anp.dot(x, anp.dot(matrix, x)) - anp.dot(linear, x)
     best = dp.minimize(loss, start, bounds=(lower, upper), maxiter=3000)
-    known = minimize(
+    expected = minimize(
         loss,
         start,
         jac=lambda x: matrix @ x - linear,
@@ -55,7 +55,7 @@ def test_starts_on_bounds_and_close_to_them(seed):
         method="L-BFGS-B",
         options={"maxiter": 5000, "maxfun": 20000, "ftol": 1e-15, "gtol": 1e-10},
     )
-    assert best.converged and best.value <= known.fun + 1e-9 * abs(known.fun)
+    assert best.converged and best.value <= expected.fun + 1e-9 * abs(expected.fun)
 
 
 LONG = {"deconvolution", "tomography"}
@@ -102,15 +102,15 @@ def test_refused_trial_points_with_bounds(rng):
 
     upper = np.where(np.arange(8) % 4, 2.0, 0.9)
     best = dp.minimize(walled, np.zeros(8), bounds=(-0.5, upper), maxiter=300)
-    known = minimize(valley, np.zeros(8), jac=rosen_der, bounds=[(-0.5, min(b, 0.95)) for b in upper], tol=1e-15)
-    assert best.value == pytest.approx(known.fun, rel=1e-3)
+    expected = minimize(valley, np.zeros(8), jac=rosen_der, bounds=[(-0.5, min(b, 0.95)) for b in upper], tol=1e-15)
+    assert best.value == pytest.approx(expected.fun, rel=1e-3)
     assert any(record.failed for record in best.history)
 
 
 def test_equal_bounds_and_corners():
     best = dp.minimize(valley, np.zeros(4), bounds=(np.array([-1.0, 0.3, -1.0, -1.0]), np.array([2.0, 0.3, 2.0, 2.0])))
-    known = minimize(valley, [0, 0.3, 0, 0], jac=rosen_der, bounds=[(-1, 2), (0.3, 0.3), (-1, 2), (-1, 2)])
-    assert best.x[1] == 0.3 and best.value == pytest.approx(known.fun, rel=1e-6)
+    expected = minimize(valley, [0, 0.3, 0, 0], jac=rosen_der, bounds=[(-1, 2), (0.3, 0.3), (-1, 2), (-1, 2)])
+    assert best.x[1] == 0.3 and best.value == pytest.approx(expected.fun, rel=1e-6)
     corner = dp.minimize(lambda x: anp.sum(x), np.array([0.3, 0.9]), bounds=(0.1, 1.0))
     assert np.array_equal(corner.x, [0.1, 0.1]) and corner.converged and corner.evaluations < 5
     still = dp.minimize(valley, np.full(3, 0.5), bounds=(0.5, 0.5))
@@ -190,7 +190,7 @@ def test_random_bounded_problems_against_scipy(method, options):
             maxiter=400 if first_order else 200,
             **options,
         )
-        known = minimize(
+        expected = minimize(
             half_square,
             start,
             jac=grad(half_square),
@@ -202,7 +202,7 @@ def test_random_bounded_problems_against_scipy(method, options):
         size = max(projected_gradient(residuals, start, lower, upper), 1e-3)
         if best.converged:
             assert projected_gradient(residuals, best.x, lower, upper) <= 1e-5 * size
-            assert best.value <= known.fun * (1 + 1e-5) + 1e-8
+            assert best.value <= expected.fun * (1 + 1e-5) + 1e-8
         assert best.converged or first_order
 
 
@@ -213,9 +213,9 @@ def test_gauss_newton_with_large_residuals_is_damped(rng):
     upper = np.array([0.45, -1.4659497, 0.98, np.inf, np.inf])
     start = np.array([-0.36, -1.4659497, 0.03, -0.5, 0.6])
     best = dp.minimize(residuals, start, "gauss_newton", bounds=(lower, upper), maxiter=300)
-    known = dp.minimize(lambda x: 0.5 * anp.sum(residuals(x) ** 2), start, bounds=(lower, upper))
+    expected = dp.minimize(lambda x: 0.5 * anp.sum(residuals(x) ** 2), start, bounds=(lower, upper))
     assert best.converged and best.evaluations < 400
-    assert np.allclose(best.x, known.x, atol=1e-5)
+    assert np.allclose(best.x, expected.x, atol=1e-5)
 
 
 def test_a_linear_problem_in_a_box_takes_one_step(rng):
@@ -224,5 +224,5 @@ def test_a_linear_problem_in_a_box_takes_one_step(rng):
         matrix = rng.normal(size=(30, 20))
         data = 5 * rng.normal(size=30)
         best = dp.minimize(lambda x, a=matrix, d=data: a @ x - d, np.zeros(20), "gauss_newton", bounds=(-0.3, 0.4))
-        known = lsq_linear(matrix, data, bounds=(-0.3, 0.4), tol=1e-14)
-        assert best.converged and len(best.history) <= 3 and np.allclose(best.x, known.x, atol=1e-8)
+        expected = lsq_linear(matrix, data, bounds=(-0.3, 0.4), tol=1e-14)
+        assert best.converged and len(best.history) <= 3 and np.allclose(best.x, expected.x, atol=1e-8)

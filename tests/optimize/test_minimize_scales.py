@@ -30,15 +30,15 @@ def loss(x):
 def test_residuals_of_any_magnitude(method, options, bounds):
     """Squares underflow below 1e-162: without scaling the gradient is 0 and the start seems converged."""
     start = np.array([0.1, 0.0, -0.2])
-    known = dp.minimize(residuals, start, method, bounds=bounds, **options)
-    assert known.converged
+    unscaled = dp.minimize(residuals, start, method, bounds=bounds, **options)
+    assert unscaled.converged
     for exponent in EXPONENTS:
         factor = 2.0**exponent
         best = dp.minimize(lambda x, factor=factor: factor * residuals(x), start, method, bounds=bounds, **options)
-        assert best.converged and np.allclose(best.x, known.x, atol=1e-7)
-        assert len(best.history) == len(known.history)
+        assert best.converged and np.allclose(best.x, unscaled.x, atol=1e-7)
+        assert len(best.history) == len(unscaled.history)
         with np.errstate(over="ignore"):
-            assert best.value == pytest.approx(np.float64(known.value) * factor * factor, rel=1e-6)
+            assert best.value == pytest.approx(np.float64(unscaled.value) * factor * factor, rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -59,11 +59,11 @@ def test_unknowns_of_any_magnitude(method, options, bounds):
             **options,
         )
 
-    known = run(1.0)
-    assert known.converged
+    unscaled = run(1.0)
+    assert unscaled.converged
     for exponent in (-1000, -550, 700):
         best = run(2.0**exponent)
-        assert best.converged and np.allclose(best.x / 2.0**exponent, known.x, atol=1e-6)
+        assert best.converged and np.allclose(best.x / 2.0**exponent, unscaled.x, atol=1e-6)
 
 
 @pytest.mark.parametrize("exponent", [-1000, 1000])
@@ -71,9 +71,9 @@ def test_unknowns_of_any_magnitude(method, options, bounds):
 def test_losses_of_any_magnitude(method, options, exponent):
     factor = 2.0**exponent
     start = np.array([0.1, 0.0, -0.2])
-    known = dp.minimize(loss, start, method, maxiter=60, **options)
+    unscaled = dp.minimize(loss, start, method, maxiter=60, **options)
     best = dp.minimize(lambda x: factor * loss(x), start, method, maxiter=60, **options)
-    assert np.allclose(best.x, known.x, rtol=1e-9) and best.converged == known.converged
+    assert np.allclose(best.x, unscaled.x, rtol=1e-9) and best.converged == unscaled.converged
 
 
 @pytest.mark.parametrize("exponent", [-1000, -550, 550])
@@ -136,9 +136,9 @@ def test_a_tolerance_function_gets_comparable_losses(exponent):
     start = np.array([0.1, 0.0, -0.2])
     with np.errstate(over="ignore"):
         best = dp.minimize(lambda x: factor * residuals(x), start, "levenberg_marquardt", tolerance=rule)
-    known = dp.minimize(residuals, start, "levenberg_marquardt", tolerance=rule)
-    assert best.converged and len(best.history) == len(known.history) > 2
-    assert np.allclose(best.x, known.x, rtol=1e-9)
+    unscaled = dp.minimize(residuals, start, "levenberg_marquardt", tolerance=rule)
+    assert best.converged and len(best.history) == len(unscaled.history) > 2
+    assert np.allclose(best.x, unscaled.x, rtol=1e-9)
 
 
 @pytest.mark.parametrize("as_function", [False, True])

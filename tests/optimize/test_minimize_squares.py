@@ -68,8 +68,8 @@ def test_lotka_volterra(rng):
     start = np.array([0.9, 0.9, 0.7])
     passes = []
     best = dp.minimize(lambda p: passes.append(p) or path(p) - data, start, "levenberg_marquardt")
-    known, spread = curve_fit(lambda _, *p: path(np.array(p)), np.arange(42.0), data, start, xtol=1e-12, ftol=1e-12)
-    assert best.converged and np.allclose(best.x, known, rtol=1e-6)
+    expected, spread = curve_fit(lambda _, *p: path(np.array(p)), np.arange(42.0), data, start, xtol=1e-12, ftol=1e-12)
+    assert best.converged and np.allclose(best.x, expected, rtol=1e-6)
     assert np.allclose(best.covariance, spread, rtol=1e-4)
     assert len(best.history) < 10  # each takes its residuals and three forward products, and not 42 in reverse
     assert len(passes) <= 2 + best.evaluations + 3 * len(best.history)
@@ -100,8 +100,8 @@ def test_covariance_against_the_formula_and_curve_fit(rng, method, scale):
     by_hand = np.linalg.inv(jacobian.T @ jacobian) * 2 * best.value / 27 * np.outer(sizes, sizes)
     assert np.allclose(best.covariance, by_hand, rtol=1e-9, atol=0)
     if scale == 1:
-        known = curve_fit(model, TIMES, data, [2.5, 1.0, 0.4], xtol=1e-12, ftol=1e-12)[1]
-        assert np.allclose(best.covariance, known, rtol=1e-4)
+        expected = curve_fit(model, TIMES, data, [2.5, 1.0, 0.4], xtol=1e-12, ftol=1e-12)[1]
+        assert np.allclose(best.covariance, expected, rtol=1e-4)
 
 
 def test_covariance_where_it_is_not_known(rng):
@@ -130,12 +130,13 @@ def test_covariance_where_it_is_not_known(rng):
     exact = run(square, absolute_sigma=True).covariance
     assert np.allclose(exact, np.linalg.inv(square.T @ square), rtol=1e-6)
     assert np.all(np.isinf(run(square[:3], lambda x: square[:3] @ x - 1.0, absolute_sigma=True).covariance))
-    known = run(matrix).covariance
+    expected = run(matrix).covariance
     assert np.allclose(
-        known, np.linalg.inv(matrix.T @ matrix) * least_squares(lambda x: matrix @ x - data, np.zeros(3)).cost * 2 / 7
+        expected,
+        np.linalg.inv(matrix.T @ matrix) * least_squares(lambda x: matrix @ x - data, np.zeros(3)).cost * 2 / 7,
     )
     copies = lambda x: anp.sum(matrix * x, axis=-1) - data
-    assert np.allclose(run(matrix, copies, apart=True).covariance, known)
+    assert np.allclose(run(matrix, copies, apart=True).covariance, expected)
 
 
 @pytest.mark.parametrize("method", [*METHODS, "half_inverse"])
@@ -147,13 +148,13 @@ def test_absolute_sigma_against_curve_fit(rng, method):
     weighted = matrix / sigma[:, None]
     run = lambda **options: dp.minimize(lambda x: anp.dot(weighted, x) - data / sigma, np.zeros(3), method, **options)
     model = lambda _, *x: matrix @ np.array(x)
-    known = curve_fit(model, np.arange(20), data, np.zeros(3), sigma, absolute_sigma=True)[1]
+    expected = curve_fit(model, np.arange(20), data, np.zeros(3), sigma, absolute_sigma=True)[1]
     found = run(absolute_sigma=True).covariance
-    assert np.allclose(found, known, rtol=1e-5)
+    assert np.allclose(found, expected, rtol=1e-5)
     assert np.allclose(found, np.linalg.inv(weighted.T @ weighted), rtol=1e-9)
     if method != "half_inverse":  # it ends short of the minimum
-        known = curve_fit(model, np.arange(20), data, np.zeros(3), sigma, absolute_sigma=False)[1]
-        assert np.allclose(run().covariance, known, rtol=1e-5)
+        expected = curve_fit(model, np.arange(20), data, np.zeros(3), sigma, absolute_sigma=False)[1]
+        assert np.allclose(run().covariance, expected, rtol=1e-5)
     with pytest.raises(ValueError, match="absolute_sigma must be one of True, False, got 1"):
         run(absolute_sigma=1)
 

@@ -59,8 +59,8 @@ def test_obstacles_are_excluded():
 def test_derivatives(grid, make):
     term = make(grid)
     u = np.random.default_rng(0).standard_normal(grid.shape)
-    found = dp.check.gradient(lambda u: term(u) + anp.sum(u**2), u)  # of a constant it sees rounding alone
-    assert found.verdict == "agrees" and found.hessian == "agrees"
+    report = dp.check.gradient(lambda u: term(u) + anp.sum(u**2), u)  # of a constant it sees rounding alone
+    assert report.verdict == "agrees" and report.hessian == "agrees"
 
 
 def test_refused_numbers():

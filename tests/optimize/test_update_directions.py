@@ -37,10 +37,10 @@ def test_the_family_against_the_svd(rng, shape, power, method):
     matrix = jacobian(rng, shape)
     x = rng.standard_normal(shape[1])
     for damping in (0.0, 1e-3):
-        found = dp.update_direction(lambda u: matrix @ u, x, power=power, damping=damping, method=method)
-        assert gap(found.step, reference(matrix, matrix @ x, power, damping)) < 1e-10
+        direction = dp.update_direction(lambda u: matrix @ u, x, power=power, damping=damping, method=method)
+        assert gap(direction.step, reference(matrix, matrix @ x, power, damping)) < 1e-10
     if power:
-        assert gap(found.spectrum[0], 1.0) < 1e-10 or shape == (1, 5) or method == "krylov"
+        assert gap(direction.spectrum[0], 1.0) < 1e-10 or shape == (1, 5) or method == "krylov"
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -50,8 +50,8 @@ def test_a_cotangent_outside_the_range_of_the_jacobian(rng, shape, power, method
     """Residuals of more outputs than unknowns have a part outside the range of J."""
     matrix = jacobian(rng, shape)
     g = rng.standard_normal(shape[0])
-    found = dp.update_direction(lambda u: matrix @ u, np.zeros(shape[1]), g, power=power, method=method)
-    assert gap(found.step, reference(matrix, g, power)) < 1e-9
+    direction = dp.update_direction(lambda u: matrix @ u, np.zeros(shape[1]), g, power=power, method=method)
+    assert gap(direction.step, reference(matrix, g, power)) < 1e-9
 
 
 SCALES = [1.0, 1e-200, 1e180]
@@ -68,12 +68,12 @@ def test_singular_values_from_gram_matrices(rng, decades, digits, scale):
     assert np.allclose(left.T @ left, np.eye(20), atol=1e-13)
     assert np.allclose(values[kept], s[kept], rtol=10.0**-digits)
     ours = left[:, kept]  # up to signs
-    known = u[:, kept]
-    assert np.linalg.norm(ours @ (ours.T @ matrix / s[0]) - known @ (known.T @ matrix / s[0])) <= 1e-8
+    unscaled = u[:, kept]
+    assert np.linalg.norm(ours @ (ours.T @ matrix / s[0]) - unscaled @ (unscaled.T @ matrix / s[0])) <= 1e-8
     b = rng.standard_normal(20)
     shares = np.where(kept, s / s[0], np.inf) ** -1.5
-    known = v.T @ (shares * (u.T @ b) * s / s[0])
-    assert gap((left @ (shares * (left.T @ b))) @ (matrix / s[0]), known) <= 10.0**-digits
+    unscaled = v.T @ (shares * (u.T @ b) * s / s[0])
+    assert gap((left @ (shares * (left.T @ b))) @ (matrix / s[0]), unscaled) <= 10.0**-digits
 
 
 def test_singular_values_of_empty_and_zero_matrices():
@@ -110,10 +110,10 @@ def test_power_zero_is_the_gradient_to_the_last_digits(rng):
 def test_truncation(rng, method):
     matrix = jacobian(rng, (8, 20), decades=7)
     x = rng.standard_normal(20)
-    found = dp.update_direction(lambda u: matrix @ u, x, power=1, truncation=3e-5, method=method)
-    assert found.kept == 5 if method == "dense" else found.kept <= 5
+    direction = dp.update_direction(lambda u: matrix @ u, x, power=1, truncation=3e-5, method=method)
+    assert direction.kept == 5 if method == "dense" else direction.kept <= 5
     expected = reference(matrix, matrix @ x, 1, truncation=3e-5)
-    assert gap(found.step, expected) < 1e-6
+    assert gap(direction.step, expected) < 1e-6
     gram = dp.update_direction(lambda u: matrix @ u, x, power=1, truncation=3e-5)
     assert gram.method == "dense" and f"{gram.kept} kept" in str(gram)
 
@@ -122,8 +122,8 @@ def test_a_rank_deficient_jacobian(rng):
     matrix = jacobian(rng, (4, 10))[[0, 1, 1, 2, 3, 3]]
     x = rng.standard_normal(10)
     for method in ("dense", "krylov"):
-        found = dp.update_direction(lambda u: matrix @ u, x, power=1, method=method)
-        assert np.allclose(matrix @ found.step, matrix @ x, rtol=1e-9)
+        direction = dp.update_direction(lambda u: matrix @ u, x, power=1, method=method)
+        assert np.allclose(matrix @ direction.step, matrix @ x, rtol=1e-9)
 
 
 def test_directions_of_zero_and_empty_jacobians():
@@ -151,9 +151,9 @@ def test_memory_of_the_bidiagonalisation(rng):
     weights = 1.0 / (1 + np.arange(size) % 7)
     rule = linear("weights", lambda u: weights * u, lambda g: weights * g)[0]
     x = rng.standard_normal(size)
-    found = dp.update_direction(rule, x, power=0.75)
-    assert found.method == "krylov" and len(found.spectrum) <= 16  # seven different numbers, and rounding
-    assert gap(found.step, np.sqrt(weights) * x) < 1e-8
+    direction = dp.update_direction(rule, x, power=0.75)
+    assert direction.method == "krylov" and len(direction.spectrum) <= 16  # seven different numbers, and rounding
+    assert gap(direction.step, np.sqrt(weights) * x) < 1e-8
 
 
 # ---- the methods of minimize ---------------------------------------------------------------------------------------
@@ -274,10 +274,10 @@ def test_outputs_of_any_magnitude(method, power, exponent, rng):
     run = lambda factor: dp.update_direction(
         lambda x: factor * (anp.dot(matrix, x) - data), np.ones(4), method=method, power=power
     )
-    known = run(1.0)
+    unscaled = run(1.0)
     scaled = run(factor)
-    assert np.allclose(scaled.step, known.step * factor ** (2.0 - 2.0 * power), rtol=1e-9)  # J^T (J J^T)^-p r
-    assert np.allclose(scaled.spectrum, factor * known.spectrum, rtol=1e-9) and scaled.kept == known.kept
+    assert np.allclose(scaled.step, unscaled.step * factor ** (2.0 - 2.0 * power), rtol=1e-9)  # J^T (J J^T)^-p r
+    assert np.allclose(scaled.spectrum, factor * unscaled.spectrum, rtol=1e-9) and scaled.kept == unscaled.kept
 
 
 @pytest.mark.parametrize("method", ["dense", "krylov"])
