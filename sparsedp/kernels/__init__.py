@@ -1,18 +1,28 @@
 """Compiled loops on plain arrays, and the NumPy formulas (`reference`) that run without numba.
 
-The arrays are not checked: that is the caller's business. They are C-contiguous and hold float64; other numbers are
-cast by the caller. numba is imported at the first use of a kernel, never before. Setting the environment variable
-``SPARSEDP_NUMBA=0`` before the first use switches it off.
+Arrays must be C-contiguous and hold float64; the caller checks and casts them. numba is imported at the first use of a
+compiled loop, never before. The environment variable ``SPARSEDP_NUMBA=0``, set before the first use, disables it.
 """
 
+from __future__ import annotations
+
 import functools
+import importlib
 import importlib.util
 import operator
 import os
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sparsedp.kernels import reference
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from sparsedp.kernels.reference import Rows, Tridiagonal
 
 __all__ = [
     "along_axis",
@@ -26,36 +36,43 @@ __all__ = [
 
 
 @functools.cache
-def compiled():
-    """Whether numba is installed and not switched off -> bool. Does not import numba."""
+def compiled() -> bool:
+    """Return whether numba is installed and not disabled; does not import numba."""
     return os.environ.get("SPARSEDP_NUMBA", "1") != "0" and importlib.util.find_spec("numba") is not None
 
 
 @functools.cache
-def _available():
-    """Number of processors this process may use, not more than numba may use."""
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def _available_threads() -> int:
+    """Return the number of processors that this process may use, at most as many as numba may use."""
+    if hasattr(os, "sched_getaffinity"):
+        usable = len(os.sched_getaffinity(0))
+    else:
+        usable = os.cpu_count() or 1
     limit = os.environ.get("NUMBA_NUM_THREADS", "")
-    return min(usable, int(limit)) if limit.isdigit() and int(limit) else usable
+    if limit.isdigit() and int(limit):
+        return min(usable, int(limit))
+    return usable
 
 
-_chosen: list[int] = []  # empty: as many as there are
+_chosen_threads: list[int] = []  # empty: all available
 
 
-def threads():
-    """Number of threads the compiled kernels use -> int."""
-    return _chosen[0] if _chosen else _available()
+def threads() -> int:
+    """Return the number of threads that the compiled loops use."""
+    if _chosen_threads:
+        return _chosen_threads[0]
+    return _available_threads()
 
 
-def set_threads(n=None):
-    """Choose how many threads the compiled kernels use.
+def set_threads(n: int | None = None) -> None:
+    """Set the number of threads that the compiled loops use.
 
-    The result of a kernel does not depend on it, to the last bit.
+    Results do not depend on it: they are bit-identical.
 
     Parameters
     ----------
     n : int, optional
-        From 1 to the number of processors this process may use; None goes back to all of them.
+        From 1 to the number of processors that this process may use. Default: all of them.
 
     Raises
     ------
@@ -72,46 +89,57 @@ def set_threads(n=None):
     >>> set_threads()
     """
     if n is None:
-        _chosen.clear()
+        _chosen_threads.clear()
         return
     try:
         n = operator.index(n)
     except TypeError:
         raise TypeError(f"set_threads got {n!r}; it needs an integer, for example 1, or None for the default") from None
-    if not 1 <= n <= _available():
+    if not 1 <= n <= _available_threads():
         raise ValueError(
-            f"set_threads got {n}; it needs 1 to {_available()}, the processors this process may use; "
+            f"set_threads got {n}; it needs 1 to {_available_threads()}, the processors this process may use; "
             "write None for the default"
         )
-    _chosen[:] = [n]
+    _chosen_threads[:] = [n]
 
 
-_module = functools.cache(importlib.import_module)  # finding it again takes longer than a small loop
+_import_module = functools.cache(importlib.import_module)  # without the cache it takes longer than a small loop
 
 
-def run(module, name, rows, work, threads, *args):
-    """Run a compiled loop of a module of this folder over some rows -> whether there is one and it works here.
+def run(module: str, name: str, rows: int, work: int, threads: int, *args: Any) -> bool:
+    """Run a compiled loop over some rows, and return whether it is available.
 
-    `work` is the count of numbers that decides whether several threads are worth it.
+    Parameters
+    ----------
+    module, name : str
+        A module of this package and the name of its loop.
+    rows : int
+        Number of rows, over which the threads are distributed.
+    work : int
+        Number of values, which determines whether several threads pay.
+    threads : int
+        Largest number of threads.
+    *args
+        Arguments of the loop, without the range of rows.
     """
-    loop = getattr(_module(f"{__name__}.{module}"), name) if compiled() else None
-    if loop is None or not loop.compiled:
+    if not compiled():
+        return False
+    loop = getattr(_import_module(f"{__name__}.{module}"), name)
+    if not loop.compiled:
         return False
     loop.run(rows, work, threads, *args)
     return True
 
 
-def summed(shape, axes, shift):
-    """Three tridiagonal matrices T_a -> function (u, out): out = shift u + sum over a of T_a u, in one pass.
-
-    What its loop reads is made ready once.
+def summed(shape: tuple[int, int, int], axes: Sequence[Tridiagonal | None], shift: float) -> Callable[..., None]:
+    """Return a function ``act(u, out)`` that sets out = shift u + sum over a of T_a u in one pass.
 
     Parameters
     ----------
     shape : (n0, n1, n2)
         Of `u` and `out`, float64 arrays that must not overlap.
-    axes : tuple of three
-        `Tridiagonal` of n_a rows, or None where nothing is done along the axis.
+    axes : sequence of three
+        `Tridiagonal` T_a of n_a rows, or None for an axis without a matrix.
     shift : float
         Multiple of `u` itself.
 
@@ -126,18 +154,19 @@ def summed(shape, axes, shift):
     """
     bands = [np.zeros((3, n)) if axis is None else np.stack(axis) for n, axis in zip(shape, axes, strict=True)]
     inner = bands[2][:, 1:-1]
-    uniform, rows = (inner == inner[:, :1]).all(), shape[0] * shape[1]
+    uniform = (inner == inner[:, :1]).all()
+    rows = shape[0] * shape[1]
 
     def act(u, out, *_):
-        given = u.reshape(shape), out.reshape(shape)
-        if u.size and not run("stencil", "kronecker_sum", rows, u.size, threads(), *given, *bands, uniform, shift):
-            reference.kronecker_sum(*given, axes, shift)
+        fields = u.reshape(shape), out.reshape(shape)
+        if u.size and not run("stencil", "kronecker_sum", rows, u.size, threads(), *fields, *bands, uniform, shift):
+            reference.kronecker_sum(*fields, axes, shift)
 
     return act
 
 
-def along_axis(u, out, rows, scale, accumulate):
-    """Field, sparse 1-D matrix M -> out = scale M u or out += scale M u along the middle axis.
+def along_axis(u: NDArray, out: NDArray, rows: Rows, scale: float, accumulate: bool) -> None:
+    """Set out = scale M u, or add it to `out`, for a sparse 1-D matrix M along the middle axis.
 
     Parameters
     ----------
@@ -149,7 +178,7 @@ def along_axis(u, out, rows, scale, accumulate):
     scale : float
         Factor of the product.
     accumulate : bool
-        Add to `out` instead of replacing it.
+        Whether to add to `out` instead of replacing it.
 
     Examples
     --------
@@ -162,21 +191,23 @@ def along_axis(u, out, rows, scale, accumulate):
     >>> out
     array([[[3., 6.]]])
     """
-    given: tuple
+    args: tuple[Any, ...]
     if out.shape[2] == 1 and rows.offsets.size:
-        fields, diagonals = (u[:, :, 0], out[:, :, 0]), (rows.offsets, rows.start, rows.stop, rows.values)
-        given = "along_rows", out.size, out.size, threads(), *fields, *diagonals, scale, accumulate
+        name = "along_rows"
+        count = out.size
+        args = u[:, :, 0], out[:, :, 0], rows.offsets, rows.start, rows.stop, rows.values
     else:
-        matrix, many = (rows.indptr, rows.indices, rows.data), out.shape[0] * out.shape[1]
-        given = "across_rows", many, out.size, threads(), u, out, *matrix, scale, accumulate
-    if not out.size or not run("stencil", *given):
+        name = "across_rows"
+        count = out.shape[0] * out.shape[1]
+        args = u, out, rows.indptr, rows.indices, rows.data
+    if not out.size or not run("stencil", name, count, out.size, threads(), *args, scale, accumulate):
         reference.product_along(u, out, rows, scale, accumulate)
 
 
-def sweep(x, lower, upper, inverses):
-    """Right-hand sides -> solutions, in place: tridiagonal systems along the first axis, eliminated before.
+def sweep(x: NDArray, lower: NDArray, upper: NDArray, inverses: NDArray) -> None:
+    """Solve tridiagonal systems along the first axis in place, for pivots that are already eliminated.
 
-    Down the rows x_i = (x_i - lower_i x_(i-1)) inverses_i, up x_i -= upper_i x_(i+1) inverses_i.
+    Down the rows x_i = (x_i - lower_i x_(i-1)) inverses_i, then up x_i -= upper_i x_(i+1) inverses_i.
 
     Parameters
     ----------
@@ -195,6 +226,5 @@ def sweep(x, lower, upper, inverses):
     array([[-0.33333333],
            [ 1.66666667]])
     """
-    given = x, lower, upper, inverses
-    if not x.size or not run("elimination", "eliminate", x.shape[1], x.size, threads(), *given):
-        reference.eliminate(*given)
+    if not x.size or not run("elimination", "eliminate", x.shape[1], x.size, threads(), x, lower, upper, inverses):
+        reference.eliminate(x, lower, upper, inverses)

@@ -1,25 +1,39 @@
 """Compiled elimination along the first axis: tridiagonal systems, one in each column."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from sparsedp.kernels.team import kernel
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 __all__ = ["eliminate"]
 
-BAND = 32768  # numbers of a band of columns that is worked on at a time: solution and pivots stay in the L2 cache
+BAND = 32768  # values of a band of columns at a time: solution and pivots stay in the L2 cache
 
 
 @kernel("write2 read1 read1 read2")
-def eliminate(x, lower, upper, inverses, start, stop):
-    """Down the rows and up again, in place, for the columns from `start` to `stop`; see `sparsedp.kernels.sweep`."""
+def eliminate(x: NDArray, lower: NDArray, upper: NDArray, inverses: NDArray, start: int, stop: int) -> None:
+    """Eliminate downwards and substitute upwards, for columns `start` to `stop`; see `sparsedp.kernels.sweep`."""
     n = x.shape[0]
     width = max(32, BAND // n)
     for left in range(start, stop, width):
         right = min(left + width, stop)
         for i in range(n):
-            here, pivots, low = x[i, left:right], inverses[i, left:right], lower[i] if i else 0.0
-            before = x[max(i - 1, 0), left:right]
-            for j in range(here.size):
-                here[j] = (here[j] - low * before[j]) * pivots[j]
+            row = x[i, left:right]
+            pivots = inverses[i, left:right]
+            if i:
+                low = lower[i]
+            else:
+                low = 0.0
+            row_above = x[max(i - 1, 0), left:right]
+            for j in range(row.size):
+                row[j] = (row[j] - low * row_above[j]) * pivots[j]
         for i in range(n - 2, -1, -1):
-            here, pivots, after = x[i, left:right], inverses[i, left:right], x[i + 1, left:right]
-            for j in range(here.size):
-                here[j] -= upper[i] * after[j] * pivots[j]
+            row = x[i, left:right]
+            pivots = inverses[i, left:right]
+            row_below = x[i + 1, left:right]
+            for j in range(row.size):
+                row[j] -= upper[i] * row_below[j] * pivots[j]

@@ -26,12 +26,15 @@ for numbers and arrays.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy import int64, uint64
 
 from sparsedp.kernels.team import Kernel, kernel
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 __all__ = [
     "SCHEMES",
@@ -161,24 +164,36 @@ def side_of(axes, a, piece, upper, tile):
 
     Along the last axis the pieces are the inner cells (0), the lower end (1) and the upper end (2) of a row.
     """
-    n, stride, wall = axes[a, N], axes[a, STRIDE], axes[a, WALL + upper]
+    n = axes[a, N]
+    stride = axes[a, STRIDE]
+    wall = axes[a, WALL + upper]
     block, first, size, _, _ = tile
     line = first
     if a < len(axes) - 1:  # divisions take most of the time here
         line = first // stride
         block = line // n
     position = line - block * n
-    begin, end = 0, size
+    begin = 0
+    end = size
     at_end = position == (n - 1) * upper
     if a == len(axes) - 1:
-        start = 1 if position == 0 else 0
-        stop = max(size - 1, start) if position + size == n else size
-        if piece == 0:
-            begin, end = start, stop
-        elif piece == 1:
-            begin, end = 0, start
+        if position == 0:
+            start = 1
         else:
-            begin, end = stop, size
+            start = 0
+        if position + size == n:
+            stop = max(size - 1, start)
+        else:
+            stop = size
+        if piece == 0:
+            begin = start
+            end = stop
+        elif piece == 1:
+            begin = 0
+            end = start
+        else:
+            begin = stop
+            end = size
         at_end = piece == 1 + upper or piece * n == 1
     walls = wall != ROUND
     step = (2 * upper - 1) * stride
@@ -208,7 +223,9 @@ def share(flow):
 
 def weigh(lines, line, x, start, table, row, axes, a, side, free, c):
     """Set a line buffer to x times a row of the table for the cells of a piece, and to 0 on closed sides."""
-    b, e, at = side.begin, side.end, side.column
+    b = side.begin
+    e = side.end
+    at = side.column
     if a == len(axes) - 1 and axes[a, VARIES]:
         for j in range(b, e):
             lines[line + j] = x[start + j] * table[row, at + j]
@@ -297,7 +314,24 @@ OPTIONS: dict[str, Any] = {
 
 
 @kernel("read1 read1 read1 mask2 read3 real read2 index2 real real read1 real write1 write1", **OPTIONS)
-def stage(u, inflow, w, free, slopes, dt, table, axes, flux, least, u0, keep, out, wrong, start, stop):
+def stage(
+    u: NDArray,
+    inflow: NDArray,
+    w: NDArray,
+    free: NDArray,
+    slopes: NDArray,
+    dt: float,
+    table: NDArray,
+    axes: NDArray,
+    flux: float,
+    least: float,
+    u0: NDArray,
+    keep: float,
+    out: NDArray,
+    wrong: NDArray,
+    start: int,
+    stop: int,
+) -> None:
     """Set out = keep u0 + (1 - keep) u'.
 
     `wrong` is set, for each tile, to the number of weights below `least` and of results that are not finite.
@@ -307,7 +341,10 @@ def stage(u, inflow, w, free, slopes, dt, table, axes, flux, least, u0, keep, ou
     leaves = memory[0]
     enters = memory[1]
     uneven = axes[0, UNEVEN]
-    speed = lines if uneven else w
+    if uneven:
+        speed = lines
+    else:
+        speed = w
     slopes_per_axis = slopes.shape[1]
     for part in range(start, stop):
         tile = _, _, _, c, size = tile_of(axes, part)
@@ -316,25 +353,36 @@ def stage(u, inflow, w, free, slopes, dt, table, axes, flux, least, u0, keep, ou
             leaves[j] = 0.0
             enters[j] = 0.0
         for a in range(len(axes)):
-            ratio = dt if uneven else dt * table[OWN, axes[a, COLUMN]]
+            if uneven:
+                ratio = dt
+            else:
+                ratio = dt * table[OWN, axes[a, COLUMN]]
             for piece in range(3 if a == len(axes) - 1 else 1):
                 below = side_of(axes, a, piece, int64(0), tile)  # int64: compiled for one type
                 above = side_of(axes, a, piece, int64(1), tile)
-                b, e, i, k = below.begin, below.end, below.beyond, above.beyond
-                m, h = below.speed, above.speed
+                b = below.begin
+                e = below.end
+                i = below.beyond
+                k = above.beyond
+                m = below.speed
+                h = above.speed
                 if b == e:
                     continue
                 if uneven:
                     weigh(lines, NONE, w, m, table, OWN, axes, a, below, free, c)
                     weigh(lines, ONE, w, h, table, OWN + 1, axes, a, above, free, c)
-                    m, h = NONE, ONE
+                    m = NONE
+                    h = ONE
                 for j in range(b, e):
                     low = ratio * speed[m + j]  # Courant numbers into the cells
                     high = -ratio * speed[h + j]
                     leaves[j] += max(low, 0.0) + max(high, 0.0) - flux * (low + high)
                     enters[j] += max(low, 0.0) * (below.shown * u[i + j]) + max(high, 0.0) * (above.shown * u[k + j])
                 for upper in range(2 if slopes.size or below.shown * above.shown == 0.0 else 0):
-                    (_, _, i, _, wall, _, inner, shown), m, sign = (above, h, -ratio) if upper else (below, m, ratio)
+                    if upper:
+                        (_, _, i, _, wall, _, inner, shown), m, sign = (above, h, -ratio)
+                    else:
+                        (_, _, i, _, wall, _, inner, shown), m, sign = (below, m, ratio)
                     if not shown:
                         for j in range(b, e):
                             enters[j] += max(sign * speed[m + j], 0.0) * inflow[wall + j]
@@ -356,7 +404,26 @@ def stage(u, inflow, w, free, slopes, dt, table, axes, flux, least, u0, keep, ou
     "read1 read1 read1 read1 mask2 read3 real read2 index2 real write1 write1 write1 flag write4 write1",
     **OPTIONS,
 )
-def vjp(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, fresh, partials, wrong, start, stop):
+def vjp(
+    g: NDArray,
+    u: NDArray,
+    inflow: NDArray,
+    w: NDArray,
+    free: NDArray,
+    slopes: NDArray,
+    dt: float,
+    table: NDArray,
+    axes: NDArray,
+    flux: float,
+    gu: NDArray,
+    ginflow: NDArray,
+    gw: NDArray,
+    fresh: bool,
+    partials: NDArray,
+    wrong: NDArray,
+    start: int,
+    stop: int,
+) -> None:
     """Pull the cotangent g of u' back to u (with constant slopes), to the inflow and to w.
 
     `gu` is set to the cotangent of u. The cotangent of the inflow is added to `ginflow`. `gw` is set to the cotangent
@@ -369,7 +436,10 @@ def vjp(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, f
     field = memory[0]
     of_slopes = memory[1:]
     uneven = axes[0, UNEVEN]
-    given = lines if uneven else g
+    if uneven:
+        given = lines
+    else:
+        given = g
     last = slopes.shape[1] - 1
     for part in range(start, stop):
         tile = _, _, _, c, size = tile_of(axes, part)
@@ -379,23 +449,40 @@ def vjp(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, f
         for a in range(len(axes)):
             on_sides = axes[a, ON_SIDES]
             cells = uint64(axes[a, SPEED])
-            ratio = dt if uneven else dt * table[OWN, axes[a, COLUMN]]
+            if uneven:
+                ratio = dt
+            else:
+                ratio = dt * table[OWN, axes[a, COLUMN]]
             for piece in range(3 if a == len(axes) - 1 else 1):
                 below = side_of(axes, a, piece, int64(0), tile)
                 above = side_of(axes, a, piece, int64(1), tile)
-                b, e, m, h = below.begin, below.end, below.speed, above.speed
+                b = below.begin
+                e = below.end
+                m = below.speed
+                h = above.speed
                 sides = (below, above)
                 if b == e:
                     continue
                 # Where `given` holds the cotangents of the cells (x, y: lower, upper side) and of those beyond (i, k).
-                x, y, i, k = c, c, below.beyond, above.beyond
-                o, p = (m, h) if on_sides else (cells + i, cells + k)
+                x = c
+                y = c
+                i = below.beyond
+                k = above.beyond
+                if on_sides:
+                    o = m
+                    p = h
+                else:
+                    o = cells + i
+                    p = cells + k
                 if uneven:
                     weigh(lines, NONE, g, c, table, OWN, axes, a, below, free, c)
                     weigh(lines, ONE, g, c, table, OWN + 1, axes, a, above, free, c)
                     weigh(lines, TWO, g, i, table, THEIRS, axes, a, below, free, c)
                     weigh(lines, THREE, g, k, table, THEIRS + 1, axes, a, above, free, c)
-                    x, y, i, k = NONE, ONE, TWO, THREE
+                    x = NONE
+                    y = ONE
+                    i = TWO
+                    k = THREE
                 places = x, y, i, k
                 if gu.size:
                     for j in range(b, e):
@@ -407,9 +494,26 @@ def vjp(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, f
                         less += (max(high, 0.0) - flux * high) * given[y + j]
                         field[j] += more - less
                 for upper in range(2):
-                    (_, _, _, m, wall, _, inner, shown), sign = (above, -1.0) if upper else (below, 1.0)
-                    x, i, o, into = (y, k, p, -ratio) if upper else (x, i, o, ratio)
-                    target, at = (field, NONE) if shown else (ginflow, wall)
+                    if upper:
+                        (_, _, _, m, wall, _, inner, shown), sign = (above, -1.0)
+                    else:
+                        (_, _, _, m, wall, _, inner, shown), sign = (below, 1.0)
+                    if upper:
+                        x = y
+                        i = k
+                        o = p
+                        into = -ratio
+                    else:
+                        x = x
+                        i = i
+                        o = o
+                        into = ratio
+                    if shown:
+                        target = field
+                        at = NONE
+                    else:
+                        target = ginflow
+                        at = wall
                     if gu.size and not inner:
                         for j in range(b, e):
                             target[at + j] += max(into * w[m + j], 0.0) * given[x + j]
@@ -436,7 +540,9 @@ def vjp(g, u, inflow, w, free, slopes, dt, table, axes, flux, gu, ginflow, gw, f
 
 
 @kernel("read4 mask2 index2 write1 write1", **OPTIONS)
-def slope_vjp(partials, free, axes, gu, ginflow, start, stop):
+def slope_vjp(
+    partials: NDArray, free: NDArray, axes: NDArray, gu: NDArray, ginflow: NDArray, start: int, stop: int
+) -> None:
     """Add the cotangents of a and b, the differences to the cells below and above, to those of u and inflow."""
     line = np.empty(LINE)
     last = partials.shape[1] - 1

@@ -1,9 +1,16 @@
-"""The compiled loops as NumPy formulas of a few lines: their tests, and what runs without numba."""
+"""The compiled loops as NumPy formulas of a few lines: reference for their tests, and fallback without numba."""
 
-from typing import NamedTuple
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
 
 __all__ = [
     "Rows",
@@ -19,8 +26,8 @@ class Rows(NamedTuple):
 
     By rows (CSR): entries of row i are `data[indptr[i]:indptr[i + 1]]` at columns `indices[...]`.
     By diagonals: `out[i] += values[d, i] * u[i + offsets[d]]` for `start[d] <= i < stop[d]`.
-    One contiguous array per diagonal, because an (n, 3) array halves the speed. When the matrix
-    has too many diagonals to be worth it, `offsets` is empty and only the rows are there.
+    Each diagonal is contiguous, because an (n, 3) array halves the speed. For a matrix with too many diagonals
+    `offsets` is empty, and only the rows are stored.
     """
 
     rows: int
@@ -46,33 +53,38 @@ class Tridiagonal(NamedTuple):
     upper: np.ndarray  # float64, n
 
 
-def kronecker_sum(u, out, axes, shift):
-    """See `sparsedp.kernels.kronecker_sum`."""
+def kronecker_sum(u: NDArray, out: NDArray, axes: Sequence[Tridiagonal | None], shift: float) -> None:
+    """Set out = shift u + sum over a of T_a u; see `sparsedp.kernels.summed`."""
     out[...] = shift * u
     for axis, line in enumerate(axes):
-        if line is not None:
-            field, total = np.moveaxis(u, axis, 0), np.moveaxis(out, axis, 0)
-            lower, centre, upper = (band.reshape(-1, 1, 1) for band in line)
-            total += centre * field
-            total[1:] += lower[1:] * field[:-1]
-            total[:-1] += upper[:-1] * field[1:]
-            for end, band, other in ((0, lower, -1), (-1, upper, 0)):
-                if band[end] != 0:  # else the far end must not be read: 0 times NaN is NaN
-                    total[end] += band[end] * field[other]
+        if line is None:
+            continue
+        field = np.moveaxis(u, axis, 0)
+        total = np.moveaxis(out, axis, 0)
+        lower, centre, upper = (band.reshape(-1, 1, 1) for band in line)
+        total += centre * field
+        total[1:] += lower[1:] * field[:-1]
+        total[:-1] += upper[:-1] * field[1:]
+        for end, band, far_end in ((0, lower, -1), (-1, upper, 0)):
+            if band[end] != 0:  # else the far end must not be read: 0 times NaN is NaN
+                total[end] += band[end] * field[far_end]
 
 
-def product_along(u, out, rows, scale, add):
-    """See `sparsedp.kernels.along_axis`."""
+def product_along(u: NDArray, out: NDArray, rows: Rows, scale: float, accumulate: bool) -> None:
+    """Set out = scale M u or add it along the middle axis; see `sparsedp.kernels.along_axis`."""
     matrix = sp.csr_array((rows.data, rows.indices, rows.indptr), shape=(rows.rows, rows.cols))
-    across = len(u), u.shape[2]
-    flat = np.moveaxis(u, 1, 0).reshape(rows.cols, across[0] * across[1])
-    product = np.moveaxis((scale * (matrix @ flat)).reshape(rows.rows, *across), 0, 1)
-    np.copyto(out, out + product if add else product)
+    other_axes = (len(u), u.shape[2])
+    flat = np.moveaxis(u, 1, 0).reshape(rows.cols, other_axes[0] * other_axes[1])
+    product = np.moveaxis((scale * (matrix @ flat)).reshape(rows.rows, *other_axes), 0, 1)
+    np.copyto(out, out + product if accumulate else product)
 
 
-def eliminate(x, lower, upper, inverses):
-    """See `sparsedp.kernels.sweep`."""
+def eliminate(x: NDArray, lower: NDArray, upper: NDArray, inverses: NDArray) -> None:
+    """Solve tridiagonal systems in place; see `sparsedp.kernels.sweep`."""
     for i, pivots in enumerate(inverses):
-        x[i] = (x[i] - lower[i] * x[i - 1] if i else x[i]) * pivots
+        if i:
+            x[i] = (x[i] - lower[i] * x[i - 1]) * pivots
+        else:
+            x[i] = x[i] * pivots
     for i in range(len(x) - 2, -1, -1):
         x[i] -= upper[i] * x[i + 1] * inverses[i]

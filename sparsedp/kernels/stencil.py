@@ -1,72 +1,119 @@
 """Compiled loops of the matrix-free operators: three-point sums, a matrix along an axis, differences through faces.
 
-A field has three axes; rows run along the last one. Every loop takes views of rows first and then runs over them:
-that is what fills the vector units. What has the coefficient 0 is not read, for 0 times NaN is NaN.
+A field has three axes; rows run along the last one. Every loop first takes views of rows and then runs over them, so
+that the inner loops are vectorised. A value with the coefficient 0 is not read, because 0 times NaN is NaN.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sparsedp.kernels.team import kernel
 
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
 __all__ = ["across_rows", "along_rows", "kronecker_sum", "through_faces"]
 
-TILE = 1024  # numbers of a row that are worked on at a time: all of its diagonals find them in the L1 cache
+TILE = 1024  # values of a row at a time, which stay in the L1 cache for all diagonals
 
 
 @kernel("read3 write3 read2 read2 read2 flag real", fastmath={"contract"})  # a product and a sum are one instruction
-def kronecker_sum(u, out, far, middle, along, uniform, shift, start, stop):
-    """out = shift u + sum of T_a u, T_a tridiagonal and cyclic along axis a: rows lower, centre, upper.
+def kronecker_sum(
+    u: NDArray,
+    out: NDArray,
+    far: NDArray,
+    middle: NDArray,
+    along: NDArray,
+    uniform: bool,
+    shift: float,
+    start: int,
+    stop: int,
+) -> None:
+    """Set out = shift u + sum of T_a u, T_a tridiagonal and cyclic along axis a: rows lower, centre, upper.
 
-    `uniform`: the rows are the same for all cells but the first and the last of the last axis.
+    `uniform`: the rows are the same for all cells except the first and the last of the last axis.
     """
     n0, n1, n = u.shape
-    rows, last = n0 * n1, n - 1
-    cells, totals = u.reshape(rows, n), out.reshape(rows, n)
-    lower, centre, upper = along[0], along[1], along[2]
+    rows = n0 * n1
+    last = n - 1
+    cells = u.reshape(rows, n)
+    totals = out.reshape(rows, n)
+    lower = along[0]
+    centre = along[1]
+    upper = along[2]
     for row in range(start, stop):
-        i, k = row // n1, row % n1
-        a, b, c, d = middle[0, k], middle[2, k], far[0, i], far[2, i]
-        weight, here, result = shift + far[1, i] + middle[1, k], cells[row], totals[row]
-        # where there is no neighbour the cell itself is read, times 0
-        before1 = cells[row + (k - 1) % n1 - k if a != 0.0 else row]
-        after1 = cells[row + (k + 1) % n1 - k if b != 0.0 else row]
-        before0 = cells[(row - n1) % rows if c != 0.0 else row]
-        after0 = cells[(row + n1) % rows if d != 0.0 else row]
-        # Of even cells three numbers stand for three rows that would fill the cache; in 2-D there is nothing to read
-        # along axis 0. The compiler fills the vector units of loops without a choice: three of them.
+        i = row // n1
+        k = row % n1
+        a = middle[0, k]
+        b = middle[2, k]
+        c = far[0, i]
+        d = far[2, i]
+        weight = shift + far[1, i] + middle[1, k]
+        line = cells[row]
+        result = totals[row]
+        # Where there is no neighbour, the cell itself is read, times 0.
+        below1 = cells[row + (k - 1) % n1 - k if a != 0.0 else row]
+        above1 = cells[row + (k + 1) % n1 - k if b != 0.0 else row]
+        below0 = cells[(row - n1) % rows if c != 0.0 else row]
+        above0 = cells[(row + n1) % rows if d != 0.0 else row]
+        # For uniform cells three numbers replace three rows that would fill the cache; in 2-D there is nothing to read
+        # along axis 0. Three loops without a branch inside, because the compiler vectorises only those.
         one = min(1, last)
-        low, mid, high = lower[one], weight + centre[one], upper[one]
+        low = lower[one]
+        mid = weight + centre[one]
+        high = upper[one]
         for j in range(1, last if uniform and n0 == 1 else 1):
-            total = mid * here[j] + (low * here[j - 1] + high * here[j + 1])
-            result[j] = total + (a * before1[j] + b * after1[j])
+            total = mid * line[j] + (low * line[j - 1] + high * line[j + 1])
+            result[j] = total + (a * below1[j] + b * above1[j])
         for j in range(1, last if uniform and n0 > 1 else 1):
-            total = mid * here[j] + (low * here[j - 1] + high * here[j + 1])
-            total += c * before0[j] + d * after0[j]
-            result[j] = total + (a * before1[j] + b * after1[j])
+            total = mid * line[j] + (low * line[j - 1] + high * line[j + 1])
+            total += c * below0[j] + d * above0[j]
+            result[j] = total + (a * below1[j] + b * above1[j])
         for j in range(1, 1 if uniform else last):
-            total = (weight + centre[j]) * here[j] + (lower[j] * here[j - 1] + upper[j] * here[j + 1])
+            total = (weight + centre[j]) * line[j] + (lower[j] * line[j - 1] + upper[j] * line[j + 1])
             if n0 > 1:
-                total += c * before0[j] + d * after0[j]
-            result[j] = total + (a * before1[j] + b * after1[j])
+                total += c * below0[j] + d * above0[j]
+            result[j] = total + (a * below1[j] + b * above1[j])
         for j in (0, last):
-            total = (weight + centre[j]) * here[j] + (a * before1[j] + b * after1[j]) + (c * before0[j] + d * after0[j])
-            total += lower[j] * here[(j - 1) % n] if lower[j] != 0.0 else 0.0
-            result[j] = total + (upper[j] * here[(j + 1) % n] if upper[j] != 0.0 else 0.0)
+            total = (weight + centre[j]) * line[j] + (a * below1[j] + b * above1[j]) + (c * below0[j] + d * above0[j])
+            total += lower[j] * line[(j - 1) % n] if lower[j] != 0.0 else 0.0
+            result[j] = total + (upper[j] * line[(j + 1) % n] if upper[j] != 0.0 else 0.0)
 
 
 @kernel("read3 write3 index1 index1 read1 real flag")
-def across_rows(u, out, indptr, indices, data, scale, add, start, stop):
-    """out = scale M u, or added to it: M sparse along the middle axis, row for row of the field."""
+def across_rows(
+    u: NDArray,
+    out: NDArray,
+    indptr: NDArray,
+    indices: NDArray,
+    data: NDArray,
+    scale: float,
+    add: bool,
+    start: int,
+    stop: int,
+) -> None:
+    """Set out = scale M u or add it, for M sparse along the middle axis, row by row of the field."""
     lines = out.shape[1]
     for row in range(start, stop):
-        i, k = row // lines, row % lines
-        result, first, last = out[i, k], indptr[k], indptr[k + 1]
+        i = row // lines
+        k = row % lines
+        result = out[i, k]
+        first = indptr[k]
+        last = indptr[k + 1]
         if first == last and not add:
             result[:] = 0.0
-        for entry in range(first, last, 2):  # two at a time: most rows of an operator have two
+        for entry in range(first, last, 2):  # two at a time, because most rows of an operator have two
             more = min(entry + 1, last - 1)
-            one, values = scale * data[entry], u[i, indices[entry]]
-            two, others = scale * data[more] if more > entry else 0.0, u[i, indices[more]]
+            one = scale * data[entry]
+            values = u[i, indices[entry]]
+            if more > entry:
+                two = scale * data[more]
+            else:
+                two = 0.0
+            others = u[i, indices[more]]
             if entry > first or add:
                 for j in range(result.size):
                     result[j] += one * values[j] + two * others[j]
@@ -76,8 +123,19 @@ def across_rows(u, out, indptr, indices, data, scale, add, start, stop):
 
 
 @kernel("read2 write2 index1 index1 index1 read2 real flag")
-def along_rows(u, out, offsets, first, last, values, scale, add, start, stop):
-    """out = scale M u, or added to it: M along the rows, by its diagonals; `start` and `stop` count entries of out."""
+def along_rows(
+    u: NDArray,
+    out: NDArray,
+    offsets: NDArray,
+    first: NDArray,
+    last: NDArray,
+    values: NDArray,
+    scale: float,
+    add: bool,
+    start: int,
+    stop: int,
+) -> None:
+    """Set out = scale M u or add it, for M along the rows, by diagonals; `start` and `stop` count entries of out."""
     n = out.shape[1]
     for row in range(start // n, -(-stop // n)):
         for left in range(max(start - row * n, 0), min(stop - row * n, n), TILE):
@@ -85,39 +143,77 @@ def along_rows(u, out, offsets, first, last, values, scale, add, start, stop):
             if not add:
                 out[row, left:right] = 0.0
             for d in range(offsets.size):
-                a, b = max(left, first[d]), min(right, last[d])
+                a = max(left, first[d])
+                b = min(right, last[d])
                 if a < b:
-                    result, weights, given = out[row, a:b], values[d, a:b], u[row, a + offsets[d] : b + offsets[d]]
+                    result = out[row, a:b]
+                    weights = values[d, a:b]
+                    given = u[row, a + offsets[d] : b + offsets[d]]
                     for j in range(result.size):
                         result[j] += scale * weights[j] * given[j]
 
 
 @kernel("read3 read3 read3 read3 read2 read2 read2 write3 flag")
-def through_faces(u, k0, k1, k2, lines0, lines1, lines2, out, closed, start, stop):
-    """out = L diag(k) R u in one pass, R from cells to faces and L back; what a face carries is not kept in memory.
+def through_faces(
+    u: NDArray,
+    k0: NDArray,
+    k1: NDArray,
+    k2: NDArray,
+    lines0: NDArray,
+    lines1: NDArray,
+    lines2: NDArray,
+    out: NDArray,
+    closed: bool,
+    start: int,
+    stop: int,
+) -> None:
+    """Set out = L diag(k) R u in one pass, R from cells to faces and L back; fluxes through faces are not stored.
 
-    A face f between the cells f - 1 and f carries k_f (r_below_f u_(f-1) + r_above_f u_f), and the cells get l_below_f
-    and l_above_f times that: the four rows of `lines` of each axis, with one more entry than the axis has cells.
-    k has as many faces as that, or as many as cells where the axis is periodic: the last face is then the first.
-    `closed`: faces with k = 0 carry 0, whatever the cells hold.
+    The flux through face f, between the cells f - 1 and f, is k_f (r_below_f u_(f-1) + r_above_f u_f). The cells get it
+    times l_below_f and l_above_f. These are the four rows of `lines` of each axis, with one more entry than there are
+    cells along it. k has as many faces or, on a periodic axis, as many as cells: the last face is then the first.
+    `closed`: the flux through faces with k = 0 is 0, even where the cells hold NaN.
     """
     n0, n1, n = u.shape
-    cells, totals, carried = u.reshape(n0 * n1, n), out.reshape(n0 * n1, n), np.empty(n + 1)
+    cells = u.reshape(n0 * n1, n)
+    totals = out.reshape(n0 * n1, n)
+    carried = np.empty(n + 1)
     for row in range(start, stop):
-        i, k = row // n1, row % n1
-        here, result, inside, faces = cells[row], totals[row], carried[1:n], k2[i, k]
-        below, above, conduct, ahead = lines2[0, 1:n], lines2[1, 1:n], faces[1:n], here[1:]
+        i = row // n1
+        k = row % n1
+        line = cells[row]
+        result = totals[row]
+        inside = carried[1:n]
+        faces = k2[i, k]
+        below = lines2[0, 1:n]
+        above = lines2[1, 1:n]
+        conduct = faces[1:n]
+        ahead = line[1:]
         for f in range(n - 1):
-            inside[f] = conduct[f] * (below[f] * here[f] + above[f] * ahead[f])
+            inside[f] = conduct[f] * (below[f] * line[f] + above[f] * ahead[f])
         for f in (0, n):  # the walls, or the face at both ends
-            low = lines2[0, f] * here[(f - 1) % n] if lines2[0, f] != 0.0 else 0.0
-            high = lines2[1, f] * here[f % n] if lines2[1, f] != 0.0 else 0.0
+            if lines2[0, f] != 0.0:
+                low = lines2[0, f] * line[(f - 1) % n]
+            else:
+                low = 0.0
+            if lines2[1, f] != 0.0:
+                high = lines2[1, f] * line[f % n]
+            else:
+                high = 0.0
             carried[f] = faces[f % faces.size] * (low + high)
         if closed:
             for f in range(faces.size):
-                carried[f] = carried[f] if faces[f] != 0.0 else 0.0
-            carried[n] = carried[n] if faces[n % faces.size] != 0.0 else 0.0
-        to_below, to_above, next_ones = lines2[2, 1:], lines2[3, :n], carried[1:]
+                if faces[f] != 0.0:
+                    carried[f] = carried[f]
+                else:
+                    carried[f] = 0.0
+            if faces[n % faces.size] != 0.0:
+                carried[n] = carried[n]
+            else:
+                carried[n] = 0.0
+        to_below = lines2[2, 1:]
+        to_above = lines2[3, :n]
+        next_ones = carried[1:]
         for j in range(n):
             result[j] = to_above[j] * carried[j] + to_below[j] * next_ones[j]
         for side in range(4):  # across rows: the face below and above in axis 1, then in axis 0
@@ -126,11 +222,16 @@ def through_faces(u, k0, k1, k2, lines0, lines1, lines2, out, closed, start, sto
                 continue
             place = row // stride % count
             f = place + upper
-            weight, below_f, above_f = line[3 - upper, f], line[0, f], line[1, f]
-            # beyond a wall there is no cell: the cell itself is read, times 0
+            weight = line[3 - upper, f]
+            below_f = line[0, f]
+            above_f = line[1, f]
+            # Beyond a wall there is no cell: the cell itself is read, times 0.
             low = cells[row + ((f - 1) % count - place) * stride if below_f != 0.0 else row]
             high = cells[row + (f % count - place) * stride if above_f != 0.0 else row]
-            faces = k1[i, f % k1.shape[1]] if side < 2 else k0[f % k0.shape[0], k]
+            if side < 2:
+                faces = k1[i, f % k1.shape[1]]
+            else:
+                faces = k0[f % k0.shape[0], k]
             for j in range(n):
                 flux = weight * (faces[j] * (below_f * low[j] + above_f * high[j]))
                 result[j] += 0.0 if closed and faces[j] == 0.0 else flux

@@ -1,19 +1,29 @@
-"""Compiled substitution: systems that are triangular when their rows are taken in a given order."""
+"""Compiled substitution: systems that are triangular in a given order of their rows."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 from sparsedp.kernels.team import kernel
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 __all__ = ["backward", "backward_complex", "forward", "forward_complex"]
 
 
 @kernel("place1 place1 +read1 place1 +read1 +write1")
-def forward(indptr, indices, data, order, b, x, start, stop):
+def forward(
+    indptr: NDArray, indices: NDArray, data: NDArray, order: NDArray, b: NDArray, x: NDArray, start: int, stop: int
+) -> None:
     """Solve A x = b for the rows in order[start:stop], one after the other.
 
-    x[i] = (b[i] - sum over j != i of A[i, j] x[j]) / A[i, i]; the x[j] that a row reads are known before.
+    x[i] = (b[i] - sum over j != i of A[i, j] x[j]) / A[i, i]; the x[j] that a row reads are computed before.
     """
     for number in range(start, stop):
         i = order[number]
-        total, pivot = b[i], data[indptr[i]]
+        total = b[i]
+        pivot = data[indptr[i]]
         for k in range(indptr[i], indptr[i + 1]):
             j = indices[k]
             if j == i:
@@ -24,10 +34,12 @@ def forward(indptr, indices, data, order, b, x, start, stop):
 
 
 @kernel("place1 place1 +read1 place1 +write1 +write1")
-def backward(indptr, indices, data, order, r, x, start, stop):
+def backward(
+    indptr: NDArray, indices: NDArray, data: NDArray, order: NDArray, r: NDArray, x: NDArray, start: int, stop: int
+) -> None:
     """Solve A^T x = r for the rows of A in order[start:stop], from the last one to the first.
 
-    x[i] = r[i] / A[i, i], then r[j] -= A[i, j] x[i] for all j != i. So r becomes r - A^T x for all other unknowns.
+    x[i] = r[i] / A[i, i], then r[j] -= A[i, j] x[i] for all j != i. Afterwards r is r - A^T x for all other unknowns.
     """
     for number in range(stop - 1, start - 1, -1):
         i = order[number]
@@ -43,4 +55,5 @@ def backward(indptr, indices, data, order, r, x, start, stop):
                 r[j] -= data[k] * value
 
 
-forward_complex, backward_complex = forward.complex, backward.complex
+forward_complex = forward.complex
+backward_complex = backward.complex

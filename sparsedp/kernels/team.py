@@ -1,8 +1,10 @@
-"""How a compiled loop is made and run: one signature each, kept on disk, slabs of rows for a pool of threads.
+"""Compilation and execution of compiled loops: one signature each, cached on disk, run by a pool of threads.
 
-Threads are Python's own: a loop gives the lock back while it runs, and compiles in a fraction of the time that
-numba takes for its own parallel loops. Which slab a row is in changes nothing in its bits.
+Threads are Python's own: a loop releases the GIL while it runs, and compiles in a fraction of the time that numba needs
+for its own parallel loops. The distribution of rows over threads does not change the bits of a result.
 """
+
+from __future__ import annotations
 
 import contextlib
 import functools
@@ -11,23 +13,27 @@ import sys
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from types import FunctionType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
 
 __all__ = ["INNER", "SERIAL", "Kernel", "kernel", "loops"]
 
-SERIAL = 524_288  # numbers: below, a few tenths of a millisecond, a second thread costs more than it brings
+SERIAL = 524_288  # values: below, a few tenths of a millisecond, a second thread costs more than it saves
 
-# Of functions that only compiled ones call: Python could not call them, which saves compiling how it would.
+# Options of functions that only compiled ones call: without the wrappers for calls from Python they compile faster.
 INNER = {"error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
-loops: list["Kernel"] = []  # all that the imported modules define
+loops: list[Kernel] = []  # all loops that the imported modules define
 
 NOTICE = "sparsedp: compiling loops for this machine, once; `python -m sparsedp compile` does all of them\n"
 _noticed: list[bool] = []
 
 
 @contextlib.contextmanager
-def _announced():
-    """Meanwhile, the first function that is not found on disk and has to be compiled is announced on stderr."""
+def _announced() -> Iterator[None]:
+    """Within this context, announce on stderr the first function that is not cached on disk and must be compiled."""
     from numba.core import event
 
     class Notice(event.Listener):
@@ -44,13 +50,13 @@ def _announced():
 
 
 @functools.cache
-def _pool(size, process):
-    """The threads beside the one that asks; they wait between loops. A forked process has none of its parent's."""
+def _pool(size: int, process: int) -> ThreadPoolExecutor:
+    """Return the threads beside the calling one, which wait between loops; a forked process gets new threads."""
     return ThreadPoolExecutor(size, "sparsedp")
 
 
-def _types(words):
-    """Words such as "read3 write1 real int flag" -> types of numba; see `Kernel`."""
+def _types(words: str) -> Iterator[Any]:
+    """Yield the numba types for words such as "read3 write1 real int flag"; see `Kernel`."""
     from numba import types
 
     numbers = {"int": types.int64, "real": types.float64, "flag": types.boolean}
@@ -63,26 +69,42 @@ def _types(words):
     }
     marked = {"^": types.float32, "*": types.complex128}
     for word in words.split():
-        kind, axes = word.strip("~^+*")[:-1], word[-1]
-        entry = marked.get(word[0]) or entries.get(kind)
-        yield numbers.get(word) or types.Array(entry, int(axes), "C", readonly=kind != "write")
+        if word in numbers:
+            yield numbers[word]
+            continue
+        kind = word.strip("~^+*")[:-1]
+        dimensions = int(word[-1])
+        entry = marked.get(word[0]) or entries[kind]
+        yield types.Array(entry, dimensions, "C", readonly=kind != "write")
 
 
 @functools.cache
-def _with_compiled(functions):
-    """Functions of a module -> its names, with these functions compiled: they stand where they are called."""
+def _with_compiled(functions: tuple[Callable, ...]) -> dict[str, Any]:
+    """Return the globals of a module in which some of its functions are compiled, to be inlined where called."""
     from numba import njit
 
     names = dict(functions[0].__globals__)
     for function in functions:
-        own = FunctionType(function.__code__, names, function.__name__)
-        names[function.__name__] = njit(forceinline=True, fastmath={"contract"}, **INNER)(own)
+        copy = FunctionType(function.__code__, names, function.__name__)
+        names[function.__name__] = njit(forceinline=True, fastmath={"contract"}, **INNER)(copy)
     return names
 
 
-def kernel(words, **options):
-    """Decorator: the types of a loop's arguments but the last two -> Kernel."""
-    return lambda loop: Kernel(loop, words, **options)
+def kernel(words: str, **options: Any) -> Callable[[Callable], Kernel]:
+    """Return a decorator that turns a loop into a `Kernel`.
+
+    Parameters
+    ----------
+    words : str
+        Types of the arguments of the loop except the last two; see `Kernel`.
+    **options
+        As for `Kernel`.
+    """
+
+    def decorate(loop: Callable) -> Kernel:
+        return Kernel(loop, words, **options)
+
+    return decorate
 
 
 class Kernel:
@@ -91,74 +113,108 @@ class Kernel:
     Parameters
     ----------
     loop : function
-        Its last two arguments are the rows it works on, `start` and `stop`.
+        Its last two arguments are the range of rows to work on, `start` and `stop`.
     words : str
-        The types of its other arguments: read1 to read4 (may be read-only), write1 to write4 (float64), index1 to
-        index4 (int64), place1 to place4 (int32, may be read-only), mask1 to mask4 (bool), real, int, flag. With ~
-        before it an array is of float32 in `single`, where ^ stands for it; with + of complex128 in `complex`, where
-        * stands for it.
+        The types of its other arguments: read1 to read4 (float64, may be read-only), write1 to write4 (float64), index1
+        to index4 (int64), place1 to place4 (int32, may be read-only), mask1 to mask4 (bool), real, int, flag. An array
+        marked with ~ is of float32 in `single`, where ^ replaces the mark. An array marked with + is of complex128 in
+        `complex`, where * replaces the mark.
     uses : tuple of functions
-        That the loop calls, and these functions themselves. They are compiled once for all loops that use them, and
-        stand in the same file: that is where numba looks whether what it has kept is still good.
+        The functions that the loop calls, including those that they call. They are compiled once for all loops that
+        use them, and must be in the same file as the loop: numba invalidates its cache by the time stamp of that file.
     given : dict, optional
-        {name: function} that this loop alone calls by that name.
+        {name: function} for functions that only this loop calls by that name.
     name : str, optional
-        Tells loops of the same code that are given other functions apart.
+        Distinguishes loops with the same code and other `given` functions.
     **options
         Of numba's ``njit``.
 
     Attributes
     ----------
     single : Kernel
-        The same loop for arrays of float32, where its words have a ~.
+        The same loop for arrays of float32 where its words have a ~.
     complex : Kernel
-        The same loop for arrays of complex128, where its words have a +.
+        The same loop for arrays of complex128 where its words have a +.
     """
 
-    def __init__(self, loop, words, uses=(), given=None, name=None, **options):
-        self.loop, self.words, self.uses, self.given, self.options = loop, words, uses, given or {}, options
-        self.name, self.__doc__ = name or loop.__name__, loop.__doc__
-        self.single = Kernel(loop, words.replace("~", "^"), uses, given, name, **options) if "~" in words else self
-        self.complex = Kernel(loop, words.replace("+", "*"), uses, given, name, **options) if "+" in words else self
+    single: Kernel
+    complex: Kernel
+
+    def __init__(
+        self,
+        loop: Callable,
+        words: str,
+        uses: tuple[Callable, ...] = (),
+        given: dict[str, Callable] | None = None,
+        name: str | None = None,
+        **options: Any,
+    ) -> None:
+        self.loop = loop
+        self.words = words
+        self.uses = uses
+        self.given = given or {}
+        self.options = options
+        self.name = name or loop.__name__
+        self.__doc__ = loop.__doc__
+        self.single = self
+        self.complex = self
+        if "~" in words:
+            self.single = Kernel(loop, words.replace("~", "^"), uses, given, name, **options)
+        if "+" in words:
+            self.complex = Kernel(loop, words.replace("+", "*"), uses, given, name, **options)
         loops.append(self)
 
     @functools.cached_property
-    def compiled(self):
-        """The compiled loop; None where it cannot be compiled, which is said once."""
+    def compiled(self) -> Any:
+        """The compiled loop; None, after one warning, if it cannot be compiled."""
         try:
-            from numba import njit
-
-            options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, **self.options}
-            keep = options.pop("cache", True)
-            signature = tuple(_types(self.words + " int int"))
-            names = dict(_with_compiled(self.uses) if self.uses else self.loop.__globals__)
-            for name, function in self.given.items():
-                names[name] = njit(forceinline=True, **options)(function)
-            loop = FunctionType(self.loop.__code__, names, self.name)
-            loop.__qualname__ = self.name  # the kept code goes by it
-            with _announced():
-                try:
-                    return njit([signature], cache=keep, **options)(loop)
-                except (OSError, RuntimeError):  # there is no place to keep it
-                    return njit([signature], **options)(loop)
-        except Exception as error:  # whatever LLVM or numba object to on this machine
+            return self._compile()
+        except Exception as error:  # any problem of LLVM or numba on this machine
             message = f"The compiled kernels do not work here ({error}); NumPy is used instead."
             warnings.warn(message, RuntimeWarning, stacklevel=4)
             return None
 
-    def run(self, rows, work, threads, *args):
-        """loop(*args, start, stop) on slabs that cover range(rows); one thread for less than SERIAL numbers of work.
+    def _compile(self) -> Any:
+        from numba import njit
 
-        Raises what a slab raises, when all have ended: nobody writes into the arrays after that.
+        options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, **self.options}
+        use_cache = options.pop("cache", True)
+        signature = tuple(_types(self.words + " int int"))
+        names = dict(_with_compiled(self.uses) if self.uses else self.loop.__globals__)
+        for name, function in self.given.items():
+            names[name] = njit(forceinline=True, **options)(function)
+        loop = FunctionType(self.loop.__code__, names, self.name)
+        loop.__qualname__ = self.name  # the cache is keyed by it
+        with _announced():
+            try:
+                return njit([signature], cache=use_cache, **options)(loop)
+            except (OSError, RuntimeError):  # there is no place for the cache
+                return njit([signature], **options)(loop)
+
+    def run(self, rows: int, work: int, threads: int, *args: Any) -> None:
+        """Call the loop on slabs that cover range(rows), on one thread for less than SERIAL values of work.
+
+        An exception of a slab is raised when all slabs have ended: no thread writes into the arrays after that.
+
+        Parameters
+        ----------
+        rows : int
+        work : int
+            Number of values to process.
+        threads : int
+            Largest number of threads.
+        *args
+            Arguments of the loop except the last two.
         """
         parts = min(threads, rows) if work >= SERIAL else 1
         if parts <= 1:
             self.compiled(*args, 0, rows)
             return
         cuts = [rows * part // parts for part in range(parts + 1)]
-        others = [_pool(parts - 1, os.getpid()).submit(self.compiled, *args, *ends) for ends in zip(cuts[1:], cuts[2:])]
+        pool = _pool(parts - 1, os.getpid())
+        futures = [pool.submit(self.compiled, *args, *ends) for ends in zip(cuts[1:], cuts[2:])]
         try:
             self.compiled(*args, *cuts[:2])
         finally:
-            for other in others:
-                other.result()
+            for future in futures:
+                future.result()

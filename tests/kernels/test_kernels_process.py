@@ -16,7 +16,7 @@ NUMBA = pytest.mark.skipif(not kernels.compiled(), reason="numba is not installe
 
 
 def test_too_many_threads_are_refused(monkeypatch):
-    monkeypatch.setattr(kernels, "_available", lambda: 2)
+    monkeypatch.setattr(kernels, "_available_threads", lambda: 2)
     with pytest.raises(
         ValueError,
         match="set_threads got 3; it needs 1 to 2, the processors this process may use; write None for the default",
