@@ -171,11 +171,11 @@ BUGS = {
     ),
     "a boundary row that is not transposed": Bug(
         "operators/structure",
-        "        turned = Factor(self.matrix.T)",
+        "        transposed = Factor(self.matrix.T)",
         "        rows = self.matrix.T.tolil()\n"
         "        if rows.shape[0] == rows.shape[1] and rows.shape[0]:\n"
         "            rows[[0]] = self.matrix.tolil()[[0]]\n"
-        "        turned = Factor(rows.tocsr())",
+        "        transposed = Factor(rows.tocsr())",
         "tests/operators/test_operators.py",
     ),
     "waves damped to the wrong side": Bug(

@@ -17,8 +17,8 @@ SHAPES = [(2, 2), (7, 5), (16, 17), (2, 3, 2), (5, 4, 6), (8, 2, 5)]
 
 @pytest.fixture(autouse=True)
 def at_every_size(monkeypatch):
-    monkeypatch.setattr(lazy, "FEW", 0)
-    monkeypatch.setattr(lazy, "SHORT", 0)
+    monkeypatch.setattr(lazy, "FUSED_FROM", 0)
+    monkeypatch.setattr(lazy, "ROW_FROM", 0)
 
 
 def chain(grid, k, boundary=dp.dirichlet):

@@ -1,13 +1,20 @@
-"""Structure: what acts linearly on flat arrays. Its plainest kind is a matrix."""
+"""Structure: a linear map of flat arrays. The simplest kind is a matrix."""
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from operator import is_
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from sparsedp._utils.counters import count
 from sparsedp._utils.reconstruction import Uncached
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 __all__ = [
     "INT32_LIMIT",
@@ -22,7 +29,7 @@ __all__ = [
 ]
 
 INT32_LIMIT = 2**31
-PROBES = 3  # random vectors with which a map without entries is examined
+PROBES = 3  # random vectors by which the magnitude of a map without entries is estimated
 
 
 class Structure(Uncached):
@@ -32,23 +39,23 @@ class Structure(Uncached):
     ----------
     shape : (rows, columns)
     dtype : numpy dtype
-        float64 or complex128: the field the entries live in.
+        float64 or complex128: the type of the entries.
     members : tuple of Structures
-        What it is made of, where it is made of others.
+        The structures that it combines, if it is a product or a sum.
     has_entries : bool
         Whether `explicit()` can list the entries without applying the map to every unit vector.
     takes_complex : bool
-        Whether `act` takes complex arrays; else real and imaginary parts go through it apart.
+        Whether `act` takes complex arrays; otherwise it is called for the real and the imaginary part.
     separable : bool
         Whether it is a Kronecker sum: one 1-D factor for each axis.
     depth : int
-        How deep products and sums are nested in it.
+        Nesting depth of products and sums.
     passes : int
-        How many passes over memory the map takes where it is not fused: for the choice of a form.
+        Number of passes over memory without fusion; the form of an operator depends on it.
     """
 
     shape: tuple[int, int]
-    dtype = np.dtype(float)
+    dtype: np.dtype = np.dtype(float)
     members: tuple = ()
     has_entries = True
     takes_complex = True
@@ -57,58 +64,68 @@ class Structure(Uncached):
     depth = 0
     passes = 1  # over memory, of the matrix-free form
 
-    def apply(self, x, out):
-        """Write A x into `out`. Both flat and contiguous, out of dtype result_dtype(self, x.dtype).
+    def apply(self, x: NDArray, out: NDArray) -> None:
+        """Write A x into `out`.
 
-        All is computed in double precision, and rounded once.
+        Both are flat and contiguous, `out` has the dtype ``result_dtype(self, x.dtype)``. The product is computed in
+        double precision and rounded once.
         """
         if x.dtype.char in "fF":
             np.copyto(out, self.product(x.astype(np.result_type(x.dtype, float))), casting="same_kind")
         elif x.dtype.kind == "c" and not self.takes_complex:
-            out.real, out.imag = (self.product(part.copy()) for part in (x.real, x.imag))
+            out.real = self.product(x.real.copy())
+            out.imag = self.product(x.imag.copy())
         else:
             self.act(x, out)
 
-    def act(self, x, out):
-        """As `apply`, for float64 and, where it takes them, complex128."""
+    def act(self, x: NDArray, out: NDArray) -> None:
+        """Write A x into `out`, for float64 and, if `takes_complex`, complex128 arrays."""
         raise TypeError(f"{type(self).__name__} does not say how it acts")
 
-    def transpose(self):
-        """The plain transpose, as a Structure."""
+    def transpose(self) -> Structure:
+        """Return the plain transpose."""
         raise TypeError(f"{type(self).__name__} has no transpose")
 
-    def explicit(self):
-        """The entries as a csr_array with 32-bit indices."""
+    def explicit(self) -> sp.csr_array:
+        """Return the entries as a csr_array with 32-bit indices."""
         return columns_by_application(self)
 
-    def scaled(self, factor):
-        """factor * A; None where it cannot take the number in."""
+    def scaled(self, factor: complex) -> Structure | None:
+        """Return factor * A; None if the structure cannot absorb the number."""
         return None
 
-    def magnitude(self):
-        """The function x -> an upper bound of |A| x, entry by entry, for x >= 0."""
+    def magnitude(self) -> Callable[[NDArray], NDArray]:
+        """Return a function of x >= 0 that bounds each entry of abs(A) x from above."""
         if self.has_entries:
             return abs(self.explicit()).dot
-        # A map that only acts: the largest response to random signs stands for every row.
+        # Without entries, the largest response to random signs is the estimate for every row.
         largest = max(float(np.max(np.abs(self.product(x)), initial=0.0)) for x in probes(self.shape[1]))
-        return lambda x: np.full(self.shape[0], largest * np.max(np.abs(x), initial=0.0))
 
-    def tangent(self):
-        """The same map inside derivative rules: without checks that only primal data must meet."""
+        def bound(x: NDArray) -> NDArray:
+            return np.full(self.shape[0], largest * np.max(np.abs(x), initial=0.0))
+
+        return bound
+
+    def tangent(self) -> Structure:
+        """Return the same map for derivative rules, without checks that only primal data must pass."""
         tangents = [member.tangent() for member in self.members]
-        return self if all(map(is_, tangents, self.members)) else self.rebuilt(tangents)
+        if all(map(is_, tangents, self.members)):
+            return self
+        return self.rebuilt(tangents)
 
-    def __deepcopy__(self, memo):
-        """The same object, because it is frozen, unless a member holds what changes, as a solver."""
+    def __deepcopy__(self, memo: Any) -> Structure:
+        """Return the same frozen object, unless a member has state, as a solver has."""
         members = [deepcopy(member, memo) for member in self.members]
-        return self if all(map(is_, members, self.members)) else self.rebuilt(members)
+        if all(map(is_, members, self.members)):
+            return self
+        return self.rebuilt(members)
 
-    def rebuilt(self, members):
-        """The same of other members."""
+    def rebuilt(self, members: Sequence) -> Structure:
+        """Return the same combination of other members."""
         return type(self)(members)  # type: ignore[call-arg]
 
-    def product(self, x):
-        """A x as a fresh array."""
+    def product(self, x: NDArray) -> NDArray:
+        """Return A x as a new array."""
         out = np.empty(self.shape[0], result_dtype(self, x.dtype))
         self.apply(x, out)
         return out
@@ -120,81 +137,101 @@ class Matrix(Structure):
     Parameters
     ----------
     matrix : sparse matrix or array
-        Copied when it is not already compact.
+        Copied unless it is compact already.
     """
 
-    def __init__(self, matrix):
+    def __init__(self, matrix: Any) -> None:
         matrix = compact(matrix)
         self.matrix = matrix.astype(np.result_type(matrix.dtype, float), copy=False)
         for part in (self.matrix.data, self.matrix.indices, self.matrix.indptr):
-            part.flags.writeable = False  # an Operator is constant: nobody may write into it
-        self.shape, self.dtype = self.matrix.shape, self.matrix.dtype
+            part.flags.writeable = False  # an Operator is constant
+        self.shape = self.matrix.shape
+        self.dtype = self.matrix.dtype
 
-    def act(self, x, out):
+    def act(self, x: NDArray, out: NDArray) -> None:
+        """Write A x into `out`: see `Structure.act`."""
         out[...] = self.matrix @ x
 
-    def transpose(self):
+    def transpose(self) -> Structure:
+        """Return the plain transpose."""
         return Matrix(self.matrix.T.tocsr())
 
-    def explicit(self):
+    def explicit(self) -> sp.csr_array:
+        """Return the entries as a csr_array with 32-bit indices."""
         return self.matrix
 
-    def scaled(self, factor):
+    def scaled(self, factor: complex) -> Structure | None:
+        """Return factor * A."""
         return Matrix(self.matrix * factor)
 
 
 class Turning(Structure):
-    """A map that one thing, `inner`, does both ways: a subclass acts as `transposed` says."""
+    """A map and its transpose, both computed by one object `inner`; `transposed` says which of them this is.
 
-    has_entries = takes_complex = False
+    Parameters
+    ----------
+    inner : object
+    shape : (rows, columns)
+    transposed : bool
+    """
 
-    def __init__(self, inner, shape, transposed=False):
-        self.inner, self.shape, self.transposed = inner, shape, transposed
+    has_entries = False
+    takes_complex = False
 
-    def transpose(self):
-        return type(self)(self.inner, self.shape[::-1], not self.transposed)
+    def __init__(self, inner: Any, shape: tuple[int, int], transposed: bool = False) -> None:
+        self.inner = inner
+        self.shape = shape
+        self.transposed = transposed
 
-    def __deepcopy__(self, memo):
+    def transpose(self) -> Structure:
+        """Return the plain transpose."""
+        rows, columns = self.shape
+        return type(self)(self.inner, (columns, rows), not self.transposed)
+
+    def __deepcopy__(self, memo: Any) -> Structure:
         return type(self)(deepcopy(self.inner, memo), self.shape, self.transposed)
 
 
-def result_dtype(structure, dtype):
-    """Dtype of A x for x of `dtype`: the dtype of x, complex when A is."""
+def result_dtype(structure: Any, dtype: np.dtype) -> np.dtype:
+    """Return the dtype of A x: the dtype of x, or its complex counterpart if A is complex."""
     if structure.dtype.kind == "c" and dtype.kind != "c":
         return np.dtype(np.complex64 if dtype.itemsize <= 4 else np.complex128)
     return dtype
 
 
-def compact(matrix):
-    """Any sparse matrix -> canonical csr_array with 32-bit indices; refuses what needs more."""
+def compact(matrix: Any) -> sp.csr_array:
+    """Return a sparse matrix as a canonical csr_array with 32-bit indices; raise ValueError if it is too large."""
     if matrix.nnz >= INT32_LIMIT or max(matrix.shape) >= INT32_LIMIT:
         raise ValueError(f"an explicit matrix of {matrix.nnz} entries needs 64-bit indices; use the matrix-free form")
     matrix = sp.csr_array(matrix)
     matrix.sum_duplicates()
     matrix.sort_indices()
-    matrix.indices, matrix.indptr = (part.astype(np.int32, copy=False) for part in (matrix.indices, matrix.indptr))
+    matrix.indices = matrix.indices.astype(np.int32, copy=False)
+    matrix.indptr = matrix.indptr.astype(np.int32, copy=False)
     return matrix
 
 
-def assembled(structure, name):
-    """Structure -> its entries as a Matrix, counted under the name of the operator."""
+def assembled(structure: Structure, name: str) -> Matrix:
+    """Return a structure as a Matrix, and count the assembly under the name of the operator."""
     count(name, "assembled")
     return Matrix(structure.explicit())
 
 
-def probes(size):
-    """The same few vectors of random signs in every run."""
+def probes(size: int) -> list[NDArray]:
+    """Return a few vectors of random signs, the same in every run."""
     generator = np.random.default_rng(0)
     return [generator.choice([-1.0, 1.0], size) for _ in range(PROBES)]
 
 
-def rows_of(matrix):
-    """csr_array -> the row of each entry."""
+def rows_of(matrix: sp.csr_array) -> NDArray:
+    """Return the row of each entry of a csr_array."""
     return np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
 
 
-def columns_by_application(structure):
-    """Entries of a map that only knows how to act: one application for each column."""
+def columns_by_application(structure: Structure) -> sp.csr_array:
+    """Return the entries of a map by one application for each column."""
     size = structure.shape[1]
     columns = [sp.csc_array(structure.product(np.eye(1, size, column)[0])[:, None]) for column in range(size)]
-    return compact(sp.hstack(columns) if columns else sp.csr_array(structure.shape))
+    if not columns:
+        return compact(sp.csr_array(structure.shape))
+    return compact(sp.hstack(columns))

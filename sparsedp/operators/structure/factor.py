@@ -1,6 +1,9 @@
-"""Factor: a small sparse matrix along one axis. The only thing a catalogue operator defines."""
+"""Factor: a small sparse matrix along one axis. Catalogue operators are defined by their factors."""
+
+from __future__ import annotations
 
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -13,12 +16,12 @@ from sparsedp.operators.structure.base import rows_of
 
 __all__ = ["Factor"]
 
-MOST_DIAGONALS = 8  # more than this and the row form is at least as fast
+MOST_DIAGONALS = 8  # with more diagonals the row form is at least as fast
 TINY = 2.0**-1000  # products below this would lose digits to underflow
 
 
 class Factor(Uncached):
-    """A 1-D matrix. Frozen; products and sums give new ones.
+    """A matrix along one axis. Frozen; products and sums are new ones.
 
     Parameters
     ----------
@@ -26,7 +29,7 @@ class Factor(Uncached):
         Real and finite.
     """
 
-    def __init__(self, matrix):
+    def __init__(self, matrix: Any) -> None:
         matrix = sp.csr_array(matrix, dtype=float)
         matrix.sum_duplicates()
         matrix.eliminate_zeros()
@@ -35,68 +38,88 @@ class Factor(Uncached):
         self.matrix = matrix
 
     @classmethod
-    def from_diagonals(cls, shape, *diagonals):
-        """Triples (rows, columns, values) of index arrays -> Factor."""
-        rows, columns, values = (np.concatenate(part) for part in zip(*diagonals, strict=True))
+    def from_diagonals(cls, shape: tuple[int, int], *diagonals: tuple) -> Factor:
+        """Return a Factor of triples of arrays (rows, columns, values)."""
+        rows = np.concatenate([diagonal[0] for diagonal in diagonals])
+        columns = np.concatenate([diagonal[1] for diagonal in diagonals])
+        values = np.concatenate([diagonal[2] for diagonal in diagonals])
         return cls(sp.coo_array((values, (rows, columns)), shape=shape))
 
     @property
-    def shape(self):
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns)."""
         return self.matrix.shape
 
     @cached_property
-    def T(self):
-        turned = Factor(self.matrix.T)
-        turned.__dict__["T"] = self
-        return turned
+    def T(self) -> Factor:
+        """The transpose."""
+        transposed = Factor(self.matrix.T)
+        transposed.__dict__["T"] = self
+        return transposed
 
-    def __matmul__(self, other):
+    def __matmul__(self, other: Factor) -> Factor:
         product = Factor(self.matrix @ other.matrix)
-        mine, theirs = self.largest, other.largest
-        if mine > 0 and theirs > 0 and mine * theirs < TINY:
+        if self.largest > 0 and other.largest > 0 and self.largest * other.largest < TINY:
             raise NonFiniteError("coefficients underflow: the spacing is too large; rescale the lengths of the grid")
         return product
 
-    def __add__(self, other):
+    def __add__(self, other: Factor) -> Factor:
         return Factor(self.matrix + other.matrix)
 
-    def scaled(self, factor):
-        """factor * matrix."""
-        return self if factor == 1 else Factor(self.matrix * factor)
+    def scaled(self, factor: float) -> Factor:
+        """Return factor * matrix."""
+        if factor == 1:
+            return self
+        return Factor(self.matrix * factor)
 
     @cached_property
-    def largest(self):
+    def largest(self) -> float:
         """Largest magnitude of an entry."""
         return float(np.max(np.abs(self.matrix.data), initial=0.0))
 
     @cached_property
-    def key(self):
-        """Content: equal factors have equal keys."""
-        m = self.matrix
-        return m.shape, m.indptr.tobytes(), m.indices.tobytes(), m.data.tobytes()
+    def key(self) -> tuple:
+        """The content as a hashable value: equal factors have equal keys."""
+        matrix = self.matrix
+        return matrix.shape, matrix.indptr.tobytes(), matrix.indices.tobytes(), matrix.data.tobytes()
 
     @cached_property
-    def rows(self):
-        """The record that the kernels read (see kernels/reference.py)."""
-        m, row = self.matrix, rows_of(self.matrix)
-        offsets, first, diagonal = np.unique(m.indices - row, return_index=True, return_inverse=True)
-        start, stop = row[first], np.zeros(offsets.size, np.int64)
+    def rows(self) -> Rows:
+        """The record that the kernels read: see kernels/reference.py."""
+        matrix = self.matrix
+        row = rows_of(matrix)
+        offsets, first, diagonal = np.unique(matrix.indices - row, return_index=True, return_inverse=True)
+        start = row[first]
+        stop = np.zeros(offsets.size, np.int64)
         np.maximum.at(stop, diagonal, row + 1)
-        few = offsets.size if offsets.size <= MOST_DIAGONALS else 0
-        values = np.zeros((few, m.shape[0]))
-        if few:
-            values[diagonal, row] = m.data
-        lists = m.indptr.astype(np.int64), m.indices.astype(np.int64), m.data
-        return Rows(m.shape[0], m.shape[1], *lists, offsets[:few], start[:few], stop[:few], values)
+        count = offsets.size
+        if count > MOST_DIAGONALS:
+            count = 0
+        values = np.zeros((count, matrix.shape[0]))
+        if count:
+            values[diagonal, row] = matrix.data
+        return Rows(
+            matrix.shape[0],
+            matrix.shape[1],
+            matrix.indptr.astype(np.int64),
+            matrix.indices.astype(np.int64),
+            matrix.data,
+            offsets[:count],
+            start[:count],
+            stop[:count],
+            values,
+        )
 
     @cached_property
-    def tridiagonal(self):
-        """The three-point record of the fused kernel, or None when a row reaches further."""
-        (n, columns), m, row = self.shape, self.matrix, rows_of(self.matrix)
-        offset = (m.indices - row) % max(n, 1)
+    def tridiagonal(self) -> Tridiagonal | None:
+        """The three-point record of the fused kernel, or None if a row has entries beyond its neighbours."""
+        n, columns = self.shape
+        matrix = self.matrix
+        row = rows_of(matrix)
+        offset = (matrix.indices - row) % max(n, 1)
         if n != columns or np.any((offset > 1) & (offset < n - 1)):
             return None
         bands = np.zeros((3, n))
-        # With one or two cells the neighbours coincide: what is not centre counts as upper, then lower.
-        bands[np.where(offset > 1, 0, offset + 1), row] = m.data
+        # With one or two cells the neighbours coincide: an entry off the centre is an upper one, then a lower one.
+        bands[np.where(offset > 1, 0, offset + 1), row] = matrix.data
         return Tridiagonal(*bands)

@@ -1,11 +1,14 @@
-"""Kronecker: blocks of sums of Kronecker products of 1-D factors. One definition, every form."""
+"""Kronecker: blocks of sums of Kronecker products of 1-D factors, in matrix-free and in explicit form."""
+
+from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Callable, Sequence
 from functools import cached_property, partial, reduce
 from itertools import product
 from math import prod
 from operator import add
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -15,6 +18,9 @@ from sparsedp import kernels
 from sparsedp.grid.space import components
 from sparsedp.operators.structure.base import Structure, compact
 from sparsedp.operators.structure.factor import Factor
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 __all__ = ["Kronecker", "Term"]
 
@@ -26,20 +32,26 @@ class Term(NamedTuple):
     factors: tuple[Any, ...]
 
     @property
-    def axes(self):
+    def axes(self) -> tuple[int, ...]:
         """Axes whose factor is not the identity."""
         return tuple(axis for axis, factor in enumerate(self.factors) if factor is not None)
 
-    def transpose(self):
+    def transpose(self) -> Term:
+        """Return the plain transpose."""
         return Term(self.scale, tuple(factor and factor.T for factor in self.factors))
 
-    def __matmul__(self, other):
+    def __matmul__(self, other: Term) -> Term:
         pairs = zip(self.factors, other.factors, strict=True)
         return Term(self.scale * other.scale, tuple(_product(a, b) for a, b in pairs))
 
 
 def _product(a, b):
-    return b if a is None else a if b is None else a @ b
+    """Return a @ b, where None is the identity."""
+    if a is None:
+        return b
+    if b is None:
+        return a
+    return a @ b
 
 
 class Kronecker(Structure):
@@ -53,9 +65,9 @@ class Kronecker(Structure):
         (row, column) -> tuple of Terms; a missing pair is a zero block.
     """
 
-    takes_complex = False  # the loops know float64 only
+    takes_complex = False  # the loops take float64 only
 
-    def __init__(self, out_parts, in_parts, blocks):
+    def __init__(self, out_parts: Sequence, in_parts: Sequence, blocks: dict) -> None:
         self.out_parts = tuple(out_parts)
         self.in_parts = tuple(in_parts)
         merged = {key: _merge(terms) for key, terms in blocks.items()}
@@ -64,59 +76,64 @@ class Kronecker(Structure):
         self.passes = max(1, len(self.blocks))
 
     @classmethod
-    def identity(cls, parts):
-        """The identity on components of the given shapes."""
+    def identity(cls, parts: Sequence) -> Kronecker:
+        """Return the identity on components of these shapes."""
         term = (Term(1.0, (None,) * len(parts[0])),)
         return cls(parts, parts, {(c, c): term for c in range(len(parts))})
 
     @cached_property
-    def is_identity(self):  # type: ignore[override]
+    def is_identity(self) -> bool:  # type: ignore[override]
         """Whether this is the identity, exactly."""
         return self.out_parts == self.in_parts and self.blocks == Kronecker.identity(self.out_parts).blocks
 
-    # ------------------------------------------------------------ what is known of a Kronecker sum
+    # ------------------------------------------------------------ properties of a Kronecker sum
 
     @cached_property
-    def separable(self):  # type: ignore[override]
+    def separable(self) -> bool:  # type: ignore[override]
         """Whether it is a Kronecker sum on one component: one factor along one axis in each term."""
-        one = len(self.out_parts) == 1 and self.out_parts == self.in_parts
-        return one and all(len(term.axes) <= 1 for term in self.terms)
+        has_one_component = len(self.out_parts) == 1 and self.out_parts == self.in_parts
+        return has_one_component and all(len(term.axes) <= 1 for term in self.terms)
 
     @property
-    def terms(self):
+    def terms(self) -> tuple[Term, ...]:
         """The terms of the first component."""
         return self.blocks.get((0, 0), ())
 
     @cached_property
-    def lines(self):
-        """The factor along each axis that has one, with its scale; what else there is, is a shift."""
+    def lines(self) -> dict[int, Factor]:
+        """The scaled factor of each axis that has one; the terms without factors are `shift`."""
         return {axis: term.factors[axis].scaled(term.scale) for term in self.terms for axis in term.axes}
 
     @property
-    def shift(self):
-        """The multiple of the identity beside the factors."""
+    def shift(self) -> float:
+        """The multiple of the identity that is added to the factors."""
         return sum(term.scale for term in self.terms if not term.axes)
 
-    def diagonal(self):
-        """The diagonal of a Kronecker sum."""
-        lines = [
-            self.lines[axis].matrix.diagonal() if axis in self.lines else np.zeros(n)
-            for axis, n in enumerate(self.out_parts[0])
-        ]
+    def diagonal(self) -> NDArray:
+        """Return the diagonal of a Kronecker sum."""
+        lines = [np.zeros(n) for n in self.out_parts[0]]
+        for axis, factor in self.lines.items():
+            lines[axis] = factor.matrix.diagonal()
         return reduce(np.add.outer, lines, np.full((), float(self.shift))).reshape(-1)
 
-    def components(self):
-        """(labels, count): components of a Kronecker sum are the products of those along the axes."""
-        labels, count = np.zeros((), np.int64), 1
+    def components(self) -> tuple[NDArray, int]:
+        """Return the label of the connected component of each unknown, and the number of components.
+
+        The components of a Kronecker sum are products of components along the axes.
+        """
+        labels: Any = np.zeros((), np.int64)
+        count = 1
         for axis, n in enumerate(self.out_parts[0]):
-            many, line = n, np.arange(n)
+            axis_count = n
+            axis_labels = np.arange(n)
             if axis in self.lines:
-                many, line = connected_components(self.lines[axis].matrix, directed=False)
-            labels, count = np.add.outer(labels * many, line), count * many
+                axis_count, axis_labels = connected_components(self.lines[axis].matrix, directed=False)
+            labels = np.add.outer(labels * axis_count, axis_labels)
+            count *= axis_count
         return labels.reshape(-1), count
 
-    def may_be_triangular(self):
-        """Whether some rows of a Kronecker sum are part of no cycle: along each axis there must be such rows."""
+    def may_be_triangular(self) -> bool:
+        """Return whether some rows of a Kronecker sum are part of no cycle: each axis must have such rows."""
         for axis, n in enumerate(self.out_parts[0]):
             if axis in self.lines:
                 count, labels = connected_components(self.lines[axis].matrix, directed=True, connection="strong")
@@ -126,54 +143,57 @@ class Kronecker(Structure):
 
     # ------------------------------------------------------------ algebra
 
-    def transpose(self):
-        turned = {(c, r): tuple(term.transpose() for term in terms) for (r, c), terms in self.blocks.items()}
-        return Kronecker(self.in_parts, self.out_parts, turned)
+    def transpose(self) -> Structure:
+        """Return the plain transpose."""
+        blocks = {(c, r): tuple(term.transpose() for term in terms) for (r, c), terms in self.blocks.items()}
+        return Kronecker(self.in_parts, self.out_parts, blocks)
 
-    def scaled(self, factor):
-        real = not np.iscomplexobj(factor)
-        return self._each(lambda term: Term(factor * term.scale, term.factors)) if real else None
+    def scaled(self, factor: complex) -> Structure | None:
+        """Return factor * A."""
+        if isinstance(factor, complex) or np.iscomplexobj(factor):
+            return None
+        return self._each(lambda term: Term(factor * term.scale, term.factors))
 
     def _each(self, change):
-        """The same blocks with every term changed."""
+        """Return the same blocks with a function applied to every term."""
         blocks = {key: tuple(map(change, terms)) for key, terms in self.blocks.items()}
         return Kronecker(self.out_parts, self.in_parts, blocks)
 
-    def composed(self, other):
-        """self @ other, both Kronecker with matching components."""
+    def composed(self, other: Kronecker) -> Kronecker:
+        """Return self @ other, with matching components."""
         blocks: defaultdict = defaultdict(tuple)
         for ((r, k), mine), ((j, c), theirs) in product(self.blocks.items(), other.blocks.items()):
             if k == j:
                 blocks[r, c] += tuple(a @ b for a in mine for b in theirs)
         return Kronecker(self.out_parts, other.in_parts, blocks)
 
-    def added(self, other):
-        """self + other, both Kronecker with the same components."""
+    def added(self, other: Kronecker) -> Kronecker:
+        """Return self + other, with the same components."""
         keys = self.blocks | other.blocks
-        return Kronecker(
-            self.out_parts,
-            self.in_parts,
-            {key: self.blocks.get(key, ()) + other.blocks.get(key, ()) for key in keys},
-        )
+        blocks = {key: self.blocks.get(key, ()) + other.blocks.get(key, ()) for key in keys}
+        return Kronecker(self.out_parts, self.in_parts, blocks)
 
-    def magnitude(self):
+    def magnitude(self) -> Callable[[NDArray], NDArray]:
+        """Return the function that bounds abs(A) x for x >= 0."""
         return self.absolute.product
 
     @cached_property
-    def absolute(self):
-        """The same of magnitudes, term by term."""
+    def absolute(self) -> Kronecker:
+        """The map whose terms are the magnitudes of the terms."""
         return self._each(_absolute)
 
     # ------------------------------------------------------------ forms
 
-    def explicit(self):
+    def explicit(self) -> sp.csr_array:
+        """Return the entries as a csr_array with 32-bit indices."""
         if not self.blocks:
             return compact(sp.csr_array(self.shape))
         columns = list(enumerate(self.in_parts))
         rows = [[_block(self.blocks.get((r, c), ()), m, n) for c, n in columns] for r, m in enumerate(self.out_parts)]
         return compact(sp.block_array(rows))
 
-    def act(self, x, out):
+    def act(self, x: NDArray, out: NDArray) -> None:
+        """Write A x into `out`: see `Structure.act`."""
         inputs = components(x, self.in_parts)
         for steps, target in zip(self._plan, components(out, self.out_parts)):
             if not steps:
@@ -183,21 +203,23 @@ class Kronecker(Structure):
 
     @cached_property
     def _plan(self):
-        """For each component of the result, the passes that add up to it, each with the component that it reads."""
+        """For each component of the result, pairs (component of the field, pass over it) whose results are added up."""
         plans: list[list] = [[] for _ in self.out_parts]
         for (r, c), terms in self.blocks.items():
             shape = self.in_parts[c]
-            three = [t for t in terms if len(t.axes) <= 1 and all(t.factors[a].tridiagonal for a in t.axes)]
-            if len(three) > 1 and shape == self.out_parts[r] and not plans[r]:
-                plans[r].append((c, _fused_pass(three, shape)))
-                terms = [t for t in terms if t not in three]
+            fusible = [t for t in terms if len(t.axes) <= 1 and all(t.factors[a].tridiagonal for a in t.axes)]
+            if len(fusible) > 1 and shape == self.out_parts[r] and not plans[r]:
+                plans[r].append((c, _fused_pass(fusible, shape)))
+                terms = [t for t in terms if t not in fusible]
             plans[r] += [(c, _pass(term, shape)) for term in terms]
         return plans
 
 
 def _fused_pass(terms, shape):
-    """Three-point terms of a block -> the function (u, out, False) that adds them up in one pass over memory."""
-    shift, axes, first = sum(term.scale for term in terms if not term.axes), [None] * 3, 3 - len(shape)
+    """Return the function (u, out, False) that adds up three-point terms in one pass over memory."""
+    shift = sum(term.scale for term in terms if not term.axes)
+    axes = [None] * 3
+    first = 3 - len(shape)
     for term in terms:
         for axis in term.axes:
             axes[first + axis] = term.factors[axis].scaled(term.scale).tridiagonal
@@ -205,61 +227,74 @@ def _fused_pass(terms, shape):
 
 
 def _pass(term, shape):
-    """A term -> the function (u, out, whether it is added to): one axis after the other, the last into the result."""
+    """Return the function (u, out, accumulate) of a term: it applies the factors axis by axis, the last into `out`."""
     steps = []
     for axis in term.axes or (0,):
         factor = term.factors[axis] or Factor(sp.eye_array(shape[axis]))
-        before, after = prod(shape[:axis]), prod(shape[axis + 1 :])
+        before = prod(shape[:axis])
+        after = prod(shape[axis + 1 :])
         steps.append((factor.rows, (before, factor.shape[1], after), (before, factor.shape[0], after)))
         shape = shape[:axis] + factor.shape[:1] + shape[axis + 1 :]
 
     def run(u, out, accumulate):
-        for rows, given, made in steps[:-1]:
-            u, before = np.empty(made), u.reshape(given)
-            kernels.along_axis(before, u, rows, 1.0, False)
-        rows, given, made = steps[-1]
-        kernels.along_axis(u.reshape(given), out.reshape(made), rows, term.scale, accumulate)
+        for rows, in_shape, out_shape in steps[:-1]:
+            result = np.empty(out_shape)
+            kernels.along_axis(u.reshape(in_shape), result, rows, 1.0, False)
+            u = result
+        rows, in_shape, out_shape = steps[-1]
+        kernels.along_axis(u.reshape(in_shape), out.reshape(out_shape), rows, term.scale, accumulate)
 
     return run
 
 
 def _absolute(term):
+    """Return a term of the magnitudes of its entries."""
     return Term(abs(term.scale), tuple(factor and Factor(abs(factor.matrix)) for factor in term.factors))
 
 
 def _block(terms, out_part, in_part):
-    matrices = [_product_matrix(term, in_part) for term in terms]
-    return reduce(add, matrices) if matrices else sp.csr_array((prod(out_part), prod(in_part)))
+    """Return the matrix of a block."""
+    if not terms:
+        return sp.csr_array((prod(out_part), prod(in_part)))
+    return reduce(add, [_product_matrix(term, in_part) for term in terms])
 
 
 def _product_matrix(term, in_part):
-    sides = [
-        sp.eye_array(n, format="csr") if factor is None else factor.matrix
-        for factor, n in zip(term.factors, in_part, strict=True)
-    ]
+    """Return the Kronecker product of the factors of a term as a matrix."""
+    sides = []
+    for factor, n in zip(term.factors, in_part, strict=True):
+        if factor is None:
+            sides.append(sp.eye_array(n, format="csr"))
+        else:
+            sides.append(factor.matrix)
     return term.scale * reduce(partial(sp.kron, format="csr"), sides)
 
 
 def _merge(terms):
-    """Add up terms that differ in one axis only where that is exact: one term for each axis."""
+    """Add up terms with the same single axis, and terms with the same factors, where that is exact."""
     merged: dict = {}
     for term in terms:
-        single = len(term.axes) == 1
-        key = term.axes if single else tuple(factor and factor.key for factor in term.factors)
+        has_one_axis = len(term.axes) == 1
+        key: Any = term.axes
+        if not has_one_axis:
+            key = tuple(factor and factor.key for factor in term.factors)
         if key not in merged:
             merged[key] = term
-        elif single:
+        elif has_one_axis:
             merged[key] = _sum_on_axis(merged[key], term)
         else:
             merged[key] = Term(merged[key].scale + term.scale, term.factors)
     return tuple(term for term in merged.values() if not _is_zero(term))
 
 
-def _sum_on_axis(one, other):
-    (axis,) = one.axes
-    total = one.factors[axis].scaled(one.scale) + other.factors[axis].scaled(other.scale)
-    return Term(1.0, tuple(total if a == axis else None for a in range(len(one.factors))))
+def _sum_on_axis(first, second):
+    """Return the sum of two terms with factors along the same single axis."""
+    (axis,) = first.axes
+    factors: list = [None] * len(first.factors)
+    factors[axis] = first.factors[axis].scaled(first.scale) + second.factors[axis].scaled(second.scale)
+    return Term(1.0, tuple(factors))
 
 
 def _is_zero(term):
+    """Return whether a term has no entries."""
     return term.scale == 0 or any(factor and factor.matrix.nnz == 0 for factor in term.factors)

@@ -1,9 +1,13 @@
-"""Lazy structures: diagonals, products, sums and functions. Nothing is multiplied out before it is needed."""
+"""Lazy structures: diagonals, products, sums and functions. Products are assembled only if their entries are needed."""
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from functools import cached_property, reduce
 from math import prod
 from operator import add, matmul
 from operator import mul as multiply
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -17,6 +21,9 @@ from sparsedp.grid.space import components
 from sparsedp.operators.structure.base import Structure, compact, rows_of
 from sparsedp.operators.structure.kronecker import Kronecker
 
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, DTypeLike, NDArray
+
 __all__ = [
     "Chain",
     "Diagonal",
@@ -29,54 +36,62 @@ __all__ = [
     "total",
 ]
 
-DEEPEST = 200  # products in sums in products: recursions over deeper operators would leave Python's limit
-FEW = 16384  # cells for which passes one after the other are quick
-SHORT = 80  # cells along the last axis, the inner loop of the fused pass: below, its rows cost more than they save
+DEEPEST = 200  # nested products and sums: recursion over deeper operators would exceed Python's limit
+FUSED_FROM = 16384  # cells; below, separate passes are as fast as a fused one
+ROW_FROM = 80  # cells along the last axis, the inner loop of the fused pass; shorter rows cost more than they save
 
 
 class Diagonal(Structure):
     """Multiplication by one number for each entry."""
 
-    def __init__(self, values):
+    def __init__(self, values: ArrayLike) -> None:
         self.values = np.array(values, np.result_type(values, float)).reshape(-1)
         self.values.flags.writeable = False
-        self.shape, self.dtype = (self.values.size,) * 2, self.values.dtype
+        self.shape = (self.values.size, self.values.size)
+        self.dtype = self.values.dtype
 
-    def act(self, x, out):
+    def act(self, x: NDArray, out: NDArray) -> None:
+        """Write A x into `out`: see `Structure.act`."""
         np.multiply(x, self.values, out=out)
 
-    def transpose(self):
+    def transpose(self) -> Structure:
+        """Return the plain transpose."""
         return self
 
-    def explicit(self):
+    def explicit(self) -> sp.csr_array:
+        """Return the entries as a csr_array with 32-bit indices."""
         return compact(sp.diags_array(self.values, format="csr"))
 
-    def scaled(self, factor):
+    def scaled(self, factor: complex) -> Structure | None:
+        """Return factor * A."""
         return Diagonal(self.values * factor)
 
-    def magnitude(self):
+    def magnitude(self) -> Callable[[NDArray], NDArray]:
+        """Return the function that bounds abs(A) x for x >= 0."""
         return lambda x: np.abs(self.values) * x
 
 
 class Mask(Diagonal):
-    """Zero outside `keep`, exactly: what is masked out may be NaN. Inside, one number for each entry."""
+    """Exact zero outside `keep`, even for NaN; multiplication by one number for each entry inside."""
 
-    def __init__(self, keep, values=1.0):
+    def __init__(self, keep: ArrayLike, values: ArrayLike = 1.0) -> None:
         self.keep = np.array(keep, dtype=bool).reshape(-1)
         super().__init__(np.where(self.keep, values, 0.0))
 
-    def act(self, x, out):
+    def act(self, x: NDArray, out: NDArray) -> None:
+        """Write A x into `out`: see `Structure.act`."""
         out.fill(0)
         np.multiply(x, self.values, out=out, where=self.keep)
 
-    def scaled(self, factor):
+    def scaled(self, factor: complex) -> Structure | None:
+        """Return factor * A."""
         return Mask(self.keep, self.values * factor)
 
 
 class Chain(Structure):
-    """A product of structures, applied from right to left; products among them are taken apart."""
+    """A product of structures, applied from right to left; products among its members are flattened."""
 
-    def __init__(self, members):
+    def __init__(self, members: Sequence) -> None:
         self.members = tuple(inner for member in members for inner in _members(member, Chain))
         self.shape = (members[0].shape[0], members[-1].shape[1])
         self.dtype = np.result_type(*(member.dtype for member in members))
@@ -84,8 +99,9 @@ class Chain(Structure):
         self.depth = _nested(self.members)
         self.passes = max(member.passes for member in members)
 
-    def act(self, x, out):
-        large = x.dtype == float == self.dtype and x.size >= FEW and kernels.compiled()
+    def act(self, x: NDArray, out: NDArray) -> None:
+        """Write A x into `out`: see `Structure.act`."""
+        large = x.dtype == float == self.dtype and x.size >= FUSED_FROM and kernels.compiled()
         if large and self._fused is not None and self._fused(x, out):
             return
         for member in self.members[:0:-1]:
@@ -94,52 +110,77 @@ class Chain(Structure):
 
     @cached_property
     def _fused(self):
-        """All members in one pass, where they are differences through faces; else None."""
+        """All members in one pass if they are differences through faces; else None."""
         middle = self.members[1:-1]
-        diagonals = all(isinstance(member, Diagonal) for member in middle)
-        return through_faces(self.members[0], middle, self.members[-1]) if diagonals else None
+        if not all(isinstance(member, Diagonal) for member in middle):
+            return None
+        return through_faces(self.members[0], middle, self.members[-1])
 
-    def transpose(self):
+    def transpose(self) -> Structure:
+        """Return the plain transpose."""
         return Chain([member.transpose() for member in reversed(self.members)])
 
-    def explicit(self):
+    def explicit(self) -> sp.csr_array:
+        """Return the entries as a csr_array with 32-bit indices."""
         return compact(reduce(matmul, (member.explicit() for member in self.members)))
 
-    def scaled(self, factor):
+    def scaled(self, factor: complex) -> Structure | None:
+        """Return factor * A."""
         return compose(times(self.members[0], factor), Chain(self.members[1:]))
 
-    def magnitude(self):
-        members = [member.magnitude() for member in reversed(self.members)]
-        return lambda x: reduce(lambda y, member: member(y), members, x)
+    def magnitude(self) -> Callable[[NDArray], NDArray]:
+        """Return the function that bounds abs(A) x for x >= 0."""
+        bounds = [member.magnitude() for member in reversed(self.members)]
+
+        def bound(x: NDArray) -> NDArray:
+            for member_bound in bounds:
+                x = member_bound(x)
+            return x
+
+        return bound
 
 
 class Sum(Structure):
     """A sum of structures."""
 
-    def __init__(self, members):
-        self.members = tuple(sorted(members, key=lambda member: member.dtype.kind))  # a complex one first: it has room
-        self.shape, self.dtype = members[0].shape, self.members[0].dtype
+    def __init__(self, members: Sequence) -> None:
+        # A complex member is first: the others are added to its result.
+        self.members = tuple(sorted(members, key=lambda member: member.dtype.kind))
+        self.shape = members[0].shape
+        self.dtype = self.members[0].dtype
         self.has_entries = all(member.has_entries for member in members)
         self.depth = _nested(self.members)
 
-    def act(self, x, out):
+    def act(self, x: NDArray, out: NDArray) -> None:
+        """Write A x into `out`: see `Structure.act`."""
         first, *rest = self.members
         first.apply(x, out)
         for member in rest:
             out += member.product(x)
 
-    def transpose(self):
+    def transpose(self) -> Structure:
+        """Return the plain transpose."""
         return Sum([member.transpose() for member in self.members])
 
-    def explicit(self):
+    def explicit(self) -> sp.csr_array:
+        """Return the entries as a csr_array with 32-bit indices."""
         return compact(reduce(add, (member.explicit() for member in self.members)))
 
-    def scaled(self, factor):
+    def scaled(self, factor: complex) -> Structure | None:
+        """Return factor * A."""
         return Sum([times(member, factor) for member in self.members])
 
-    def magnitude(self):
-        members = [member.magnitude() for member in self.members]
-        return lambda x: sum(member(x) for member in members)
+    def magnitude(self) -> Callable[[NDArray], NDArray]:
+        """Return the function that bounds abs(A) x for x >= 0."""
+        bounds = [member.magnitude() for member in self.members]
+
+        def bound(x: NDArray) -> NDArray:
+            total: Any = 0
+            for member_bound in bounds:
+                total = total + member_bound(x)
+            return total
+
+        return bound
 
 
 class Functions(Remade, Structure):
@@ -148,20 +189,30 @@ class Functions(Remade, Structure):
     name = "an operator of two functions"
     has_entries = False
 
-    def __init__(self, forward, backward, domain, codomain, dtype=float):
-        self.forward, self.backward = forward, backward
-        self.domain, self.codomain = domain, codomain  # shapes of the fields
+    def __init__(
+        self,
+        forward: Callable | None,
+        backward: Callable | None,
+        domain: tuple[int, ...],
+        codomain: tuple[int, ...],
+        dtype: DTypeLike = float,
+    ) -> None:
+        self.forward = forward
+        self.backward = backward
+        self.domain = domain  # shapes of the fields
+        self.codomain = codomain
         self.shape = (int(np.prod(codomain)), int(np.prod(domain)))
         self.dtype = np.dtype(dtype)
 
-    def recipe(self):
+    def recipe(self) -> tuple:
         """The call that makes it again: see _utils/reconstruction.py."""
         return Functions, (self.forward, self.backward, self.domain, self.codomain, self.dtype)
 
-    def apply(self, x, out):
+    def apply(self, x: NDArray, out: NDArray) -> None:
+        """Write A x into `out`: see `Structure.apply`."""
         if self.forward is None:
             raise DerivativeError("this operator has no transpose; give from_functions its second function")
-        y = np.asarray(self.forward(frozen(x.reshape(self.domain))))  # the field is the caller's
+        y = np.asarray(self.forward(frozen(x.reshape(self.domain))))  # read-only for the function
         check_shape("what the function returns", y, self.codomain)
         if y.dtype.kind == "c" and out.dtype.kind != "c":
             raise DerivativeError(
@@ -169,29 +220,36 @@ class Functions(Remade, Structure):
             )
         np.copyto(out, y.reshape(-1), casting="same_kind")
 
-    def transpose(self):
+    def transpose(self) -> Structure:
+        """Return the plain transpose."""
         return Functions(self.backward, self.forward, self.codomain, self.domain, self.dtype)
 
 
-# ---- products and sums: kept as factors where that is exact, lazy elsewhere ----
+# ---- products and sums: merged where that is exact, lazy otherwise ----
 
 
-def compose(a, b):
-    """Structure of a @ b.
+def compose(a: Structure, b: Structure) -> Structure:
+    """Return the structure of a @ b.
 
-    Identities vanish, factor-defined maps stay factor-defined, diagonals meet in one diagonal; the rest becomes a
-    chain, and so do Kronecker sums of two axes and more, whose product is none.
+    Identities are dropped, products of factor-defined maps are factor-defined, products of diagonals are one diagonal.
+    Other products are a chain; so are products of Kronecker sums of several axes, which are no Kronecker sums.
     """
     members = _members(a, Chain)
     for member in _members(b, Chain):
-        while members and (joined := _joined(members[-1], member)) is not None:
-            members, member = members[:-1], joined
+        while members:
+            merged = _merged_product(members[-1], member)
+            if merged is None:
+                break
+            members.pop()
+            member = merged
         members.append(member)
-    return members[0] if len(members) == 1 else Chain(members)
+    if len(members) == 1:
+        return members[0]
+    return Chain(members)
 
 
 def _nested(members):
-    """Return the depth of a product or sum of these members; refuse what Python could not recurse over."""
+    """Return the nesting depth of a product or sum; raise ValueError if Python could not recurse over it."""
     depth = 1 + max((member.depth for member in members), default=0)
     if depth > DEEPEST:
         raise ValueError(
@@ -202,49 +260,57 @@ def _nested(members):
 
 
 def _members(structure, kind):
-    """The members of a structure of this kind; else the structure itself."""
-    return list(structure.members) if isinstance(structure, kind) else [structure]
+    """Return the members of a product or sum; for another structure, the structure itself."""
+    if isinstance(structure, kind):
+        return list(structure.members)
+    return [structure]
 
 
-def _joined(a, b):
-    """One structure for a @ b, or None when it has to stay a pair."""
+def _merged_product(a, b):
+    """Return one structure for a @ b, or None if there is none."""
     if b.is_identity:
         return a
     if a.is_identity:
         return b
     if isinstance(a, Kronecker) and isinstance(b, Kronecker) and a.in_parts == b.out_parts:
         product = a.composed(b)
-        return (
-            None if a.separable and b.separable and not product.separable else product
-        )  # L @ L keeps its eigenvectors
+        if a.separable and b.separable and not product.separable:
+            return None  # as a chain, L @ L is solved by the eigenvectors of L
+        return product
     if isinstance(a, Diagonal) and isinstance(b, Diagonal):
-        kept = [member.keep for member in (a, b) if isinstance(member, Mask)]
-        return Mask(np.all(kept, axis=0), a.values * b.values) if kept else Diagonal(a.values * b.values)
+        masks = [member.keep for member in (a, b) if isinstance(member, Mask)]
+        if masks:
+            return Mask(np.all(masks, axis=0), a.values * b.values)
+        return Diagonal(a.values * b.values)
     return None
 
 
-def times(structure, factor):
-    """Structure of factor * structure."""
+def times(structure: Structure, factor: complex) -> Structure:
+    """Return the structure of factor * structure."""
     scaled = structure.scaled(factor)
     if scaled is not None:
         return scaled
     return compose(Diagonal(np.full(structure.shape[0], factor)), structure)
 
 
-def total(a, b):
-    """Structure of a + b."""
+def total(a: Structure, b: Structure) -> Structure:
+    """Return the structure of a + b."""
     members = _members(a, Sum)
     for member in _members(b, Sum):
-        for place, other in enumerate(members):
-            if (joined := _added(other, member)) is not None:
-                members[place] = joined
+        for number, other in enumerate(members):
+            merged = _merged_sum(other, member)
+            if merged is not None:
+                members[number] = merged
                 break
         else:
             members.append(member)
-    return members[0] if len(members) == 1 else Sum(members)
+    if len(members) == 1:
+        return members[0]
+    return Sum(members)
 
 
-def _added(a, b):
+def _merged_sum(a, b):
+    """Return one structure for a + b, or None if there is none."""
     if isinstance(a, Kronecker) and isinstance(b, Kronecker) and (a.out_parts, a.in_parts) == (b.out_parts, b.in_parts):
         return a.added(b)
     if isinstance(a, Diagonal) and isinstance(b, Diagonal):
@@ -255,59 +321,82 @@ def _added(a, b):
 # ---- products with faces between cells, in one pass ----
 
 
-def through_faces(left, middle, right):
-    """Structures L (faces -> cells), the diagonals between, R (cells -> faces) -> their product in one pass, or None.
+def through_faces(left: Structure, middle: Sequence[Any], right: Structure) -> Callable | None:
+    """Return the product L K R in one pass over memory.
 
-    It is a function of x and of the array for the result that says whether it could be done.
+    Parameters
+    ----------
+    left, right : Structure
+        L maps faces to cells, R maps cells to faces.
+    middle : sequence of Diagonal
+        Their product is K.
+
+    Returns
+    -------
+    callable or None
+        ``run(x, out)`` writes the product into `out` and returns whether that was possible. None if the structures
+        are not of this form.
     """
     if not (isinstance(left, Kronecker) and isinstance(right, Kronecker) and middle):
         return None
     if len(right.in_parts) != 1 or left.out_parts != right.in_parts or left.in_parts != right.out_parts:
         return None
     shape = right.in_parts[0]
-    if len(shape) not in (2, 3) or len(left.in_parts) != len(shape) or min(shape) < 2 or shape[-1] < SHORT:
+    if len(shape) not in (2, 3) or len(left.in_parts) != len(shape) or min(shape) < 2 or shape[-1] < ROW_FROM:
         return None
-    lines = [face_entries(left, right, axis, n) for axis, n in enumerate(shape)]
-    closed = [isinstance(member, Mask) for member in middle]
+    lines: list = [face_entries(left, right, axis, n) for axis, n in enumerate(shape)]
+    has_mask = any(isinstance(member, Mask) for member in middle)
     k = reduce(multiply, (member.values for member in middle))
     if any(line is None for line in lines) or k.dtype != float:
         return None
-    if any(closed) and not all(np.all(member.values[getattr(member, "keep", ...)] != 0) for member in middle):
+    if has_mask and not all(np.all(member.values[getattr(member, "keep", ...)] != 0) for member in middle):
         return None  # 0 times NaN is NaN for some of the zeros, and 0 for others
     parts = components(k, right.out_parts)
-    if len(shape) == 2:  # an axis of one cell, without faces
-        shape, parts = (shape[0], 1, shape[1]), [parts[0][:, None], np.zeros((0, 0, 0)), parts[1][:, None]]
+    if len(shape) == 2:  # insert an axis of one cell, without faces
+        shape = (shape[0], 1, shape[1])
+        parts = [parts[0][:, None], np.zeros((0, 0, 0)), parts[1][:, None]]
         lines.insert(1, np.zeros((4, 2)))
 
     def run(x, out):
         fields = x.reshape(shape), *parts, *lines, out.reshape(shape)
-        return kernels.run("stencil", "through_faces", prod(shape[:2]), x.size, kernels.threads(), *fields, any(closed))
+        return kernels.run("stencil", "through_faces", prod(shape[:2]), x.size, kernels.threads(), *fields, has_mask)
 
     return run
 
 
-def face_entries(left, right, axis, n):
-    """Entries of R for the cells below and above each face across an axis of n cells, and those of L; or None.
+def face_entries(left: Any, right: Any, axis: int, n: int) -> NDArray | None:
+    """Return the entries of R and of L for the cells below and above each face of an axis of n cells.
 
-    None where another axis, a second term or a further cell takes part. On a periodic axis the last face is the first.
+    None if another axis, a second term or a cell that is not beside the face takes part. On a periodic axis the last
+    face is the first.
     """
-    terms = right.blocks.get((axis, 0), ()), left.blocks.get((0, axis), ())
-    if any(len(found) != 1 or found[0].axes != (axis,) for found in terms):
-        return None
-    (slope,), (back,) = terms
-    sides = _beside(slope.factors[axis], slope.scale, n), _beside(back.factors[axis].T, back.scale, n)
-    if any(side is None or np.any(side[:, 1:n] == 0) for side in sides):  # what is not read could be NaN
-        return None
+    right_terms = right.blocks.get((axis, 0), ())
+    left_terms = left.blocks.get((0, axis), ())
+    for terms in (right_terms, left_terms):
+        if len(terms) != 1 or terms[0].axes != (axis,):
+            return None
+    (slope,) = right_terms
+    (difference,) = left_terms
+    sides = (
+        _entries_beside_faces(slope.factors[axis], slope.scale, n),
+        _entries_beside_faces(difference.factors[axis].T, difference.scale, n),
+    )
+    for side in sides:
+        if side is None or np.any(side[:, 1:n] == 0):  # a cell with entry 0, which is not read, could hold NaN
+            return None
     return np.concatenate(sides)
 
 
-def _beside(factor, scale, n):
-    """A factor from n cells to faces -> its entries for the cell below and the cell above each face, or None."""
-    m, row, faces = factor.matrix, rows_of(factor.matrix), factor.shape[0]
-    is_below, is_above = m.indices == (row - 1) % faces, m.indices == row
+def _entries_beside_faces(factor, scale, n):
+    """Return the entries of a factor from n cells to faces for the cells below and above each face, or None."""
+    matrix = factor.matrix
+    row = rows_of(matrix)
+    faces = factor.shape[0]
+    is_below = matrix.indices == (row - 1) % faces
+    is_above = matrix.indices == row
     if faces not in (n, n + 1) or not np.all(is_above ^ is_below):
-        return None  # further cells; or one periodic cell, on both sides of its face
+        return None  # more cells take part, or one periodic cell is on both sides of its face
     sides = np.zeros((2, n + 1))
-    sides[np.where(is_below, 0, 1), row] = scale * m.data
+    sides[np.where(is_below, 0, 1), row] = scale * matrix.data
     sides[:, faces:] = sides[:, : n + 1 - faces]
     return sides
