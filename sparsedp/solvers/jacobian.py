@@ -197,9 +197,14 @@ class Jacobians:
     def __str__(self) -> str:
         lines = []
         for space, pattern in self._patterns.items():
-            products = "" if pattern.coloured is None else f", {pattern.coloured.count} products"
-            lines.append(f"  {space.size} unknowns{products}")
-        lines.append(str(self._points.last) if len(self._points) else "  not set up yet")
+            line = f"  {space.size} unknowns"
+            if pattern.coloured is not None:
+                line += f", {pattern.coloured.count} products"
+            lines.append(line)
+        if len(self._points):
+            lines.append(str(self._points.last))
+        else:
+            lines.append("  not set up yet")
         return "\n".join(lines)
 
     # ------------------------------------------------------------ set-ups
@@ -352,8 +357,10 @@ class Jacobians:
         if isbox(jacobian):
             raise DerivativeError(f"the jacobian of {self.name} uses a traced value that is not an argument")
         if not isinstance(jacobian, Operator):
-            is_matrix = sp.issparse(jacobian) or np.ndim(jacobian)
-            jacobian = from_matrix(jacobian if is_matrix else [[jacobian]], name=name)
+            is_number = not sp.issparse(jacobian) and not np.ndim(jacobian)
+            if is_number:
+                jacobian = [[jacobian]]
+            jacobian = from_matrix(jacobian, name=name)
         check_shape(f"the jacobian of {self.name}", jacobian, (unknowns.size, unknowns.size))
         jacobian = unknowns.backend.implementation(jacobian_on_unknowns)(jacobian, unknowns.space)
         check_kind(f"the jacobian of {self.name}", jacobian.dtype, "real numbers")
@@ -361,10 +368,11 @@ class Jacobians:
 
     def _product(self, equation, x, leaves, transposed, purpose="jacobian"):
         """Return the function that maps v to J v or J^T v, and counts."""
-        counter = (f"{self.name}.{purpose}", "vjp" if transposed else "jvp")
         if transposed:
+            counter = (f"{self.name}.{purpose}", "vjp")
             multiply = equation.transposed(x, leaves)
         else:
+            counter = (f"{self.name}.{purpose}", "jvp")
             multiply = equation.tangent(x, leaves)
 
         def product(v):
@@ -409,7 +417,9 @@ class Jacobians:
 
     def _store_coloured(self, pattern, equation, x, leaves):
         cells, shapes = find_fields(equation, x, leaves)
-        by_rows = self._orientations[0] if len(self._orientations) == 1 else None
+        by_rows = None
+        if len(self._orientations) == 1:
+            by_rows = self._orientations[0]
         coloured = ColouredPattern(pattern, shapes, by_rows)
         return self._store(equation.unknowns.space, KnownPattern(coloured, cells))
 
@@ -471,8 +481,16 @@ def _key(equation, x, leaves):
 
 def _possible_orientations(equation, x, leaves):
     """Return False if J can be assembled by JVPs, and True if by VJPs; VJPs if neither works."""
-    has_jvp = _can_derive(pushforward, lambda y: equation(y, *leaves), x, np.ones_like(x))
-    has_vjp = _can_derive(lambda: equation.transposed(x, leaves)(np.ones_like(x)))
+    ones = np.ones_like(x)
+
+    def residual(y):
+        return equation(y, *leaves)
+
+    def vjp():
+        return equation.transposed(x, leaves)(ones)
+
+    has_jvp = _can_derive(pushforward, residual, x, ones)
+    has_vjp = _can_derive(vjp)
     orientations = []
     if has_jvp:
         orientations.append(False)
@@ -521,7 +539,7 @@ def _rates(matrix, unknowns):
     """Return the rate at which each unknown relaxes, with the sign of its equation; 0 if the equation is not a rate.
 
     It is half the sum of the magnitudes in a row over its own field: 4 nu / h^2 of a Laplacian in 2-D, |v| / h of
-    convection. The sign is that of the diagonal entry where it dominates the row, else the sign of the sum of the
+    convection. The sign is the one of the diagonal entry where it dominates the row, else the sign of the sum of the
     diagonal over the field; 0 for a pressure in div v = 0.
     """
     field = np.repeat(np.arange(len(unknowns.shapes)), np.diff(unknowns.space.offsets))
@@ -529,7 +547,9 @@ def _rates(matrix, unknowns):
     diagonal = matrix.diagonal()
     is_inside = field[row] == field[matrix.indices]
     sums = np.bincount(row[is_inside], np.abs(matrix.data[is_inside]), diagonal.size)
-    field_signs = np.sign(np.bincount(field, diagonal))[field] if field.size else diagonal
+    field_signs = diagonal
+    if field.size:
+        field_signs = np.sign(np.bincount(field, diagonal))[field]
     signs = np.where(2.1 * np.abs(diagonal) >= sums, np.sign(diagonal), field_signs)
     return 0.5 * sums * signs
 

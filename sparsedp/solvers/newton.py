@@ -181,7 +181,9 @@ def _check_unknown(leaf, name):
 
 def _solution_dtype(leaf):
     dtype = dtype_of(leaf)
-    return dtype if dtype.kind == "f" else np.dtype(float)
+    if dtype.kind == "f":
+        return dtype
+    return np.dtype(float)
 
 
 class Equation:
@@ -288,14 +290,21 @@ class Equation:
     def tangent(self, x: Any, values: Sequence[Any]) -> Callable[[Any], Any]:
         """Return the function that maps v to J v."""
 
+        def residual(y):
+            return self(y, *values)
+
         def product(v):
-            return push(lambda y: self(y, *values), x, [v])[1]
+            return push(residual, x, [v])[1]
 
         return product
 
     def transposed(self, x: Any, values: Sequence[Any]) -> Callable[[Any], Any]:
         """Return the function that maps g to J^T g."""
-        return pullback(lambda y: self(y, *values), x)[1]
+
+        def residual(y):
+            return self(y, *values)
+
+        return pullback(residual, x)[1]
 
 
 # ---- the method ------------------------------------------------------------------------------------------------------
@@ -402,7 +411,10 @@ class Newton:
             self.J = jacobian
             self.is_stale = True
         forcing = LOOSEST_FORCING
-        status = self._acceptance(0.0 if self.is_time_step else 1.0)
+        if self.is_time_step:
+            status = self._acceptance(0.0)
+        else:
+            status = self._acceptance()
         while not status:
             previous_size = self.size
             if self.run.iterations == self.maxiter:
@@ -516,10 +528,11 @@ class Newton:
             if np.array_equal(x, self.x):
                 return False
             F = self._residual_at_trial(x)
-            size = np.inf if F is None else self._measure(F)
-            if F is not None and size <= (1 - SUFFICIENT_DECREASE * share) * self.size:
-                self.x, self.F, self.size = self._zero_or(x, F, size)
-                return True
+            if F is not None:
+                size = self._measure(F)
+                if size <= (1 - SUFFICIENT_DECREASE * share) * self.size:
+                    self.x, self.F, self.size = self._zero_or(x, F, size)
+                    return True
             share /= 2
         return False
 
@@ -538,7 +551,9 @@ class Newton:
             F = self.equation.unknowns.attempt(self.equation.value, x, self.leaves)
         except (UnstableStepError, NonFiniteError, ConvergenceError):
             return None
-        return F if np.all(np.isfinite(F)) else None
+        if not np.all(np.isfinite(F)):
+            return None
+        return F
 
     # ------------------------------------------------------------ pseudo-time
 
@@ -605,7 +620,9 @@ class Newton:
         if is_converged.all():
             return "converged"
         is_exact = residual <= ROUNDING * terms
-        return "converged_at_roundoff" if np.all(is_converged | is_exact) else ""
+        if np.all(is_converged | is_exact):
+            return "converged_at_roundoff"
+        return ""
 
     def _field_sizes(self):
         norms = self.equation.unknowns.norms
@@ -631,7 +648,11 @@ class Newton:
         """Return F_p p: the sum of the terms of F in its parameters, each as often as its degree."""
         if not self.leaves:
             return np.zeros_like(self.x)
-        return push(lambda leaves: self.equation(self.x, *leaves), list(self.leaves), self.leaves)[1]
+
+        def residual(leaves):
+            return self.equation(self.x, *leaves)
+
+        return push(residual, list(self.leaves), self.leaves)[1]
 
     def _fail(self, status: str, reason: str = "") -> NoReturn:
         run = self.run
@@ -640,7 +661,9 @@ class Newton:
         if not has_own_reason:
             residual = number_beside(run.residual, self.rtol, digits=1, style="e")
             reason = f"relative residual {residual}, wanted {self.rtol:g} ({status})"
-        hint = self.jacobians.hint(self.J) if self.J is not None else ""
+        hint = ""
+        if self.J is not None:
+            hint = self.jacobians.hint(self.J)
         if status == "stagnated" and self.J.singular:
             hint += "; its Jacobian is singular there, start from another guess or fix what is free by a constant"
         elif not (has_own_reason or hint or self.is_time_step):

@@ -639,12 +639,15 @@ class MatrixSolver(ParametricSolver):
         values = np.asarray(plain(data))
         check_shape("data", values, self.rows.shape, "; give one value for each entry")
         check_kind("data", values.dtype, "numbers")
-        check_finite("data", values, where=lambda entry: f"row {self.rows[entry]}, column {self.columns[entry]}")
+        check_finite("data", values, where=self._place_of)
         if not isbox(data):
             data = values
         if not isbox(b):
             b = np.asarray(b)
         return self._solution(data, b, 0.0)
+
+    def _place_of(self, entry):
+        return f"row {self.rows[entry]}, column {self.columns[entry]}"
 
     def _operator(self, data, shift):
         matrix = sp.csr_array((data, self._pattern.indices, self._pattern.indptr), shape=self._pattern.shape)

@@ -322,8 +322,7 @@ class Root(Remade):
         self.info.hierarchy = log.hierarchy
 
     def _vjp(self, nums, ans, equation, guess, *leaves):
-        places = [num - 2 for num in nums]
-        varied, chosen = vary(lambda *values: equation(ans, *values), leaves, places)
+        varied, chosen = self._residual_of_leaves(nums, ans, equation, leaves)
 
         def pull(g):
             y = self._linear_solve(True)(g, equation, ans, *leaves)
@@ -332,6 +331,15 @@ class Root(Remade):
             return tuple(back(-y))
 
         return pull
+
+    @staticmethod
+    def _residual_of_leaves(nums, x, equation, leaves):
+        """Return the residual at x as a function of the leaves with these argument numbers, and these leaves."""
+
+        def residual(*values):
+            return equation(x, *values)
+
+        return vary(residual, leaves, [num - 2 for num in nums])
 
     def _check_root(self, equation, x, g, y, F, leaves):
         """Refuse a derivative where x is no longer a root, because something that the residual uses has changed.
@@ -351,7 +359,11 @@ class Root(Remade):
             return
         terms = np.zeros(0)
         if leaves:
-            terms = push(lambda leaves: equation(x, *leaves), leaves, leaves)[1]
+
+            def residual(leaves):
+                return equation(x, *leaves)
+
+            terms = push(residual, leaves, leaves)[1]
         if length(F) <= CANCELLATION * length(terms):  # a root near 0, where the terms of the residual cancel
             return
         step = self._solve(False, False, F, equation, x, *leaves)
@@ -362,7 +374,7 @@ class Root(Remade):
             )
 
     def _jvp(self, nums, tangents, ans, equation, guess, *leaves):
-        varied, chosen = vary(lambda *values: equation(ans, *values), leaves, [num - 2 for num in nums])
+        varied, chosen = self._residual_of_leaves(nums, ans, equation, leaves)
         return self._linear_solve(False)(-push(varied, chosen, tangents)[1], equation, ans, *leaves)
 
     # ------------------------------------------------------------ solves with J and J^T, as rules of x, b and p
@@ -390,7 +402,11 @@ class Root(Remade):
 
 def _negative_gradient(point, places, y, s):
     """Return -grad <y, J s> = -grad <s, J^T y> in the arguments of J at these places."""
-    varied, chosen = vary(lambda *point: _product(True, y, *point), point, places)
+
+    def product(*point):
+        return _product(True, y, *point)
+
+    varied, chosen = vary(product, point, places)
     return pullback(varied, chosen)[1](-s)
 
 
