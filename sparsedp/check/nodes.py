@@ -1,9 +1,13 @@
-"""Every node of a reverse-mode tape, seen while it is made: what was called, with which values, inside what."""
+"""Every node of a reverse-mode tape, seen while it is recorded: what was called, with which values, inside what."""
+
+from __future__ import annotations
 
 import gc
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from types import CellType, FunctionType, MethodType
+from typing import Any
 
 import numpy as np
 
@@ -13,8 +17,8 @@ from sparsedp.autodiff.tape import called, isbox, through
 
 __all__ = ["Node", "bytes_held", "calls_seen", "in_order"]
 
-HOLDERS = tuple, list, set, dict, MethodType, CellType, partial
-DEEPEST = 36  # holders inside each other; deeper ones are not the tape's. A function, its closure and a cell are three
+HOLDERS = (tuple, list, set, dict, MethodType, CellType, partial)
+DEEPEST = 36  # holders inside each other; deeper ones do not belong to the tape. A function with its closure is three
 
 
 class Node:
@@ -24,7 +28,7 @@ class Node:
     ----------
     subject : Rule, Operator, or a function of autograd
     name : str
-        How the user knows it.
+        The name that the user knows.
     value
         Its result.
     values : list
@@ -34,48 +38,56 @@ class Node:
     plain : bool
         Whether no argument belongs to an outer trace.
     inner : list of Node
-        The calls that its derivative made, as that of a time loop does that runs its steps again; the steps of a
-        loop that keeps its tape stand before the loop.
+        The calls that its derivative recorded, as a time loop does that runs its steps again; the steps of a loop that
+        keeps its tape stand before the loop.
     again : callable
         ``again(values)`` is the same call with other values of these arguments.
     """
 
-    def __init__(self, fun, value, args, options, nums):
-        self.subject, self.value = called(fun, args), value
-        self.name, self.inner = name_of(self.subject), []  # type: str, list[Node]
-        self.values, self.plain = [args[num] for num in nums], not any(map(isbox, args))
-        self.places = [num - (self.subject is not fun) for num in nums]  # a rule is the first argument of its call
+    def __init__(
+        self, function: Any, value: Any, args: Sequence[Any], options: dict[str, Any], numbers: Sequence[int]
+    ) -> None:
+        self.subject = called(function, args)
+        self.name: str = name_of(self.subject)
+        self.value = value
+        self.values = [args[number] for number in numbers]
+        self.plain = not any(map(isbox, args))
+        self.inner: list[Node] = []
+        is_rule = self.subject is not function  # a rule is the first argument of its call
+        self.places = [number - is_rule for number in numbers]
 
-        def again(values):
-            given = dict(zip(nums, values, strict=True))
-            everything = [given.get(num, _as_new(arg)) for num, arg in enumerate(args)]
-            if fun is through:  # the rule of a time loop knows which of its arguments have a derivative
-                loop, *everything = everything
-                return loop.again(*everything)
-            return fun(*everything, **options)
+        def again(values: Sequence[Any]) -> Any:
+            new = dict(zip(numbers, values, strict=True))
+            everything = [new.get(number, _as_new(arg)) for number, arg in enumerate(args)]
+            if function is through:  # the rule of a time loop knows which of its arguments have a derivative
+                loop, *arguments = everything
+                return loop.again(*arguments)
+            return function(*everything, **options)
 
         self.again = again
 
 
-def _as_new(argument):
+def _as_new(argument: Any) -> Any:
     """Return an argument for another run of a call; one that keeps the results of its run has `as_new`."""
     return argument.as_new() if hasattr(argument, "as_new") else argument
 
 
 @contextmanager
-def calls_seen():
-    """A `with` block that yields the list of the calls made in it, each with those inside of it."""
+def calls_seen() -> Iterator[list[Node]]:
+    """Yield the list of the calls that the `with` block records, each with those inside of it."""
     calls: list[Node] = []
-    running: list[Node] = []  # calls whose derivative is under way, the innermost last
+    running: list[Node] = []  # calls whose derivative is running, the innermost last
 
-    def see(tape_node, *call):
-        node, pull = Node(*call), tape_node.vjp
-        (running[-1].inner if running else calls).append(node)
+    def see(tape_node: Any, *call: Any) -> None:
+        node = Node(*call)
+        pull = tape_node.vjp
+        outer = running[-1].inner if running else calls
+        outer.append(node)
 
-        def watched(*g):
+        def watched(*cotangents: Any) -> Any:
             running.append(node)
             try:
-                return pull(*g)
+                return pull(*cotangents)
             finally:
                 running.pop()
 
@@ -85,35 +97,45 @@ def calls_seen():
         yield calls
 
 
-def in_order(nodes):
-    """All calls, those inside of a call before it."""
+def in_order(nodes: Iterable[Node]) -> Iterator[Node]:
+    """Yield all calls, those inside of a call before it."""
     for node in nodes:
         yield from in_order(node.inner)
         yield node
 
 
-def bytes_held(nodes):
-    """Bytes of all arrays that nodes of a tape keep alive, each buffer once.
+def bytes_held(nodes: Iterable[Any]) -> int:
+    """Return the bytes of all arrays that nodes of a tape keep alive, each buffer once.
 
-    They are below functions (what they close over, their defaults) and containers.
+    The arrays are below functions (their closures and defaults) and containers.
     """
     buffers: dict[int, int] = {}
     seen: set[int] = set()
-    waiting: list = [(part, 0) for node in nodes for part in (node.vjp, node.held)]
+    waiting: list[tuple[Any, int]] = []
+    for node in nodes:
+        waiting += [(node.vjp, 0), (node.held, 0)]
     while waiting:
         thing, depth = waiting.pop()
         if isinstance(thing, array_types()):
-            while isinstance(base := getattr(thing, "base", None), np.ndarray):  # a field on ranks has none
-                thing = base
-            buffers[id(thing)] = thing.nbytes
+            owner = _owner(thing)
+            buffers[id(owner)] = owner.nbytes
         elif depth <= DEEPEST and id(thing) not in seen:
             seen.add(id(thing))
             waiting += [(part, depth + 1) for part in _parts(thing)]
     return sum(buffers.values())
 
 
-def _parts(thing):
-    """What a box, a function or a container refers to."""
+def _owner(array: Any) -> Any:
+    """Return the array that owns the memory of a view; a field on ranks has no views."""
+    base = getattr(array, "base", None)
+    while isinstance(base, np.ndarray):
+        array = base
+        base = array.base
+    return array
+
+
+def _parts(thing: Any) -> Any:
+    """Return what a box, a function or a container refers to."""
     if isbox(thing):
         return (thing._value,)
     if isinstance(thing, FunctionType):  # not the names of its module
