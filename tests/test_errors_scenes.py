@@ -325,7 +325,7 @@ TABLE = [
         lambda: dp.rollout(dp.identity(LINE.cells), np.ones(4), None, 3, memory="reverse"),
         VALUE,
         "memory='reverse' needs a step with step.back(state, params), got <identity: cells(4) -> "
-        "cells(4), explicit>; write memory='200 MB', or make it by stepper('leapfrog', ...)",
+        "cells(4), explicit>; write memory='200 MB', or take a step from stepper('leapfrog', ...)",
     ),
     (
         lambda: dp.grad(lambda c: dp.rollout(Wrong(), 1.0, c, 3, memory="reverse"))(1.0),

@@ -1,40 +1,46 @@
 """Error control: as many steps as the tolerance needs, each compared with two of half its length.
 
-A trial of length h is taken once whole, w, and once in two halves, f. Their difference is 2^p - 1 times the error of f;
-what is kept is f + (f - w) / (2^p - 1), one order better (local extrapolation). Crank-Nicolson keeps f: where its
-steps ring, w has the opposite sign. The next length is the smaller of what the last error allows and what the trend of
-the last two predicts.
-Sources: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I (1993), II.4; Gustafsson, ACM Trans. Math.
-Software 20 (1994).
+A trial of length h is computed once whole, w, and once in two halves, f. Their difference is 2^p - 1 times the error of
+f; the result is f + (f - w) / (2^p - 1), one order better (local extrapolation). Crank-Nicolson returns f: where its
+steps ring, w has the opposite sign. The next length is the smaller of the one that the last error allows and the one
+that the trend of the last two predicts.
 
 Derivatives: where something fast happens at a time that depends on the parameters (a jump, an ignition), the derivative
 of the state at a fixed time is its speed there times the derivative of that time: huge for a while, and small again
-when it is over. Steps of fixed lengths lose what is left. So lengths move. With the speed f and the weights of the
-error norm, a half step of length h from the state u gets h + d,
+afterwards. With steps of fixed lengths the small remainder is lost. So lengths follow the state. With the speed f and
+the weights of the error norm, a half step of length h from the state u gets h + d,
 
     d = -q <f, u - u*> / <f, f>,     q = a / (a + SLACK),     a = h |f|,
 
 where u* is the same state as data: d is 0, and its derivative takes the state back to the plane through u* across the
 flow. The sum of all d so far is given back, in proportion to the lengths, over a last stretch of the interval that is
-as long as its speed allows. For a rate that is continuous no choice of d changes what the derivative converges to.
+as long as its speed allows. For a rate that is continuous no choice of d changes the limit of the derivative.
 Where it jumps, at a time or with the state, all of them converge to a derivative without the term of the jump: see
 discontinuities.py, which refuses these, and interruptions.py, which has the term.
 
-Two shadows take the same states. The first has the derivative of f + (w - e) (f - w), a little less extrapolated than
-the steps that count: where both meet, their difference is e times what extrapolation took away. What enters the second
-gets errors of the size of the tolerance: where terms cancel so that they matter, their difference is large. Tangents
-start in all three, and cotangents arrive from all three. The derivative is judged by the sum of both sizes, and that of
-the steps that count goes on. `spread` and `judge` are each other's transposes in this sense, so it holds in every mode
-and order. One shadow with both changes would be cheaper, but near a change of sign either hides the other: where two
-intervals met in the middle of a jump, derivatives that were wrong by 69 % passed.
+Two perturbed solutions have the same states. The first has the derivative of f + (w - e) (f - w), a little less
+extrapolated than the solution itself: where both end, their difference is e times the contribution of the
+extrapolation. The input of the second gets errors of the size of the tolerance: where terms cancel so that they matter,
+their difference is large. Tangents start in all three, and cotangents arrive from all three. The error of the
+derivative is the sum of both differences, and the derivative of the solution itself is returned. `perturb` and
+`evaluate` are each other's transposes in this sense, so it holds in every mode and order. One perturbed solution with
+both changes would be cheaper, but near a change of sign either hides the other: where two intervals met in the middle
+of a jump, derivatives that were wrong by 69 % passed.
 
-The values of all states are known by then. So what goes on the tape is how far they are off, which is 0 and has the
-derivative.
+The values of all states are known when the derivative is taken. So the tape records their deviations, which are 0 and
+have the derivative.
+
+References
+----------
+E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I (1993), II.4; K. Gustafsson, ACM Trans.
+Math. Software 20 (1994).
 """
+
+from __future__ import annotations
 
 from collections import deque
 from functools import reduce
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import autograd.numpy as anp
 import numpy as np
@@ -48,40 +54,57 @@ from sparsedp.autodiff.tape import cast, dtype_of, is_variable, isbox, linear, p
 from sparsedp.autodiff.tape_constants import constant
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
 from sparsedp.grid.space import Space
-from sparsedp.integrators.discontinuities import Inspector
+from sparsedp.integrators.discontinuities import RateInspector
 from sparsedp.integrators.problem import combine, later, unsided, untraced
 from sparsedp.integrators.runge_kutta import Explicit, Scheme
 
-__all__ = ["Adaptive", "Moving", "Taken", "inner", "relative"]
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+    from sparsedp.integrators.events import Event
+
+__all__ = ["AcceptedStep", "Adaptive", "FlatDeviation", "inner_product", "relative_sizes"]
 
 FITTING = "; give one number, or a tree like the state"  # advice about a floor
-SAFETY, SMALLEST, LARGEST = 0.9, 0.2, 5.0  # of one change of the length
+# Of one change of the length.
+SAFETY = 0.9
+SMALLEST = 0.2
+LARGEST = 5.0
 QUIET = 1e-2  # share of the tolerance below which an error shows no trend
 FLOOR = 0.1  # share of the largest entry of an array to which errors of small entries are compared
 LEAST = 1e-15  # share of the time so far below which no step is tried: its end would be rounded to its start
 TINY = 1e-25  # share of the interval, for the first step
-CAREFUL = 1e-3  # most that is tried first where the rate takes the time: it may be at rest at the start alone
+CAREFUL = 1e-3  # longest first step, as a share, where the rate takes the time: it may be at rest at the start alone
 MOST = 100_000  # trials in one interval
-WINDOW, FAR = 1000, 10  # trials at a pace that would need FAR * MOST for the rest: no use to go on
+WINDOW = 1000  # trials after which the pace is compared with that needed for the rest
+FAR = 10  # times MOST: trials that the rest would need, from which on the interval is given up
 
-QUADRATURE = {  # by order
+QUADRATURE = {  # nodes and weights by order
     1: ((0.5,), (1.0,)),
     2: ((0.0, 0.5, 1.0), (1 / 6, 4 / 6, 1 / 6)),
     3: ((0.0, 0.25, 0.5, 0.75, 1.0), (3 / 42, 16 / 42, 4 / 42, 16 / 42, 3 / 42)),
     4: ((0.0, 0.25, 0.5, 0.75, 1.0), (7 / 90, 32 / 90, 12 / 90, 32 / 90, 7 / 90)),
 }
-SLACK = 0.05  # relative change of the state in a half step that has it follow the flow by half
-EPSILON = 1e-3  # share of the shadows
-LESS = 0.0, EPSILON, 0.0  # how much less the steps that count and both shadows are extrapolated
-UNCERTAIN = 6.0  # error of a derivative without extrapolation, in units of tolerance^(p / (p + 1)), that is taken
+SLACK = 0.05  # relative change of the state in a half step at which its length follows the flow by half
+EPSILON = 1e-3  # share of the extrapolation that the first perturbed solution lacks
+LESS = (0.0, EPSILON, 0.0)  # how much less the solution and both perturbed ones are extrapolated
+UNCERTAIN = 6.0  # largest error of a derivative without extrapolation, in units of tolerance^(p / (p + 1))
 TIMES = 10.0  # error of a derivative in units of the tolerance: aim with extrapolation, limit without
 STEEP = 0.1  # relative uncertainty of the rate of change of an event, from which on it grazes its surface
 ROUNDING = 1e-12  # of the largest first derivative, below which a second one is 0 to rounding
-SHARE = 1e-4  # of what goes in: derivatives that are smaller are judged by it
+SHARE = 1e-4  # of the input: errors of derivatives that are smaller are relative to it
 
 
-class Taken(NamedTuple):
-    """A step: its share of the interval, the share done before, the state, that between its halves, and the new one."""
+class AcceptedStep(NamedTuple):
+    """An accepted step.
+
+    Attributes
+    ----------
+    length, done : float
+        Shares of the interval: of the step, and before it.
+    u, middle, new : tree
+        The states before it, between its halves, and after it; of radau: flat, the stages, flat.
+    """
 
     length: float
     done: float
@@ -115,150 +138,173 @@ class Adaptive(Scheme):
 
     window = WINDOW
 
-    def __init__(self, scheme, tolerance, floor, max_step=None):
+    def __init__(self, scheme: Scheme, tolerance: Any, floor: Any, max_step: float | None = None) -> None:
         super().__init__(scheme.problem, f"stepper({scheme.name})", scheme.order)
+        self.scheme: Any = scheme
+        self.info = scheme.info
+        self.dyadic = scheme.dyadic
+        self.tolerance = tolerance
+        self.floor = constant(floor)
         self.max_step = np.inf if max_step is None else float(max_step)
-        self.scheme, self.tolerance, self.floor, self.info = scheme, tolerance, constant(floor), scheme.info
-        self.taken, self.ratio, self.compared, self.dyadic = [], 2**self.order - 1, self.order, scheme.dyadic
+        self.taken: list[float] = []
+        self.compared = self.order
+        self.ratio: float = 2**self.order - 1
         self.weight = 0.0 if scheme.name == "crank_nicolson" else 1 / self.ratio
 
-    def __call__(self, *given):
-        """(u, params, t, h) -> the state after the interval h."""
-        self.check_tolerance(given[0])
-        return self._crossed(given, isbox)
+    def __call__(self, *arguments: Any) -> Any:
+        """Return the state after the interval h, from (u, params, t, h)."""
+        self.check_tolerance(arguments[0])
+        return self._state_after(arguments, isbox)
 
-    def _crossed(self, given, moves):
-        """The state after the interval; `moves`: which leaves of what is given have a derivative."""
-        traced = any(map(isbox, leaves(given)))
-        path, _, self.taken = self.path(untraced(given), traced)
-        return self._followed(path, given, moves) if traced else path[-1].new
+    def _state_after(self, arguments: tuple, has_derivative: Callable[[Any], bool]) -> Any:
+        """Return the state after the interval; `has_derivative`: of a leaf of the arguments."""
+        is_traced = any(map(isbox, leaves(arguments)))
+        path, _, self.taken = self.steps_over(untraced(arguments), is_traced)
+        if is_traced:
+            return self._differentiable_end(path, arguments, has_derivative)
+        return path[-1].new
 
-    def path(self, known, whole, watch=None):
-        """The steps over an interval, or up to the first event in it.
+    def steps_over(
+        self, arguments: tuple, keeps_all: bool, detector: Any = None
+    ) -> tuple[list[AcceptedStep], Event | None, list[float]]:
+        """Run the steps over an interval, or up to the first event in it.
 
         Parameters
         ----------
-        known : tuple
+        arguments : tuple
             (u, params, t, h), plain.
-        whole : bool
-            Whether all steps are wanted; else the last one alone.
-        watch : Watch, optional
+        keeps_all : bool
+            Whether all steps are returned; else the last one alone.
+        detector : EventDetector, optional
             Looks for events in each step.
 
         Returns
         -------
-        (list of Taken, Event or None, list of the lengths of all steps)
+        (list of AcceptedStep, Event or None, list of the lengths of all steps)
         """
-        crossing, taken = None, []
-        path: deque = deque(maxlen=None if whole else 1)
-        inspector = self.inspector(known)
-        u, params, t, h = known
+        path: deque = deque(maxlen=None if keeps_all else 1)
+        lengths = []
+        event = None
+        inspector = self.inspector(arguments)
+        u, params, t, h = arguments
         for step in self._steps(u, params, t, h, inspector):
-            crossing = watch and watch.crossing(self, step, known)
-            path.append(crossing.step if crossing else step)
-            if whole and inspector:  # beyond an event the rate is that at its surface
-                inspector.search(path[-1])
-            taken.append(path[-1].length)
+            crossing = detector.first_crossing(self, step, arguments) if detector else None
             if crossing:
+                step = crossing.step
+                event = crossing.event
+            path.append(step)
+            lengths.append(step.length)
+            if keeps_all and inspector:  # beyond an event the rate is evaluated at its surface
+                inspector.search(step)
+            if event:
                 break
-        if whole and inspector:
-            if inspector.found:
-                self._refuse_jump(*inspector.found[0])
-            place = inspector.unresolved()
+        if keeps_all and inspector:
+            if inspector.jumps:
+                self._refuse_jump(*inspector.jumps[0])
+            place = inspector.unresolved_step()
             if place is not None:
-                self._refuse_layer(path[place], known)
-        return [*path], crossing and crossing.event, taken
+                self._refuse_layer(path[place], arguments)
+        return [*path], event, lengths
+
+    # ------------------------------------------------------------ discontinuities of the rate
 
     @property
-    def timed(self):
-        """Whether the right-hand side depends on the time."""
-        return self.scheme.problem.driven or self.scheme.problem.moving
+    def takes_time(self) -> bool:
+        """Return whether the right-hand side depends on the time."""
+        return self.scheme.problem.rate_takes_time or self.scheme.problem.source_takes_time
 
     @property
-    def quadrature(self):
-        """Nodes and weights that an extrapolated step gives to a rate that depends on the time alone."""
+    def quadrature(self) -> tuple[Sequence[float], Sequence[float]]:
+        """Return nodes and weights of an extrapolated step for a rate that depends on the time alone."""
         if not self.weight:
             return (0.0, 0.5, 1.0), (0.25, 0.5, 0.25)
         return QUADRATURE[self.compared]
 
-    def _refuse_layer(self, step, known):
-        time = (known[2] or 0.0) + (step.done + 0.5 * step.length) * known[3]
-        raise DerivativeError(
-            f"the rate of {self.name} changes near t = {time:.6g} faster than steps with the tolerance "
-            f"{self.tolerance:g} resolve, and the derivative would miss a part of it; give a smaller tolerance or "
-            "max_step, or breaks= where it jumps"
-        )
-
     @property
-    def follows_path(self):
-        """Whether the rate along the steps tells how far they go: not where it is stiff."""
+    def follows_path(self) -> bool:
+        """Return whether the integral of the rate along the path predicts the step: not where it is stiff."""
         return isinstance(self.scheme, Explicit)
 
-    def inspector(self, known):
-        """What looks for jumps of the rate; None where it has none: an operator, and a source that is constant.
+    def inspector(self, arguments: tuple) -> RateInspector | None:
+        """Return what looks for jumps of the rate; None where it has none: an operator, and a constant source.
 
-        Also on ranks, whose fields it would have to gather.
+        None also on ranks, whose fields it would have to gather.
         """
         problem = self.scheme.problem
-        smooth = problem.rate is None and not problem.moving
-        return None if smooth or backend_of(leaves(known[0])) is not NUMPY else Inspector(self, *known[1:])
+        if problem.rate is None and not problem.source_takes_time:
+            return None
+        if backend_of(leaves(arguments[0])) is not NUMPY:
+            return None
+        return RateInspector(self, *arguments[1:])
 
-    def inner_state(self, step):
+    def inner_state(self, step: AcceptedStep) -> tuple[Any, float]:
         """Return a state inside a step, in the form that steps have, and the share of the step at which it is."""
         return step.middle, 0.5
 
-    def _refuse_jump(self, time, in_time):
+    def _refuse_jump(self, time: float, is_in_time: bool) -> None:
         cure = f"breaks=[{time:.6g}], or breaks=lambda params: [...] where it moves"
-        if not in_time:
+        if not is_in_time:
             cure = "events=lambda u, params, t: ... with a function that is 0 there"
-            if self.timed:  # close to a state of 0 the two are hard to tell apart
+            if self.takes_time:  # close to a state of 0 the two are hard to tell apart
                 cure += f", or breaks=[{time:.6g}] if it jumps at that time in every state"
         raise DerivativeError(
             f"the rate of {self.name} jumps at t = {time:.9g}, and the derivative of steps across it lacks the term of "
             f"the jump; write {cure}"
         )
 
-    def interval(self, u, params, t, h):
-        """What crosses an interval: a scheme, and what it is given."""
+    def _refuse_layer(self, step: AcceptedStep, arguments: tuple) -> None:
+        time = (arguments[2] or 0.0) + (step.done + 0.5 * step.length) * arguments[3]
+        raise DerivativeError(
+            f"the rate of {self.name} changes near t = {time:.6g} faster than steps with the tolerance "
+            f"{self.tolerance:g} resolve, and the derivative would miss a part of it; give a smaller tolerance or "
+            "max_step, or breaks= where it jumps"
+        )
+
+    # ------------------------------------------------------------ for steps that stop at breaks and events
+
+    def interval(self, u: Any, params: Any, t: Any, h: Any) -> tuple[Adaptive, tuple]:
+        """Return the scheme that crosses an interval, and its arguments."""
         return self, (u, params, t, h)
 
-    def rerun(self, path, given, event):
-        """The ends of the steps that were taken: (state, time of the event or None) for each run.
+    def replay(self, path: list[AcceptedStep], starts: Sequence[tuple], event: Event | None) -> list[tuple]:
+        """Return the ends of accepted steps: (state, time of the event or None) for each perturbed solution.
 
         Parameters
         ----------
-        path : list of Taken
-        given : list of tuples
-            (u, params, t, h) of each run: of equal value, with derivatives of their own.
+        path : list of AcceptedStep
+        starts : list of tuples
+            (u, params, t, h) of each solution: of equal value, with derivatives of their own.
         event : Event or None
-            What ended the path.
+            At the end of the path.
         """
-        _, params, t, h = untraced(given[0])
-        slopes = self._slopes(path, params, t, h, event)
-        return [self._again(path, slopes, less, event, *start) for less, start in zip(LESS, given, strict=True)]
+        _, params, t, h = untraced(starts[0])
+        slopes = self._length_slopes(path, params, t, h, event)
+        return [self._replayed(path, slopes, less, event, *start) for less, start in zip(LESS, starts, strict=True)]
 
-    def tree(self, u):
-        """The state of a step as the user knows it."""
+    def tree(self, u: Any) -> Any:
+        """Return the state of a step as the user knows it."""
         return u
 
-    def rounded(self, u):
-        """The state at the end of an interval."""
+    def rounded(self, u: Any) -> Any:
+        """Return the state at the end of an interval."""
         return u
 
-    def rate(self, u, params, t):
-        """The rate at a state of a step."""
+    def rate(self, u: Any, params: Any, t: Any) -> Any:
+        """Return the rate at a state of a step."""
         return self.problem(u, params, t)
 
-    def partial(self, step, known, length):
-        """The step from the same state with another length, as a share of the interval; None where there is none."""
-        _, params, t, h = known
+    def partial_step(self, step: AcceptedStep, arguments: tuple, length: float) -> AcceptedStep | None:
+        """Return the step from the same state with another length, a share of the interval; None if there is none."""
+        _, params, t, h = arguments
         middle, new, _ = self._trial(step.u, params, later(t, step.done * h), length, h)
-        return None if new is None else Taken(length, step.done, step.u, middle, new)
+        return None if new is None else AcceptedStep(length, step.done, step.u, middle, new)
 
-    def check_tolerance(self, u):
-        """Refuse a floor that does not fit the state, and digits that it cannot hold: steps would shrink to nothing.
+    # ------------------------------------------------------------ error control
 
-        The ledger learns the tolerance: a check of a gradient compares its gap with it.
+    def check_tolerance(self, u: Any) -> None:
+        """Refuse a floor that does not fit the state, and a tolerance below its rounding: steps would shrink to zero.
+
+        The tolerance is recorded: a check of a gradient compares its gap with it.
         """
         thread.controlled += 1
         note(self.name, "tolerance", self.tolerance)
@@ -278,39 +324,51 @@ class Adaptive(Scheme):
                     f"rounding is {rounding:.1e}; take a larger tolerance or write u.astype(float)"
                 )
 
-    def _steps(self, u, params, t, h, inspector):
-        """The steps over the interval, one after the other."""
-        length, done, count, mark = self._first(u, params, t, h), 0.0, 0, 0.0
-        before, most, power = None, LARGEST, -1 / (self.compared + 1)
+    def _steps(self, u: Any, params: Any, t: Any, h: Any, inspector: RateInspector | None) -> Iterable[AcceptedStep]:
+        """Yield the accepted steps over the interval."""
+        length = self._first_length(u, params, t, h)
         longest = self.max_step / h
-        left_zero = None  # the place at which a step that was refused would have changed an array that is 0
+        done = 0.0
+        done_at_window = 0.0  # at the end of the last window of trials
+        count = 0
+        last = None  # length and error of the last accepted step
+        most = LARGEST
+        power = -1 / (self.compared + 1)
+        left_zero = None  # the place at which a refused step would have changed an array that is 0
         for trial in range(1, MOST + 1):
-            left = 1.0 - done
-            length = self._allowed(min(length, longest), left)
+            rest = 1.0 - done
+            length = self._allowed(min(length, longest), rest)
             middle, new, error = self._trial(u, params, later(t, done * h), length, h, inspector)
             change = SAFETY * max(error, 1e-10) ** power
-            accepted = error <= 1
-            if accepted and inspector:
-                shorter = inspector.shortened(Taken(length, done, u, middle, new))
+            is_accepted = error <= 1
+            if is_accepted and inspector:
+                shorter = inspector.shorter_share(AcceptedStep(length, done, u, middle, new))
                 if shorter is not None:
-                    accepted, change = False, shorter
-            if not accepted and new is not None and self._leaves_zero(u, new):
+                    is_accepted = False
+                    change = shorter
+            if not is_accepted and new is not None and self._leaves_zero(u, new):
                 left_zero = done
-            if accepted:
-                yield Taken(length, done, u, middle, new)
+            if is_accepted:
+                yield AcceptedStep(length, done, u, middle, new)
                 count += 1
-                u, done, error = new, done + length if length < left else 1.0, max(error, QUIET)
+                u = new
+                done = done + length if length < rest else 1.0
+                error = max(error, QUIET)
                 if done == 1.0:
                     return
-                if before is not None:  # errors go on growing as they did
-                    change = min(change, change * length / before[0] * (error / before[1]) ** power)
-                before = length, error
-            length *= float(np.clip(change, SMALLEST if accepted or error > 1 else 0.0, most))
-            most = LARGEST if accepted else 1.0  # the step after a refused one is not made longer
-            turn = trial % self.window == 0
-            if length < max(LEAST * done, TINY) or turn and (1.0 - done) * self.window > FAR * MOST * (done - mark):
+                if last is not None:  # errors continue to grow at the same pace
+                    last_length, last_error = last
+                    change = min(change, change * length / last_length * (error / last_error) ** power)
+                last = length, error
+            least = SMALLEST if is_accepted or error > 1 else 0.0
+            length *= float(np.clip(change, least, most))
+            most = LARGEST if is_accepted else 1.0  # the step after a refused one does not become longer
+            if length < max(LEAST * done, TINY):
                 break
-            mark = done if turn else mark
+            if trial % self.window == 0:
+                if (1.0 - done) * self.window > FAR * MOST * (done - done_at_window):
+                    break
+                done_at_window = done
         cure = "take a larger tolerance, a method for stiff problems, or an interval that ends before the solution does"
         if left_zero is not None and done - left_zero < 1e-3:
             cure = (
@@ -322,21 +380,18 @@ class Adaptive(Scheme):
             f"after {count} steps; {cure}"
         )
 
-    def _leaves_zero(self, u, new):
+    def _leaves_zero(self, u: Any, new: Any) -> bool:
         """Whether a step starts to change an array that is 0, whose errors are relative to its size alone."""
-        arrays = zip(leaves(u), leaves(new), self._floors(u), strict=True)
-        for before, after, floor in arrays:
-            still, moved = (np.max(np.abs(leaf), initial=0.0) for leaf in (before, after))
-            if floor is None and still == 0 and moved != 0:
+        for before, after, floor in zip(leaves(u), leaves(new), self._floors(u), strict=True):
+            is_zero = np.max(np.abs(before), initial=0.0) == 0
+            if floor is None and is_zero and np.max(np.abs(after), initial=0.0) != 0:
                 return True
         return False
 
-    def _first(self, u, params, t, h):
-        """A first length from the size of the rate: one that changes the state by a hundredth."""
-        size, speed = (
-            float(np.max([np.max(np.abs(leaf), initial=0.0) for leaf in leaves(tree)], initial=0.0))
-            for tree in (u, self.problem(u, params, t))
-        )
+    def _first_length(self, u: Any, params: Any, t: Any, h: Any) -> float:
+        """Return a first length from the size of the rate: one that changes the state by a hundredth."""
+        size = _largest_entry(u)
+        speed = _largest_entry(self.problem(u, params, t))
         if not np.isfinite(speed):
             raise NonFiniteError(
                 f"the rate of {self.name} must be finite at the state given; take a state in its domain"
@@ -344,31 +399,38 @@ class Adaptive(Scheme):
         length = 0.01 * (size or 1.0) / (speed * float(h)) if speed > 0 else 1.0
         return min(max(1e3 * TINY, length), CAREFUL if self.problem.timed else 1.0)
 
-    def _allowed(self, length, left):
-        """At most what is left, and not just short of it."""
-        if not self.dyadic:
-            return left if length > 0.99 * left else min(length, 0.5 * left) if length > 0.5 * left else length
-        return 2.0 ** float(np.floor(np.log2(min(length, left))))
+    def _allowed(self, length: float, rest: float) -> float:
+        """Return a length of at most the rest of the interval, and not slightly less."""
+        if self.dyadic:
+            return 2.0 ** float(np.floor(np.log2(min(length, rest))))
+        if length > 0.99 * rest:
+            return rest
+        if length > 0.5 * rest:
+            return min(length, 0.5 * rest)
+        return length
 
-    def _trial(self, u, params, t, length, h, inspector=None):
-        """The state between two half steps, the new state, and the error of the halves in units of the tolerance."""
+    def _trial(
+        self, u: Any, params: Any, t: Any, length: float, h: Any, inspector: RateInspector | None = None
+    ) -> tuple[Any, Any, float]:
+        """Return the state between two half steps, the new state, and the error in units of the tolerance."""
         half = 0.5 * length * h
         scheme = self.scheme
-        # An inspector needs the rates at the start and in the middle, too: explicit steps begin with them.
-        shared = inspector is not None and isinstance(scheme, Explicit)
+        middle_time = later(t, half)
         try:
-            with np.errstate(all="ignore"):  # a step that is too long is refused, whatever it gave
-                if shared:
-                    first = inspector.once(u, t)
+            with np.errstate(all="ignore"):  # a step that is too long is refused in any case
+                # An inspector needs the rates at the start and in the middle, too: explicit steps begin with them.
+                if inspector is not None and isinstance(scheme, Explicit):
+                    first = inspector.rate_at_state(u, t)
                     middle = scheme(u, params, t, half, first)
-                    fine = scheme(middle, params, later(t, half), half, inspector.once(middle, later(t, half)))
+                    second = inspector.rate_at_state(middle, middle_time)
+                    fine = scheme(middle, params, middle_time, half, second)
                     whole = scheme(u, params, t, half + half, first)
                 else:
                     middle = scheme(u, params, t, half)
-                    fine = scheme(middle, params, later(t, half), half)
+                    fine = scheme(middle, params, middle_time, half)
                     whole = scheme(u, params, t, half + half)
                 error = self._error(u, fine, whole)
-                new = self.joined(fine, whole, self.weight)
+                new = self.extrapolated(fine, whole, self.weight)
         except (UnstableStepError, NonFiniteError, ConvergenceError):
             if length * SMALLEST < TINY:
                 raise
@@ -376,44 +438,54 @@ class Adaptive(Scheme):
         return middle, new, error if np.isfinite(error) else np.inf
 
     @staticmethod
-    def joined(fine, whole, weight):
-        """fine + weight (fine - whole)."""
+    def extrapolated(fine: Any, whole: Any, weight: float) -> Any:
+        """Return fine + weight (fine - whole)."""
         return combine(fine, (weight, fine), (-weight, whole)) if weight else fine
 
-    def _floors(self, u):
-        """A floor for each array of the state; a number or None may stand for a whole branch."""
+    def _floors(self, u: Any) -> list:
+        """Return a floor for each array of the state; a number or None may stand for a whole branch."""
         return paired(self.floor, u, "floor", advice=FITTING, prefix=is_uniform)
 
-    def sizes(self, *states):
-        """For each array of the state |u| + floor, to which its errors are compared."""
-        columns = list(zip(*map(leaves, states), strict=True))
-        sizes = [reduce(np.maximum, map(np.abs, parts)) for parts in columns]
-        pairs = zip(sizes, self._floors(states[0]), strict=True)
-        return [size + (FLOOR * np.max(size, initial=0.0) if floor is None else floor) for size, floor in pairs]
+    def sizes(self, *states: Any) -> list:
+        """Return |u| + floor, to which errors are compared, for each array; the larger of several states."""
+        columns = zip(*map(leaves, states), strict=True)
+        sizes = []
+        for column, floor in zip(columns, self._floors(states[0]), strict=True):
+            size = reduce(np.maximum, map(np.abs, column))
+            sizes.append(size + (FLOOR * np.max(size, initial=0.0) if floor is None else floor))
+        return sizes
 
-    def _error(self, u, new, whole):
-        rows = zip(self.sizes(u, new), leaves(new), leaves(whole), strict=True)
-        shares = [np.where(one == other, 0.0, np.abs(one - other) / size) for size, one, other in rows]
-        count = sum(share.size for share in shares)
-        return float(np.linalg.norm([*map(np.linalg.norm, shares)])) / (
-            max(count, 1) ** 0.5 * self.tolerance * self.ratio
-        )
+    def _error(self, u: Any, new: Any, whole: Any) -> float:
+        """Return the error of two half steps in units of the tolerance."""
+        norms = []
+        count = 0
+        for size, fine, coarse in zip(self.sizes(u, new), leaves(new), leaves(whole), strict=True):
+            share = np.where(fine == coarse, 0.0, np.abs(fine - coarse) / size)
+            norms.append(np.linalg.norm(share))
+            count += share.size
+        return float(np.linalg.norm(norms)) / (max(count, 1) ** 0.5 * self.tolerance * self.ratio)
 
-    def _followed(self, path, given, moves):
-        """The state at the end of the path, with a derivative that is judged."""
-        known = untraced(given)
-        start = Moving(given, moves, [*self.sizes(path[0].u), *map(relative, leaves(known[1:]))])
-        end = Moving(path[-1].new, is_variable, self.sizes(path[0].u, path[-1].new))
-        spread, judge = linear(f"{self.name}.variation", *self.doors(len(path)))
-        return end.at(judge(self._runs(path, known, start, end, spread(start.off(given)))))
+    # ------------------------------------------------------------ derivatives of the accepted steps
 
-    def _runs(self, path, known, start, end, entered):
-        """How far the ends of the three runs are off, from how far their starts are."""
-        ends = self.rerun(path, [start.at(x) for x in entered], None)
-        return anp.array([end.off(new) for new, _ in ends])
+    def _differentiable_end(self, path: list, arguments: tuple, has_derivative: Callable[[Any], bool]) -> Any:
+        """Return the state at the end of the path, with a derivative whose error is checked."""
+        plain_arguments = untraced(arguments)
+        sizes = [*self.sizes(path[0].u), *map(relative_sizes, leaves(plain_arguments[1:]))]
+        start = FlatDeviation(arguments, has_derivative, sizes)
+        end = FlatDeviation(path[-1].new, is_variable, self.sizes(path[0].u, path[-1].new))
+        perturb, evaluate = linear(f"{self.name}.variation", *self.perturbed_solutions(len(path)))
+        entered = perturb(start.deviation(arguments))
+        return end.tree(evaluate(self._deviations_at_end(path, plain_arguments, start, end, entered)))
 
-    def section(self, u, rates, half):
-        """The derivative of d for each array of the state, and the speed, as a share of the state's size by time."""
+    def _deviations_at_end(
+        self, path: list, arguments: tuple, start: FlatDeviation, end: FlatDeviation, entered: Any
+    ) -> Any:
+        """Return the deviations of the three solutions at the end, from those at the start."""
+        ends = self.replay(path, [start.tree(x) for x in entered], None)
+        return anp.array([end.deviation(new) for new, _ in ends])
+
+    def section(self, u: Any, rates: Sequence, half: float) -> tuple[list, float]:
+        """Return the derivative of d in each array of the state, and the speed: share of the state's size per time."""
         sizes = [np.where(size > 0, size, np.inf) for size in self.sizes(u)]
         count = max(sum(size.size for size in sizes), 1)
         rows = [np.conj(rate / size) / size / count for rate, size in zip(rates, sizes, strict=True)]
@@ -421,188 +493,236 @@ class Adaptive(Scheme):
         speed = np.sqrt(square)
         return [-half / (speed * half + SLACK) / (speed or 1.0) * row for row in rows], speed
 
-    def _slopes(self, path, params, t, h, event):
-        """(for each step the derivatives of d at both halves, None where the shift is given back; its time)."""
-        rows, speeds = [], []
+    def _length_slopes(self, path: list, params: Any, t: Any, h: Any, event: Event | None) -> tuple[list, float]:
+        """Return the derivatives of the lengths d.
+
+        Returns
+        -------
+        rows : list
+            For each step the derivatives of d at both halves; None where the sum of all d is given back.
+        rest : float
+            The time of these last steps.
+        """
+        rows: list = []
+        speeds = []
         for step in path[:-1] if event else path:
-            half, at = 0.5 * step.length * h, later(t, step.done * h)
-            places = (step.u, at), (step.middle, later(at, half))
-            (first, speed), (second, _) = (self.section(u, leaves(self.problem(u, params, t)), half) for u, t in places)
+            half = 0.5 * step.length * h
+            start = later(t, step.done * h)
+            rates = leaves(self.problem(step.u, params, start))
+            first, speed = self.section(step.u, rates, half)
+            rates = leaves(self.problem(step.middle, params, later(start, half)))
+            second, _ = self.section(step.middle, rates, half)
             rows.append((first, second))
             speeds.append(speed)
         if event:  # its time is free: nothing is given back
             return [*rows, None], np.inf
         rest = h * (1.0 - np.array([step.done for step in path]))
-        turn = int(np.argmin(np.maximum.accumulate(speeds[::-1])[::-1] + 1 / rest))  # the fastest from each step on
+        fastest = np.maximum.accumulate(speeds[::-1])[::-1]  # from each step on
+        turn = int(np.argmin(fastest + 1 / rest))
         return rows[:turn] + [None] * (len(path) - turn), rest[turn]
 
-    def _again(self, path, slopes, share, event, u, params, t, h):
-        """The steps that were taken; the new state of each has the value that is known. And the time of an event."""
+    def _replayed(
+        self, path: list, slopes: tuple, less: float, event: Event | None, u: Any, params: Any, t: Any, h: Any
+    ) -> tuple[Any, Any]:
+        """Run the accepted steps again, with derivatives; return the state and the time of the event.
+
+        Each new state has its known value. `less`: how much less the steps are extrapolated.
+        """
         rows, rest = slopes
-        shift = back = 0.0
+        shift: Any = 0.0  # the sum of all d
+        returned: Any = 0.0  # the share of it that a time unit gives back
         for step, row in zip(path, rows, strict=True):
-            half, at = 0.5 * step.length * h, later(later(t, step.done * h), shift)
+            half = 0.5 * step.length * h
+            start = later(later(t, step.done * h), shift)
             if event and step is path[-1]:
-                return self._until(event, step, share, u, params, at, half)
-            bend = _bend(u, row[0]) if row else -back * plain(half)
-            middle = _at(self.scheme(u, params, at, half + bend), step.middle)
-            other = _bend(middle, row[1]) if row else -back * plain(half)
-            fine = self.scheme(middle, params, later(later(at, half), bend), half + other)
-            whole = self.scheme(u, params, at, half + bend + (half + other))
-            u, shift = _at(self.joined(fine, whole, self.weight - share), step.new), shift + bend + other
-            back = shift / rest if row else back
+                return self._state_at_event(event, step, less, u, params, start, half)
+            first = _length_shift(u, row[0]) if row else -returned * plain(half)
+            middle = _with_values(self.scheme(u, params, start, half + first), step.middle)
+            second = _length_shift(middle, row[1]) if row else -returned * plain(half)
+            fine = self.scheme(middle, params, later(later(start, half), first), half + second)
+            whole = self.scheme(u, params, start, half + first + (half + second))
+            u = _with_values(self.extrapolated(fine, whole, self.weight - less), step.new)
+            shift = shift + first + second
+            if row:
+                returned = shift / rest
         return u, None
 
-    def _until(self, event, step, share, u, params, t, half):
-        """The state and the time at the end of a step that an event ends."""
-        weight = self.weight - share
+    def _state_at_event(
+        self, event: Event, step: AcceptedStep, less: float, u: Any, params: Any, t: Any, half: Any
+    ) -> tuple[Any, Any]:
+        """Return the state and the time at the end of a step that an event ends."""
+        weight = self.weight - less
 
-        def ahead(point, bend):
-            """The state after a step of length 2 half + bend, and the time."""
+        def advanced(point: tuple, change: Any) -> tuple[Any, Any]:
+            """Return the state and the time after a step of length 2 half + change."""
             u, params, t = point
-            length = half + 0.5 * bend
-            middle = _at(self.scheme(u, params, t, length), step.middle)
+            length = half + 0.5 * change
+            middle = _with_values(self.scheme(u, params, t, length), step.middle)
             fine = self.scheme(middle, params, t + length, length)
             whole = self.scheme(u, params, t, length + length)
-            return _at(self.joined(fine, whole, weight), step.new), t + (length + length)
+            return _with_values(self.extrapolated(fine, whole, weight), step.new), t + (length + length)
 
-        def value(point, bend):
-            new, time = ahead(point, bend)
+        def value(point: tuple, change: Any) -> Any:
+            new, time = advanced(point, change)
             return event.value(new, unsided(point[1]), time)
 
         point = u, params, t
-        known = untraced(point)
-        change = float(push(lambda bend: 1.0 * value(known, bend), 0.0, [1.0])[1])
-        if not share:
-            self._check_transversal(event, step, known, change, 2.0 * half)
-        bend = 0.0
-        for _ in traces_of(leaves(point)):  # each one makes the derivative of one more order exact
-            found = value(point, bend)
-            bend = bend - (found - plain(found)) / change
-        return ahead(point, bend)
+        plain_point = untraced(point)
+        slope = float(push(lambda change: 1.0 * value(plain_point, change), 0.0, [1.0])[1])
+        if not less:
+            self._check_transversal(event, step, plain_point, slope, 2.0 * half)
+        change: Any = 0.0
+        for _ in traces_of(leaves(point)):  # each iteration makes the derivative of one more order exact
+            residual = value(point, change)
+            change = change - (residual - plain(residual)) / slope
+        return advanced(point, change)
 
-    def _check_transversal(self, event, step, known, change, length):
+    def _check_transversal(self, event: Event, step: AcceptedStep, start: tuple, slope: float, length: Any) -> None:
         """Refuse the derivative of an event where the solution, to the tolerance, only touches the surface."""
-        _, params, t = known
-        u, new = self.tree(step.u), self.tree(step.new)
+        _, params, t = start
+        u = self.tree(step.u)
         of_state, of_time = event.gradient(u, unsided(params), t)
-        before = of_time + inner(of_state, self.tree(self.rate(step.u, params, t)))
-        self.check_steep(event, new, params, t + length, change, (change - before) / length)
+        before = of_time + inner_product(of_state, self.tree(self.rate(step.u, params, t)))
+        self.check_steep(event, self.tree(step.new), params, t + length, slope, (slope - before) / length)
 
-    def check_steep(self, event, u, params, t, change, bend):
-        """Refuse an event whose rate of change, with the derivative `bend`, is zero to the tolerance."""
+    def check_steep(self, event: Event, u: Any, params: Any, t: Any, slope: float, curvature: Any) -> None:
+        """Refuse an event whose rate of change `slope`, with the derivative `curvature`, is zero to the tolerance."""
         of_state, _ = event.gradient(u, unsided(params), t)
         sizes = flatten(u)[1](Adaptive.sizes(self, u))
-        uncertain = self.tolerance * inner(mapped(_magnitude, of_state), sizes)
-        if change == 0 or abs(bend) * uncertain > STEEP * change**2:
+        uncertain = self.tolerance * inner_product(mapped(_magnitude, of_state), sizes)
+        if slope == 0 or abs(curvature) * uncertain > STEEP * slope**2:
             raise DerivativeError(
                 f"{event.name} of {self.name} grazes its surface at t = {t:.9g}: its rate of change there, "
-                f"{change:.3g}, is zero to the tolerance {self.tolerance:g}, so that its time has no derivative; "
+                f"{slope:.3g}, is zero to the tolerance {self.tolerance:g}, so that its time has no derivative; "
                 "give another event or parameter, or a smaller tolerance"
             )
 
-    def doors(self, count):
-        """(spread, judge): where the three runs part, and where they meet; on plain arrays."""
+    def perturbed_solutions(self, count: int) -> tuple[Callable, Callable]:
+        """Return the functions `perturb` and `evaluate` of plain arrays, for a number of steps.
+
+        `perturb` returns the deviations with which the solution and two perturbed ones begin; `evaluate` returns the
+        deviation of the solution at the end, and refuses it if the perturbed ones differ too much.
+        """
         share = self.compared / (self.compared + 1)
         limit = UNCERTAIN * self.tolerance**share if self.weight else TIMES * self.tolerance
-        unit, scale, largest = EPSILON * self.ratio, [0.0], [0.0]  # of the last values, and of all
+        unit = EPSILON * self.ratio
+        scale = 0.0  # of the last input
+        largest = 0.0  # of all inputs
 
-        def spread(x):
-            scale[0] = np.max(np.abs(x), initial=0.0)
-            largest[0] = max(largest[0], scale[0])
-            return np.stack([x, x, x * (1 + unit * limit / TIMES * np.random.default_rng(0).uniform(-1, 1, x.size))])
+        def perturb(x: np.ndarray) -> np.ndarray:
+            nonlocal scale, largest
+            scale = np.max(np.abs(x), initial=0.0)
+            largest = max(largest, scale)
+            noise = np.random.default_rng(0).uniform(-1, 1, x.size)
+            return np.stack([x, x, x * (1 + unit * limit / TIMES * noise)])
 
-        def judge(arrived):
-            derivative, *shadows = arrived
-            size = max(np.max(np.abs(derivative), initial=0.0), SHARE * scale[0])
-            error = np.max(sum(np.abs(shadow - derivative) for shadow in shadows), initial=0.0) / unit
-            # What comes in not finite was named where it came up.
-            if error <= limit * size or not np.isfinite(scale[0]):
+        def evaluate(ends: np.ndarray) -> np.ndarray:
+            derivative, *perturbed = ends
+            size = max(np.max(np.abs(derivative), initial=0.0), SHARE * scale)
+            error = np.max(sum(np.abs(other - derivative) for other in perturbed), initial=0.0) / unit
+            # An input that is not finite is named where it arises.
+            if error <= limit * size or not np.isfinite(scale):
                 return derivative.copy()
-            # Without extrapolation errors fall more slowly than the tolerance: a smaller one is refused all the more.
-            cure = "give a smaller floor or tolerance" if self.weight else "take tr_bdf2, which extrapolates"
-            if size < ROUNDING * largest[0]:
+            if size < ROUNDING * largest:
                 raise DerivativeError(
                     f"a second derivative of {self.name} over {count} steps is 0 to rounding, which error control "
                     "cannot tell from an error: the result does not depend on it to second order, as that of a ball "
                     "before its first bounce; leave it out, or take fixed steps"
                 )
-            share = number_beside(error / size, limit, float(f"{limit:.1e}"), digits=1, style="e")
+            # Without extrapolation errors fall more slowly than the tolerance: a smaller one is refused all the more.
+            cure = "give a smaller floor or tolerance" if self.weight else "take tr_bdf2, which extrapolates"
+            shown = number_beside(error / size, limit, float(f"{limit:.1e}"), digits=1, style="e")
             raise DerivativeError(
-                f"the derivative of {self.name} over {count} steps is uncertain by {share} of its "
+                f"the derivative of {self.name} over {count} steps is uncertain by {shown} of its "
                 f"size, more than the {limit:.1e} that its tolerance {self.tolerance:g} allows; {cure}, end no "
                 "interval in the middle of a fast change, or take fixed steps"
             )
 
-        return spread, judge
+        return perturb, evaluate
 
 
-class Moving:
-    """The leaves of a tree that have a derivative, and how far they are off their values, as one flat array of floats.
+class FlatDeviation:
+    """The deviations of the differentiated leaves of a tree from their values, as one flat array of floats.
 
     Parameters
     ----------
     tree : tree
-    moves : callable
+    has_derivative : callable
         Whether a leaf has a derivative.
     sizes : list
-        For each leaf the unit of each entry; 1 for 0.
+        For each leaf the unit of each entry; 1 in place of 0.
     """
 
-    def __init__(self, tree, moves, sizes):
-        self.found, self.rebuild = flatten(tree)
-        self.form = self.rebuild(range(len(self.found)))
-        rows = enumerate(zip(self.found, sizes, strict=True))
-        self.moving = [(n, plain(leaf), np.where(size > 0, size, 1.0)) for n, (leaf, size) in rows if moves(leaf)]
-        self.units = [size for *_, size in self.moving]
-        shapes = [np.shape(leaf) for _, leaf, _ in self.moving for _ in range(1 + np.iscomplexobj(leaf))]
+    def __init__(self, tree: Any, has_derivative: Callable[[Any], bool], sizes: Sequence) -> None:
+        self.entries, self.rebuild = flatten(tree)
+        self.form = self.rebuild(range(len(self.entries)))
+        self.differentiated = []  # (place, value, unit)
+        self.units = []
+        shapes = []
+        for place, (leaf, size) in enumerate(zip(self.entries, sizes, strict=True)):
+            if has_derivative(leaf):
+                unit = np.where(size > 0, size, 1.0)
+                self.differentiated.append((place, plain(leaf), unit))
+                self.units.append(unit)
+                shapes += [np.shape(leaf)] * (2 if np.iscomplexobj(plain(leaf)) else 1)
         self.space = Space(None, parts=shapes)
 
-    def off(self, tree):
-        """Tree -> flat."""
-        found, parts = paired(tree, self.form, "rate"), []
-        for place, leaf, size in self.moving:
-            part = replicated(_off(found[place], leaf) / size)
-            parts += [anp.real(part), anp.imag(part)] if np.iscomplexobj(leaf) else [part]
+    def deviation(self, tree: Any) -> Any:
+        """Return the deviations of a tree, flat."""
+        entries = paired(tree, self.form, "rate")
+        parts = []
+        for place, value, unit in self.differentiated:
+            part = replicated(_deviation(entries[place], value) / unit)
+            if np.iscomplexobj(value):
+                parts += [anp.real(part), anp.imag(part)]
+            else:
+                parts.append(part)
         return self.space.join(*parts)
 
-    def at(self, flat):
-        """Flat -> tree."""
-        found, parts = list(self.found), iter(self.space.split(flat))
-        for place, leaf, size in self.moving:
-            part = next(parts) + 1j * next(parts) if np.iscomplexobj(leaf) else next(parts)
-            found[place] = leaf + cast(size * part, dtype_of(leaf))
-        return self.rebuild(found)
+    def tree(self, flat: Any) -> Any:
+        """Return the tree with these deviations."""
+        entries = list(self.entries)
+        parts = iter(self.space.split(flat))
+        for place, value, unit in self.differentiated:
+            part = next(parts)
+            if np.iscomplexobj(value):
+                part = part + 1j * next(parts)
+            entries[place] = value + cast(unit * part, dtype_of(value))
+        return self.rebuild(entries)
 
 
-def _off(leaf, known):
-    """0 with the derivative of a leaf, in double precision."""
-    off = leaf - known
-    return cast(off, np.result_type(dtype_of(off), float))
+def _deviation(leaf: Any, value: Any) -> Any:
+    """Return 0 with the derivative of a leaf, in double precision."""
+    deviation = leaf - value
+    return cast(deviation, np.result_type(dtype_of(deviation), float))
 
 
-def _at(tree, known):
-    """The same tree with the values of another, which are nearly the same, and its own derivative."""
-    return mapped(lambda leaf, value: leaf - plain(leaf) + value if isbox(leaf) else value, tree, known)
+def _with_values(tree: Any, values: Any) -> Any:
+    """Return a tree with other values, which are nearly the same, and its own derivative."""
+    return mapped(lambda leaf, value: leaf - plain(leaf) + value if isbox(leaf) else value, tree, values)
 
 
-def _bend(u, rows):
-    """d: 0, with its derivative."""
+def _length_shift(u: Any, rows: Sequence) -> Any:
+    """Return d: 0, with its derivative."""
     pairs = zip(leaves(u), rows, strict=True)
-    return sum(anp.sum(anp.real(row * _off(leaf, plain(leaf)))) for leaf, row in pairs if isbox(leaf))
+    return sum(anp.sum(anp.real(row * _deviation(leaf, plain(leaf)))) for leaf, row in pairs if isbox(leaf))
 
 
-def _magnitude(leaf):
+def _magnitude(leaf: Any) -> Any:
     return None if leaf is None else np.abs(leaf)
 
 
-def inner(cotangent, tangent):
-    """The real product of two trees; None in the first one counts for nothing."""
+def _largest_entry(tree: Any) -> float:
+    return float(np.max([np.max(np.abs(leaf), initial=0.0) for leaf in leaves(tree)], initial=0.0))
+
+
+def inner_product(cotangent: Any, tangent: Any) -> float:
+    """Return the real inner product of two trees; None in the first one counts as 0."""
     pairs = zip(leaves(cotangent), leaves(tangent), strict=True)
     return float(sum(np.sum(np.real(row * rate)) for row, rate in pairs if row is not None))
 
 
-def relative(leaf):
-    """What a relative change is relative to: the entry itself, and where it is 0, the largest one."""
+def relative_sizes(leaf: Any) -> Any:
+    """Return the unit of relative changes of each entry: the entry itself, and where it is 0, the largest one."""
     size = np.abs(leaf) if is_variable(leaf) else 1.0
     return np.where(size > 0, size, np.max(size, initial=0.0))

@@ -1,52 +1,58 @@
 """Jumps, pulses and steep layers of a rate inside a step with error control.
 
-An error estimate compares evaluations of the rate at a few times. What happens between them it does not see: backward
-Euler, whole and in halves, never looks at the start of a step. So the rate is also evaluated at both ends and in the
+An error estimate compares evaluations of the rate at a few times. Between them it sees nothing: backward Euler, whole
+and in halves, never evaluates the rate at the start of a step. So the rate is also evaluated at both ends and in the
 middle of each step, and where it depends on the time at further times in between. Where nearly all of its change lies
-in a small part of the step, this part is cut into eight, the one with the largest deviation from an even change is cut
-again, and so on. Along the way the deviation falls by 64 in each cut for a smooth rate, by 8 at a kink, and not at all
+in a small part of the step, this part is divided into eight, the one with the largest deviation from an even change is
+divided again, and so on. In each division the deviation falls by 64 for a smooth rate, by 8 at a kink, and not at all
 at a jump.
 
 A step across a jump of size J is refused until length * J is below the tolerance, a step across a layer until it is
 resolved. Values then meet the tolerance. The derivative of steps across a jump lacks a term, J times the derivative of
-the time of the jump, that no choice of steps brings back: it is refused.
+the time of the jump, for every choice of steps: it is refused.
 
-Between the states of a step that are known the path is a straight line. It is not the solution; but a continuous rate
-is continuous along it, too.
+Between the known states of a step the path is a straight line. It is not the solution; but a continuous rate is
+continuous along it, too.
 """
 
+from __future__ import annotations
+
 from collections import deque
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from sparsedp._utils.pytree import flatten, leaves
 from sparsedp.errors import ConvergenceError, NonFiniteError, UnstableStepError
 
-__all__ = ["Inspector"]
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
-UNEVEN = 3.0  # ratio of the changes of a rate in both halves of a step, from which on the larger one is looked at
-CONCENTRATED = 0.5  # share of the change in one of eight parts, from which on it is followed further
+__all__ = ["RateInspector"]
+
+UNEVEN = 3.0  # ratio of the changes of a rate in both halves of a step, from which on the larger one is searched
+CONCENTRATED = 0.5  # share of the change in one of eight parts, from which on the search continues
 NEGLIGIBLE = 1e-6  # share of the rate below which changes do not count
-PERSISTS = 0.5  # share of a deviation that a cut leaves, from which on it may be a jump
+PERSISTS = 0.5  # share of a deviation after a division, from which on it may be a jump
 PARTS = 8
-CUTS = 9  # until a jump is a jump: to 8^-9 of a step
-STEADY = 4  # cuts on end that leave the deviation, in a search for small jumps
+DIVISIONS = 9  # after which a change counts as a jump: at 8^-9 of a step
+STEADY = 4  # successive divisions that do not reduce the deviation, in a search for small jumps
 RESOLVED = 4.0  # lengths of a layer that a step across it may have
 GAP = 1 / 200  # largest share of the interval between two evaluations of a rate that depends on the time
-EFFORT = 2.0  # times the evaluations that the steps take, at most, for that
+EFFORT = 2.0  # evaluations for that, at most, as a multiple of those that the steps take
 EVALUATIONS = 12  # of the rate in a step, about
-MISSED = 0.3  # of its length, to which a step that missed a smooth pulse is shortened
+MISSED = 0.3  # share of its length to which a step that missed a smooth pulse is shortened
 UNSEEN = 10.0  # error, in units of the tolerance, of a step that missed a smooth pulse, from which on it is refused
 NEARBY = 1e-4  # share of a step for differences of the rate
-WINDOW = 7  # steps on end, over which errors are compared with the change of the rate
+WINDOW = 7  # successive steps over which errors are compared with the change of the rate
 COARSE = 0.005  # error of the change of the rate by the quadrature of a scheme, from which on it is not resolved
 ROUNDING = 1e-15  # relative change of the state
-NOISE = 30.0  # times its effect on the rate: what may be rounding
-ROUGH = 0.02  # fourth difference of the rate over eighths of a step, as a share of its change, of a closer look
+NOISE = 30.0  # times its effect on the rate: changes up to there may be rounding
+ROUGH = 0.02  # fourth difference of the rate over eighths of a step, as a share of its change, of a closer search
 REFUSALS = UnstableStepError, NonFiniteError, ConvergenceError
 
 
-class Inspector:
+class RateInspector:
     """Looks at the rate inside the steps over one interval.
 
     Parameters
@@ -57,155 +63,173 @@ class Inspector:
 
     Attributes
     ----------
-    found : list of pairs
+    jumps : list of pairs
         (time, whether it jumps in time) for each jump in an accepted step.
     resolution : list of pairs
         For each step that was searched the error of the change of the rate by the quadrature of the scheme, and the
         change.
     """
 
-    def __init__(self, scheme, params, t, h):
-        self.scheme, self.problem, self.params, self.t, self.h = scheme, scheme.problem, params, t, h
-        self.evaluations, self.probes = 0, 0
-        self.known: deque = deque(maxlen=3)  # states, and their rates
-        self.found: list = []
-        self.resolution: list = []
+    def __init__(self, scheme: Any, params: Any, t: Any, h: Any) -> None:
+        self.scheme = scheme
+        self.problem = scheme.problem
+        self.params = params
+        self.t = t
+        self.h = h
+        self.evaluations = 0
+        self.probes = 0
+        self.recent: deque = deque(maxlen=3)  # states, and their rates
+        self.jumps: list[tuple[float, bool]] = []
+        self.resolution: list[tuple[float, float]] = []
 
-    def rate(self, u, share):
-        """The rate at a share of the interval, as a list of arrays."""
+    def rate(self, u: Any, share: float) -> list[np.ndarray]:
+        """Return the rate at a share of the interval, as a list of arrays."""
         time = None if self.t is None else self.t + share * self.h
         return [np.asarray(leaf) for leaf in leaves(self.problem(u, self.params, time))]
 
-    def once(self, u, time):
-        """The rate at one of the last states of the steps, evaluated once."""
-        for state, rate in self.known:
+    def rate_at_state(self, u: Any, time: Any) -> Any:
+        """Return the rate at one of the last states of the steps, evaluated once."""
+        for state, rate in self.recent:
             if state is u:
                 return rate
         rate = self.problem(u, self.params, time)
-        self.known.append((u, rate))
+        self.recent.append((u, rate))
         return rate
 
-    # ------------------------------------------------------------ steps that are about to be accepted
+    # ------------------------------------------------------------ steps before they are accepted
 
-    def shortened(self, step):
-        """The share of its length to which a step has to be shortened, or None: it is accepted."""
+    def shorter_share(self, step: Any) -> float | None:
+        """Return the share of its length to which a step has to be shortened, or None: it is accepted."""
         self.evaluations += EVALUATIONS
         try:
             with np.errstate(all="ignore"):
-                return self._shortened(_Part(self, step))
+                path = _StepPath(self, step)
+                if not np.isfinite(path.scale):
+                    return None
+                return self._share_by_changes(path)
         except REFUSALS:  # the straight path leaves the domain of the rate
             return None
 
-    def _shortened(self, part):
-        first, last = part.norms(part.changes)
-        smaller, larger = (first, last) if first < last else (last, first)
-        if not np.isfinite(part.scale):
-            return None
-        if larger > UNEVEN * smaller and larger > NEGLIGIBLE * part.scale:
-            ends = (0.0, part.between) if first > last else (part.between, 1.0)
-            share = self._followed(part, *ends)
+    def _share_by_changes(self, path: _StepPath) -> float | None:
+        """Search the larger one of both changes, and probe in between."""
+        first, last = path.norms(path.changes)
+        if max(first, last) > UNEVEN * min(first, last) and max(first, last) > NEGLIGIBLE * path.scale:
+            start, stop = (0.0, path.between) if first > last else (path.between, 1.0)
+            share = self._share_by_search(path, start, stop)
             if share is not None:
                 return share
-        return self._probed(part, first + last)
+        return self._share_by_probes(path, first + last)
 
-    def _probed(self, part, change):
-        """Look between: a rate that depends on the time may have a pulse there."""
-        if not self.scheme.timed:
+    def _share_by_probes(self, path: _StepPath, change: float) -> float | None:
+        """Evaluate a rate that depends on the time in between: it may have a pulse there."""
+        if not self.scheme.takes_time:
             return None
-        count = int(min(np.ceil(part.length / GAP), EFFORT * self.evaluations - self.probes))
+        count = int(min(np.ceil(path.length / GAP), EFFORT * self.evaluations - self.probes))
         if count < 3:
             return None
         self.probes += count
-        shares = np.sort([0.0, part.between, 1.0, *((np.arange(count) + 0.5) / count)])
-        rates = part.rates(shares)
-        steps = part.norms([np.diff(rate, axis=0) for rate in rates])
-        scale = float(np.max(part.norms(rates)))
+        shares = np.sort([0.0, path.between, 1.0, *((np.arange(count) + 0.5) / count)])
+        rates = path.rates(shares)
+        steps = path.norms([np.diff(rate, axis=0) for rate in rates])
+        scale = float(np.max(path.norms(rates)))
         if not np.isfinite(scale) or np.sum(steps) <= UNEVEN * change + NEGLIGIBLE * scale:
             return None
         place = int(np.argmax(steps))
-        factor = self._followed(part, float(shares[place]), float(shares[place + 1]))
-        if factor is None and self.scheme.follows_path:
-            widths = np.diff(shares)
-            mean = [np.tensordot(widths, 0.5 * (rate[1:] + rate[:-1]), 1) for rate in rates]
-            missed = [part.length * self.h * a - b for a, b in zip(mean, part.moved(), strict=True)]
-            return MISSED if part.norm(missed) > UNSEEN * self.scheme.tolerance else None
-        return factor
+        share = self._share_by_search(path, float(shares[place]), float(shares[place + 1]))
+        if share is not None or not self.scheme.follows_path:
+            return share
+        widths = np.diff(shares)
+        missed = []
+        for rate, moved in zip(rates, path.displacement(), strict=True):
+            mean = np.tensordot(widths, 0.5 * (rate[1:] + rate[:-1]), 1)
+            missed.append(path.length * self.h * mean - moved)
+        return MISSED if path.norm(missed) > UNSEEN * self.scheme.tolerance else None
 
-    def _followed(self, part, start, stop):
-        """Follow the change of the rate between two shares of a step to where it happens."""
-        size, start, stop, is_jump = narrowed(part, start, stop)
-        if size is None or size <= self._rounding(part):
+    def _share_by_search(self, path: _StepPath, start: float, stop: float) -> float | None:
+        """Locate the change of the rate between two shares of a step, and return the share that resolves it."""
+        change = steepest_change(path, start, stop)
+        if change is None or change.size <= self._rounding(path):
             return None
-        if not is_jump:
-            width = RESOLVED * (stop - start)
-            return max(0.999 * start, width) if width < 0.5 else None
-        kick = size * part.length * self.h / self.scheme.tolerance
+        if not change.is_jump:
+            width = RESOLVED * (change.stop - change.start)
+            return max(0.999 * change.start, width) if width < 0.5 else None
+        kick = change.size * path.length * self.h / self.scheme.tolerance
         if kick > 1:
-            return max(0.999 * start, 0.5 / kick)
-        self._note(part, start, stop)
+            return max(0.999 * change.start, 0.5 / kick)
+        self._record_jump(path, change)
         return None
 
-    def _rounding(self, part):
-        """A bound on what rounding of the state, at both ends of a step, changes in the rate."""
-        found = [0.0]
+    def _rounding(self, path: _StepPath) -> float:
+        """Return a bound on the effect of rounding of the state on the rate, at both ends of a step."""
+        largest = 0.0
         for share in (0.0, 1.0):
             signs = np.random.default_rng(0)
-            moved = [
-                leaf if leaf is None else leaf * (1 + ROUNDING * signs.choice([-1.0, 1.0], np.shape(leaf)))
-                for leaf in leaves(part.state(share))
-            ]
-            rate = self.rate(part.rebuild(moved), part.done + share * part.length)
-            found.append(part.norm([a - b for a, b in zip(rate, part.rate(share), strict=True)]))
-        return NOISE * max(found)
+            rounded = []
+            for leaf in leaves(path.state(share)):
+                if leaf is not None:
+                    leaf = leaf * (1 + ROUNDING * signs.choice([-1.0, 1.0], np.shape(leaf)))
+                rounded.append(leaf)
+            rate = self.rate(path.rebuild(rounded), path.done + share * path.length)
+            largest = max(largest, path.norm([a - b for a, b in zip(rate, path.rate(share), strict=True)]))
+        return NOISE * largest
 
-    def _note(self, part, start, stop):
-        """Keep the time of a jump, and whether the rate jumps in time with the state held."""
-        place = part.done + stop * part.length
-        in_time = False
-        if self.scheme.timed:
-            u, here = part.state(start), part.done + start * part.length
-            later = part.done + (stop + 1e-3 * (stop - start)) * part.length
-            held = [a - b for a, b in zip(self.rate(u, later), self.rate(u, here), strict=True)]
-            both = [a - b for a, b in zip(part.rate(stop), part.rate(start), strict=True)]
-            in_time = part.norm(held) > 0.5 * part.norm(both)
-        self.found.append((place * self.h + (self.t or 0.0), in_time))
+    def _record_jump(self, path: _StepPath, change: _Change) -> None:
+        """Keep the time of a jump, and whether the rate jumps in time when the state is held."""
+        start, stop = change.start, change.stop
+        is_in_time = False
+        if self.scheme.takes_time:
+            u = path.state(start)
+            after = self.rate(u, path.done + (stop + 1e-3 * (stop - start)) * path.length)
+            before = self.rate(u, path.done + start * path.length)
+            held = [a - b for a, b in zip(after, before, strict=True)]
+            along_path = [a - b for a, b in zip(path.rate(stop), path.rate(start), strict=True)]
+            is_in_time = path.norm(held) > 0.5 * path.norm(along_path)
+        time = (path.done + stop * path.length) * self.h + (self.t or 0.0)
+        self.jumps.append((time, is_in_time))
 
     # ------------------------------------------------------------ steps with a derivative
 
-    def search(self, step):
+    def search(self, step: Any) -> None:
         """Look for smaller jumps, and for layers that are not resolved, in an accepted step."""
         self.resolution.append((0.0, 0.0))
         try:
             with np.errstate(all="ignore"):
-                part = _Part(self, step, straight=True)
-                rates = part.rates(np.linspace(0.0, 1.0, PARTS + 1))
-                change = float(np.sum(part.norms([np.diff(rate, axis=0) for rate in rates])))
-                rough = float(np.max(part.norms([np.diff(rate, 4, axis=0) for rate in rates])))
+                path = _StepPath(self, step, is_straight=True)
+                rates = path.rates(np.linspace(0.0, 1.0, PARTS + 1))
+                change = float(np.sum(path.norms([np.diff(rate, axis=0) for rate in rates])))
+                rough = float(np.max(path.norms([np.diff(rate, 4, axis=0) for rate in rates])))
                 self.resolution[-1] = 0.0, change
-                if rough <= max(ROUGH * change, NEGLIGIBLE * part.scale):
+                if rough <= max(ROUGH * change, NEGLIGIBLE * path.scale):
                     return
-                size, *place, _ = narrowed(part, 0.0, 1.0, thorough=True)
-                if size is not None and size > self._rounding(part):
-                    self._note(part, *place)
-                self.resolution[-1] = self._resolved(part)
+                jump = steepest_change(path, 0.0, 1.0, is_thorough=True)
+                if jump is not None and jump.size > self._rounding(path):
+                    self._record_jump(path, jump)
+                self.resolution[-1] = self._quadrature_error(path)
         except REFUSALS:
             pass
 
-    def _resolved(self, part):
-        """(error of the quadrature of the derivative of the rate in a step, change of the rate)."""
+    def _quadrature_error(self, path: _StepPath) -> tuple[float, float]:
+        """Return the error of the quadrature of the derivative of the rate in a step, and the change of the rate."""
         nodes, weights = map(np.array, self.scheme.quadrature)
-        before, after = np.maximum(nodes - NEARBY, 0.0), np.minimum(nodes + NEARBY, 1.0)
+        before = np.maximum(nodes - NEARBY, 0.0)
+        after = np.minimum(nodes + NEARBY, 1.0)
         shares = np.concatenate([before, after, [0.0, 1.0]])
-        rates = part.rates(shares)
+        order = np.argsort(shares)
+        rates = path.rates(shares)
         n = len(nodes)
         weights = weights / (after - before)
-        error = [rate[-1] - rate[-2] - np.tensordot(weights, rate[n : 2 * n] - rate[:n], 1) for rate in rates]
-        order = np.argsort(shares)
-        change = float(np.sum(part.norms([np.diff(rate[order], axis=0) for rate in rates])))
-        return (part.norm(error), change) if change > NEGLIGIBLE * np.max(part.norms(rates)) else (0.0, 0.0)
+        errors = []
+        differences = []
+        for rate in rates:
+            errors.append(rate[-1] - rate[-2] - np.tensordot(weights, rate[n : 2 * n] - rate[:n], 1))
+            differences.append(np.diff(rate[order], axis=0))
+        change = float(np.sum(path.norms(differences)))
+        if change > NEGLIGIBLE * np.max(path.norms(rates)):
+            return path.norm(errors), change
+        return 0.0, 0.0
 
-    def unresolved(self):
-        """The number of the step where the rate changes faster than steps resolve; None where there is none."""
+    def unresolved_step(self) -> int | None:
+        """Return the number of the step where the rate changes faster than steps resolve, or None."""
         errors, changes = np.array(self.resolution).T
         window = np.ones(min(WINDOW, len(errors)))
         total = np.convolve(changes, window, "same")
@@ -214,8 +238,15 @@ class Inspector:
         return worst if shares[worst] > COARSE else None
 
 
-class _Part:
-    """A step: its states along a path, and the rates there.
+class _StepPath:
+    """The states of a step along straight lines, and the rates there.
+
+    Parameters
+    ----------
+    inspector : RateInspector
+    step : AcceptedStep
+    is_straight : bool
+        Whether the path does not pass through the state inside the step.
 
     Attributes
     ----------
@@ -229,36 +260,39 @@ class _Part:
         The largest of the rates.
     """
 
-    def __init__(self, inspector, step, straight=False):
-        self.inspector, scheme = inspector, inspector.scheme
-        self.length, self.done = step.length, step.done
-        middle, self.between = scheme.inner_state(step)
-        self.trees = {0.0: step.u, 1.0: step.new} if straight else {0.0: step.u, self.between: middle, 1.0: step.new}
+    def __init__(self, inspector: RateInspector, step: Any, is_straight: bool = False) -> None:
+        self.inspector = inspector
+        self.length = step.length
+        self.done = step.done
+        middle, self.between = inspector.scheme.inner_state(step)
+        self.trees = {0.0: step.u, 1.0: step.new}
+        if not is_straight:
+            self.trees = {0.0: step.u, self.between: middle, 1.0: step.new}
         self.places = list(self.trees)
         self.states = [leaves(u) for u in self.trees.values()]
         self.rebuild = flatten(step.u)[1]
-        self.sizes = [np.where(size > 0, size, 1.0) for size in scheme.sizes(step.u, step.new)]
+        self.sizes = [np.where(size > 0, size, 1.0) for size in inspector.scheme.sizes(step.u, step.new)]
         self.count = max(sum(size.size for size in self.sizes), 1)
-        self.known: dict = {}
+        self._rates: dict[float, list] = {}
         rates = [self.rate(share) for share in self.places]
-        stacked = [np.stack(row) for row in zip(*rates, strict=True)]
-        self.changes = [np.diff(row, axis=0) for row in stacked]
-        self.scale = float(np.max(self.norms(stacked)))
+        stacks = [np.stack(row) for row in zip(*rates, strict=True)]
+        self.changes = [np.diff(row, axis=0) for row in stacks]
+        self.scale = float(np.max(self.norms(stacks)))
 
-    def norms(self, rates):
-        """The sizes of several rates, along a first axis, relative to the state: root mean squares."""
-        total = 0.0
+    def norms(self, rates: Sequence) -> np.ndarray:
+        """Return the sizes of rates along a first axis, relative to the state: root mean squares."""
+        total: Any = 0.0
         for rate, size in zip(rates, self.sizes, strict=True):
             shares = np.abs(rate / size).reshape(len(rate), -1)
             total = total + np.einsum("ij,ij->i", shares, shares)
         return np.sqrt(total / self.count)
 
-    def norm(self, rate):
-        """The size of one."""
+    def norm(self, rate: Sequence) -> float:
+        """Return the size of one rate."""
         return float(self.norms([row[None] for row in rate])[0])
 
-    def state(self, share):
-        """On straight lines between the states that are known."""
+    def state(self, share: float) -> Any:
+        """Return the state at a share, on straight lines between the known states."""
         if share in self.trees:
             return self.trees[share]
         late = int(len(self.places) > 2 and share > self.between)
@@ -267,73 +301,86 @@ class _Part:
         pairs = zip(*self.states[late : late + 2], strict=True)
         return self.rebuild([a if a is None else a + weight * (b - a) for a, b in pairs])
 
-    def rate(self, share):
-        """The rate there."""
+    def rate(self, share: float) -> list[np.ndarray]:
+        """Return the rate at a share."""
         place = self.done + share * self.length
         if share not in self.trees:
             return self.inspector.rate(self.state(share), place)
-        if share not in self.known:
-            time = None if self.inspector.t is None else self.inspector.t + place * self.inspector.h
-            self.known[share] = [np.asarray(leaf) for leaf in leaves(self.inspector.once(self.trees[share], time))]
-        return self.known[share]
+        if share not in self._rates:
+            inspector = self.inspector
+            time = None if inspector.t is None else inspector.t + place * inspector.h
+            rate = inspector.rate_at_state(self.trees[share], time)
+            self._rates[share] = [np.asarray(leaf) for leaf in leaves(rate)]
+        return self._rates[share]
 
-    def rates(self, shares):
-        """The rates at several shares, along a first axis."""
+    def rates(self, shares: Sequence | np.ndarray) -> list[np.ndarray]:
+        """Return the rates at several shares, along a first axis."""
         return [np.stack(row) for row in zip(*(self.rate(float(share)) for share in shares), strict=True)]
 
-    def moved(self):
-        """What the step adds to the state."""
+    def displacement(self) -> list:
+        """Return the change of the state in the step."""
         return [b - a for a, b in zip(self.states[0], self.states[-1], strict=True)]
 
 
-def narrowed(part, start, stop, thorough=False):
-    """Where a rate changes most unevenly between two shares of a step.
+class _Change(NamedTuple):
+    """A change of a rate: its size, the shares of the step between which it is, and whether it is a jump."""
+
+    size: float
+    start: float
+    stop: float
+    is_jump: bool
+
+
+def steepest_change(path: _StepPath, start: float, stop: float, is_thorough: bool = False) -> _Change | None:
+    """Locate where a rate changes most unevenly between two shares of a step.
 
     Parameters
     ----------
-    part : _Part
+    path : _StepPath
     start, stop : float
-    thorough : bool
-        Look for jumps that are smaller than the smooth change in the part.
+    is_thorough : bool
+        Look for jumps that are smaller than the smooth change between the shares.
 
     Returns
     -------
-    (size, start, stop, whether it is a jump)
-        Size None: the rate is smooth there. Else the size of the jump, or of the change in a layer, and where it is.
+    _Change or None
+        A jump, or a layer; None: the rate is smooth there.
     """
-    nothing = None, start, stop, False
-    before, steady = 0.0, 0
-    first, last = part.rate(start), part.rate(stop)
-    for cut in range(CUTS + STEADY):
+    last_size = 0.0
+    steady = 0
+    first = path.rate(start)
+    last = path.rate(stop)
+    for division in range(DIVISIONS + STEADY):
         shares = np.linspace(start, stop, PARTS + 1)
         if not start < shares[1] < shares[-2] < stop:
             break
-        inside = part.rates(shares[1:-1])
+        inside = path.rates(shares[1:-1])
         rates = [np.concatenate([a[None], b, c[None]]) for a, b, c in zip(first, inside, last, strict=True)]
         steps = [np.diff(rate, axis=0) for rate in rates]
-        uneven = [row - (np.sum(row, axis=0) - row) / (PARTS - 1) for row in steps]
-        deviations = part.norms(uneven)
+        deviations = path.norms([row - (np.sum(row, axis=0) - row) / (PARTS - 1) for row in steps])
+        variation = path.norms(steps)
         place = int(np.argmax(deviations))
         size = float(deviations[place])
-        if not size > NEGLIGIBLE * part.scale:
-            return nothing
-        variation = part.norms(steps)
-        if cut == 0 and not thorough and size < CONCENTRATED * np.sum(variation):
-            return nothing
-        if cut and size < PERSISTS * before:
-            if not thorough and cut == 1:
-                return nothing
-            if not thorough or steady >= 2:
-                return before, start, stop, False
+        if not size > NEGLIGIBLE * path.scale:
+            return None
+        if division == 0 and not is_thorough and size < CONCENTRATED * np.sum(variation):
+            return None
+        if division > 0 and size < PERSISTS * last_size:
+            if not is_thorough and division == 1:
+                return None
+            if not is_thorough or steady >= 2:
+                return _Change(last_size, start, stop, False)
             steady = 0
-            if cut >= CUTS - STEADY:
-                return nothing
-        elif cut:
+            if division >= DIVISIONS - STEADY:
+                return None
+        elif division > 0:
             steady += 1
-        before = size
-        start, stop = float(shares[place]), float(shares[place + 1])
-        first, last = [rate[place] for rate in rates], [rate[place + 1] for rate in rates]
-        if cut + 1 >= CUTS and steady >= STEADY:
-            isolated = np.sum(variation) - variation[place] < 0.2 * size
-            return (size, start, stop, True) if isolated else nothing
-    return (before, start, stop, True) if steady >= STEADY else nothing
+        last_size = size
+        start = float(shares[place])
+        stop = float(shares[place + 1])
+        first = [rate[place] for rate in rates]
+        last = [rate[place + 1] for rate in rates]
+        if division + 1 >= DIVISIONS and steady >= STEADY:
+            is_isolated = np.sum(variation) - variation[place] < 0.2 * size
+            return _Change(size, start, stop, True) if is_isolated else None
+    return _Change(last_size, start, stop, True) if steady >= STEADY else None

@@ -172,7 +172,7 @@ class Exponential(Scheme):
     def __init__(self, problem):
         super().__init__(problem, "etdrk4", 4)
         self.functions = {op: PhiFunctions(op, "stepper(etdrk4)") for op in problem.operators} | {None: _free}
-        self.nodes = () if problem.source is None else NODES if problem.moving else NODES[:1]
+        self.nodes = () if problem.source is None else NODES if problem.source_takes_time else NODES[:1]
         self.parts = [quadrature(self.nodes, *ends) for ends in ((0.0, 1.0), (0.0, 0.5), (0.5, 1.0))]
 
     def __call__(self, u, params, t, h):
@@ -185,13 +185,13 @@ class Exponential(Scheme):
         def scaled(rate):
             return mapped(lambda leaf: leaf if leaf is None else h * leaf, rate)
 
-        s = [scaled(self.problem.given(params, later(t, node * h))) for node in self.nodes]
+        s = [scaled(self.problem.source_value(params, later(t, node * h))) for node in self.nodes]
         whole, first, second = self.parts
         if self.problem.rate is None:
             return f((WHOLE, *whole), u, *s)
 
         def n(v, share):
-            return scaled(self.problem.explicit(v, params, later(t, share * h)))
+            return scaled(self.problem.rate_value(v, params, later(t, share * h)))
 
         n0, half = n(u, 0.0), f((HALF, *first), u, *s)
         a = combine(half, (1.0, f((MEAN,), n0)))

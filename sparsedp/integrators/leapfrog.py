@@ -32,8 +32,8 @@ from sparsedp.autodiff.derivative import push
 from sparsedp.autodiff.tape import is_variable, plain
 from sparsedp.errors import UnstableStepError
 from sparsedp.grid.grid import AXES, check_grid
-from sparsedp.integrators.adaptive import Moving
-from sparsedp.integrators.problem import combine, of_fields, pair, untraced
+from sparsedp.integrators.adaptive import FlatDeviation
+from sparsedp.integrators.problem import check_pair, combine, field_leaves, untraced
 from sparsedp.integrators.runge_kutta import Scheme
 from sparsedp.solvers.cache import Cache
 
@@ -61,10 +61,10 @@ class Leapfrog(Scheme):
     def __init__(self, rates, damping):
         super().__init__(self, "leapfrog", 2)
         example = "(lambda v, c: ..., lambda p, c: ...) for the state (p, v)"
-        for rate in pair("the rates of leapfrog", rates, example):
+        for rate in check_pair("the rates of leapfrog", rates, example):
             check_function("a rate of leapfrog", rate, "lambda field, params: ...", 2)
         if damping is not None:
-            pair("damping, for both fields of the state,", damping, "(s, None)")
+            check_pair("damping, for both fields of the state,", damping, "(s, None)")
         for rate in map(plain, leaves(damping)):
             if rate is not None and not (np.all(np.isfinite(rate)) and np.all(rate >= 0)):
                 raise ValueError("damping needs finite rates >= 0 [1 / time]; take dp.sponge(grid, cells, speed)")
@@ -89,11 +89,11 @@ class Leapfrog(Scheme):
         """(h w)^2 of the fastest waves."""
         (p, q), (f, g) = _pair(state), self.rates
         p = mapped(lambda leaf: leaf if leaf is None else leaf * 1.0, p)  # whole numbers have no slope
-        flat = Moving(p, is_variable, [1.0] * len(leaves(p)))
+        flat = FlatDeviation(p, is_variable, [1.0] * len(leaves(p)))
         n = flat.space.size
 
         def forces(x):
-            return flat.off(f(combine(q, (h, g(flat.at(x), params))), params))
+            return flat.deviation(f(combine(q, (h, g(flat.tree(x), params))), params))
 
         def product(x):
             slope = -h * push(forces, np.zeros(n), [x])[1]
@@ -132,7 +132,7 @@ class Leapfrog(Scheme):
 
 
 def _pair(state):
-    return pair("the state of leapfrog", state, "(p, v)")
+    return check_pair("the state of leapfrog", state, "(p, v)")
 
 
 def _advanced(x, rate, h, damping, name):
@@ -140,7 +140,7 @@ def _advanced(x, rate, h, damping, name):
     if damping is None:
         return combine(x, (h, rate))
     entries, rebuild = flatten(x)
-    rates = of_fields(rate, x)
+    rates = field_leaves(rate, x)
     damped = paired(damping, x, name, advice="; give one number, or a tree like the field", prefix=is_uniform)
     rows = zip(entries, rates, damped, strict=True)
     return rebuild([leaf + h * (r - s * leaf) / (1 + 0.5 * h * s) for leaf, r, s in rows])

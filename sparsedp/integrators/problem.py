@@ -1,15 +1,17 @@
-"""What is integrated: u' = c L u + rate(u, params, t) + source(params, t), the checks of its numbers, and arithmetic on
+"""The right-hand side u' = c L u + rate(u, params, t) + source(params, t), the checks of its numbers, and arithmetic on
 states: an array, or any tree of arrays, plus multiples of others. Each field of a tree has a c L of its own, or none.
 
 Where a rate switches, at a time or on a surface of the state, it has two values. Steps that end there need the value
 before, steps that begin there the value after. The stepper then passes the params of the rate as `Sided`, and `Problem`
 evaluates the rate a rounding error inside the interval, and on the side of the surface where the step began. The shifts
-are constants: they have no derivative. So the derivative of a Runge-Kutta stage beyond a surface is that of the smooth
-continuation of the rate, to an error of the size of the shift.
+are constants: they have no derivative. So the derivative of a Runge-Kutta stage beyond a surface is the derivative of
+the smooth continuation of the rate, to an error of the size of the shift.
 """
 
+from __future__ import annotations
+
 import inspect
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -21,14 +23,30 @@ from sparsedp.errors import ShapeError
 from sparsedp.grid.space import fits
 from sparsedp.operators.operator import Operator
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
 __all__ = [
-    "Problem", "Side", "Sided", "combine", "later", "like", "number", "of_fields", "pair", "takes", "unsided",
+    "Problem",
+    "Side",
+    "Sided",
+    "check_pair",
+    "combine",
+    "field_leaves",
+    "later",
+    "like",
+    "real_number",
+    "takes_arguments",
+    "unsided",
     "untraced",
-]  # fmt: skip
+]
 
 
-def combine(u, *pairs):
-    """u + the sum of factor * tree over the pairs (factor, tree), leaf by leaf.
+# ---- arithmetic on states --------------------------------------------------------------------------------------------
+
+
+def combine(u: Any, *pairs: tuple) -> Any:
+    """Return u plus the sum of factor * tree over the pairs (factor, tree), leaf by leaf.
 
     Parameters
     ----------
@@ -49,47 +67,72 @@ def combine(u, *pairs):
         for factor, rate in pairs:
             u = u + factor * rate
         return u
-    found, rebuild = flatten(u)
+    entries, rebuild = flatten(u)
     for factor, tree in pairs:
-        rates = of_fields(tree, u)
-        found = [leaf if leaf is None else leaf + factor * rate for leaf, rate in zip(found, rates, strict=True)]
-    return rebuild(found)
+        rates = field_leaves(tree, u)
+        entries = [leaf if leaf is None else leaf + factor * rate for leaf, rate in zip(entries, rates, strict=True)]
+    return rebuild(entries)
 
 
-def of_fields(tree, u, name="rate"):
-    """The leaves of a rate, one for each of the state; broadcasting one into another would hide a mistake."""
+def field_leaves(tree: Any, u: Any, name: str = "rate") -> list:
+    """Return the leaves of a rate, one for each of the state u.
+
+    Shapes must be equal: broadcasting one field into another would hide a mistake.
+    """
     return paired(tree, u, name, advice="; return a tree like the state", shapes=True)
 
 
-def like(new, u):
-    """The new state in the dtypes of the old one: rates in double precision do not widen a float32 state."""
+def like(new: Any, u: Any) -> Any:
+    """Return a new state in the dtypes of the old one: rates in double precision do not widen a float32 state."""
     return mapped(_rounded, new, u)
 
 
-def _rounded(leaf, old):
-    kind = dtype_of(old)
-    if not is_variable(old) or dtype_of(leaf) == kind:
+def _rounded(leaf: Any, old: Any) -> Any:
+    dtype = dtype_of(old)
+    if not is_variable(old) or dtype_of(leaf) == dtype:
         return leaf
-    if dtype_of(leaf).kind == "c" != kind.kind:
-        raise TypeError(f"a rate of complex numbers needs a complex state, got {kind}; write u.astype(complex)")
-    return cast(leaf, kind)
+    if dtype_of(leaf).kind == "c" != dtype.kind:
+        raise TypeError(f"a rate of complex numbers needs a complex state, got {dtype}; write u.astype(complex)")
+    return cast(leaf, dtype)
 
 
-def pair(what, value, example):
-    """Two things, as they were given."""
-    if not (isinstance(value, (tuple, list)) and len(value) == 2):
-        raise TypeError(f"{what} must be a pair, got {type(value).__name__}; write {example}")
-    return value
-
-
-def later(t, h):
-    """The time t + h, or None where nothing takes a time."""
+def later(t: Any, h: Any) -> Any:
+    """Return the time t + h, or None where nothing depends on the time."""
     return t if t is None else t + h
 
 
-def untraced(tree):
-    """The same tree without a trace."""
+def untraced(tree: Any) -> Any:
+    """Return the same tree without a trace."""
     return mapped(plain, tree)
+
+
+# ---- checks ----------------------------------------------------------------------------------------------------------
+
+
+def check_pair(name: str, value: Any, example: str) -> Any:
+    """Return a tuple or list of two entries; refuse anything else."""
+    if not (isinstance(value, (tuple, list)) and len(value) == 2):
+        raise TypeError(f"{name} must be a pair, got {type(value).__name__}; write {example}")
+    return value
+
+
+def real_number(value: Any, name: str, sign: str = "", advice: str = "") -> Any:
+    """Return one finite real number, traced or as a float, so that a float32 state stays in single precision."""
+    check_number(name, plain(value), sign, advice)
+    return value if isbox(value) else float(value)
+
+
+def takes_arguments(fun: Callable | None, least: int) -> bool:
+    """Return whether a function takes at least this many arguments: then the last one is the time."""
+    if fun is None:
+        return False
+    try:
+        parameters = inspect.signature(fun).parameters.values()
+    except (TypeError, ValueError):  # the function has no signature
+        return False
+    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    required = [p for p in parameters if p.kind in kinds and p.default is p.empty]
+    return len(required) >= least
 
 
 # ---- sides of switching times and surfaces ---------------------------------------------------------------------------
@@ -108,20 +151,21 @@ class Side:
 
     __slots__ = ("earliest", "latest", "surfaces")
 
-    def __init__(self, earliest=-np.inf, latest=np.inf, surfaces=()):
-        # Between adjacent numbers there is none: the later one is after both.
-        self.earliest, self.latest, self.surfaces = earliest, max(earliest, latest), surfaces
+    def __init__(self, earliest: float = -np.inf, latest: float = np.inf, surfaces: tuple = ()) -> None:
+        self.earliest = earliest
+        self.latest = max(earliest, latest)  # between adjacent numbers there is none: the later one is after both
+        self.surfaces = surfaces
 
-    def time(self, t):
-        """The time, clipped to the interval; its derivative is 1."""
+    def time(self, t: Any) -> Any:
+        """Return the time, clipped to the interval; its derivative is 1."""
         if t is None:
             return None
-        known = plain(t)
-        inside = min(max(known, self.earliest), self.latest)
-        return t if inside == known else t + (inside - known)
+        value = plain(t)
+        clipped = min(max(value, self.earliest), self.latest)
+        return t if clipped == value else t + (clipped - value)
 
-    def inside(self, u, params, t):
-        """The state and time at which the rate is evaluated in the place of (u, t)."""
+    def inside(self, u: Any, params: Any, t: Any) -> tuple:
+        """Return the state and time at which the rate is evaluated in place of (u, t)."""
         t = self.time(t)
         for surface in self.surfaces:
             u, t = surface.inside(u, params, t)
@@ -135,16 +179,16 @@ class Sided(NamedTuple):
     side: Side
 
 
-def unsided(params):
-    """The params as the user knows them."""
+def unsided(params: Any) -> Any:
+    """Return the params as the user passed them."""
     return params.params if type(params) is Sided else params
 
 
 # ---- the right-hand side ---------------------------------------------------------------------------------------------
 
 
-class Stiff:
-    """c L of one field.
+class StiffTerm:
+    """The term c L u of one field.
 
     Parameters
     ----------
@@ -152,42 +196,51 @@ class Stiff:
         L.
     coefficient : number, or function of params
     place : str
-        Where it was given, for messages.
+        Its place in the option `linear`, for messages.
     """
 
     described = "one operator"
 
-    def __init__(self, op, coefficient, place):
-        self.op, self._coefficient = op, coefficient
+    def __init__(self, op: Operator, coefficient: Any, place: str) -> None:
+        self.op = op
         self.name = f"the coefficient of {op.name}{place.removeprefix('linear')}"
+        self._coefficient = coefficient
         if not fits(op.domain, op.codomain):
             raise ShapeError(
                 f"stepper needs an operator from a space to itself, {op.name} maps {op.domain} to {op.codomain}"
             )
 
-    def coefficient(self, params):
-        """The number c >= 0, traced or not."""
-        given = self._coefficient
-        given = given(unsided(params)) if callable(given) else given
-        return number(given, self.name, ">= 0", "; write a number >= 0, the sign is that of the operator")
+    def coefficient(self, params: Any) -> Any:
+        """Return the number c >= 0, traced or not."""
+        value = self._coefficient
+        if callable(value):
+            value = value(unsided(params))
+        return real_number(value, self.name, ">= 0", "; write a number >= 0, the sign is that of the operator")
 
 
-def _terms(linear, place):
-    """What `linear` holds, with a Stiff in place of each operator and None where there is none."""
+def _stiff_terms(linear: Any, place: str) -> Any:
+    """Return the option `linear` with a StiffTerm in place of each operator and None where there is none."""
     if linear is None or (isinstance(linear, (int, float)) and linear == 0):
         return None
-    is_pair = isinstance(linear, tuple) and len(linear) == 2 and not hasattr(linear, "_fields")
-    op, coefficient = linear if is_pair else (linear, 1.0)
+    op = linear
+    coefficient: Any = 1.0
+    if isinstance(linear, tuple) and len(linear) == 2 and not hasattr(linear, "_fields"):
+        op, coefficient = linear
     if isinstance(op, Operator) and not isinstance(coefficient, (Operator, tuple, list, dict, type(None))):
-        return Stiff(op, coefficient, place)
+        return StiffTerm(op, coefficient, place)
     if keys(linear) is None:
         raise TypeError(f"{place} takes an Operator or a pair (Operator, coefficient), got {type(linear).__name__}")
-    return branches_mapped(lambda name: _terms(linear[name], place + subscript(linear, name)), linear)
+    return branches_mapped(lambda name: _stiff_terms(linear[name], place + subscript(linear, name)), linear)
 
 
-def _is_none(term):
+def _is_none(term: Any) -> bool:
     """Whether a term stands for a whole branch without a stiff part."""
     return term is None
+
+
+def _coefficient_from_params(params: Any) -> Any:
+    """Return c of a rate that is an Operator: the params themselves, 1 where there are none."""
+    return 1.0 if params is None else params
 
 
 class Problem:
@@ -200,121 +253,120 @@ class Problem:
 
     Attributes
     ----------
-    stiff : list of Stiff
+    stiff : list of StiffTerm
         Those of all fields.
     operators : set of Operator
         Every L there is.
     timed : bool
         Whether the state is the pair (u, t).
-    driven, moving : bool
-        Whether the rate, and whether the source, takes the time.
+    rate_takes_time, source_takes_time : bool
     linear : bool
         Whether the right-hand side is c L u + source: a step is a linear solve.
     """
 
-    def __init__(self, rate, linear, source, timed):
+    def __init__(self, rate: Any, linear: Any, source: Any, timed: bool | None) -> None:
         if isinstance(rate, Operator):
             if linear is not None:
                 raise TypeError("give the operator once: as rate, or as linear with the rest as rate")
-            rate, linear = None, (rate, lambda params: 1.0 if params is None else params)
-        self.rate, self.source, self._terms = rate, source, _terms(linear, "linear")
+            linear = (rate, _coefficient_from_params)
+            rate = None
+        self.rate = rate
+        self.source = source
+        self._terms = _stiff_terms(linear, "linear")
         self.stiff = [term for term in leaves(self._terms) if term is not None]
         self.operators = {term.op for term in self.stiff}
-        self._check_functions()
-        self.driven, self.moving = takes(rate, 3), takes(source, 2)
-        self.timed = self.driven or self.moving if timed is None else timed
         self.linear = rate is None
+        self._check_functions()
+        self.rate_takes_time = takes_arguments(rate, 3)
+        self.source_takes_time = takes_arguments(source, 2)
+        self.timed = timed
+        if timed is None:
+            self.timed = self.rate_takes_time or self.source_takes_time
         if rate is not None:
             example = "lambda u, params: ... or lambda u, params, t: ..."
-            check_takes("stepper", rate, 3 if self.driven else 2, example)
+            check_takes("stepper", rate, 3 if self.rate_takes_time else 2, example)
 
-    def _check_functions(self):
-        for name, fun in (("rate", self.rate), ("source", self.source)):
-            if fun is not None:
-                check_function(f"stepper, as {name},", fun, f"{name}=lambda {'u, ' * (name == 'rate')}params: ...")
+    def _check_functions(self) -> None:
+        if self.rate is not None:
+            check_function("stepper, as rate,", self.rate, "rate=lambda u, params: ...")
+        if self.source is not None:
+            check_function("stepper, as source,", self.source, "source=lambda params: ...")
         if self.rate is None and not self.stiff:
             raise TypeError("stepper needs a rate, a function rate(u, params) or an Operator, or the option linear")
 
-    def terms(self, u):
-        """The Stiff of each field of a state, None where there is none."""
+    def terms(self, u: Any) -> list:
+        """Return the StiffTerm of each field of a state, None where there is none."""
         advice = "; write None for a field without a stiff part"
         return paired(self._terms, u, "linear", advice=advice, prefix=_is_none, error=TypeError)
 
-    def on_fields(self, act, h, params, u, *trees):
-        """act(L, h c, leaf, ...) for each field of the state u, and of trees like it -> a tree like u.
+    def on_fields(self, act: Callable, h: Any, params: Any, u: Any, *trees: Any) -> Any:
+        """Return the tree of act(L, h c, leaf, ...) for each field of the state u, and of trees like it.
 
-        L is None where nothing is stiff. Where the state holds None it stays.
+        L is None where nothing is stiff. None in the state stays None.
         """
-        found, rebuild = flatten(u)
-        rows = zip(self.terms(u), found, *(of_fields(tree, u) for tree in trees), strict=True)
+        entries, rebuild = flatten(u)
+        rows = zip(self.terms(u), entries, *(field_leaves(tree, u) for tree in trees), strict=True)
+        results = []
+        for term, leaf, *row in rows:
+            op = term.op if term else None
+            factor = h * term.coefficient(params) if term else h
+            results.append(None if leaf is None else act(op, factor, leaf, *row))
+        return rebuild(results)
 
-        def on(term, leaf, *row):
-            L, z = (term.op, h * term.coefficient(params)) if term else (None, h)
-            return leaf if leaf is None else act(L, z, leaf, *row)
-
-        return rebuild([on(*row) for row in rows])
-
-    def explicit(self, u, params, t):
-        """The rate alone, or None; a copy: it may write into the array that it returned before."""
+    def rate_value(self, u: Any, params: Any, t: Any) -> Any:
+        """Return the rate alone, or None; a copy, since it may write into the array that it returned before."""
         if self.rate is None:
             return None
         if type(params) is Sided:
             u, t = params.side.inside(u, params.params, t)
             params = params.params
-        return copied(_unchanged(self.rate, u, (params, t) if self.driven else (params,)))
+        arguments = (params, t) if self.rate_takes_time else (params,)
+        return copied(_call_rate(self.rate, u, arguments))
 
-    def given(self, params, t):
-        """The source alone, or None."""
+    def source_value(self, params: Any, t: Any) -> Any:
+        """Return the source alone, or None."""
         if self.source is None:
             return None
         if type(params) is Sided:
             t = params.side.time(t)
             params = params.params
-        return copied(self.source(*((params, t) if self.moving else (params,))))
+        return copied(self.source(params, t) if self.source_takes_time else self.source(params))
 
-    def __call__(self, u, params, t):
-        """The whole right-hand side."""
-        rest = [self.explicit(u, params, t), self.given(params, t)]
+    def __call__(self, u: Any, params: Any, t: Any) -> Any:
+        """Return the whole right-hand side."""
+        parts = []
         if self.stiff:
-            rest.insert(0, self.on_fields(lambda L, c, leaf: (L(leaf) if L else 0.0 * leaf) * c, 1.0, params, u))
-        first, *others = [part for part in rest if part is not None]
+            parts.append(self.on_fields(_product, 1.0, params, u))
+        parts.append(self.rate_value(u, params, t))
+        parts.append(self.source_value(params, t))
+        first, *others = [part for part in parts if part is not None]
         if keys(u) is not None:
-            first = flatten(u)[1](of_fields(first, u))
+            first = flatten(u)[1](field_leaves(first, u))
         return combine(first, *((1.0, part) for part in others))
 
 
-def takes(fun, least):
-    """Whether a function takes this many arguments: then the last one is the time."""
-    try:
-        found = inspect.signature(fun).parameters.values()
-    except (TypeError, ValueError):  # there is none, or it does not tell
-        return False
-    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    return sum(p.kind in kinds and p.default is p.empty for p in found) >= least
+def _product(op: Operator | None, coefficient: Any, leaf: Any) -> Any:
+    """Return c L u of one field."""
+    return (op(leaf) if op else 0.0 * leaf) * coefficient
 
 
-def _unchanged(rate, u, args):
-    """The rate, which must not write into the state."""
+def _call_rate(rate: Callable, u: Any, arguments: Sequence) -> Any:
+    """Call a rate, which must not write into the state."""
     try:
-        return rate(mapped(frozen, u), *args)
+        return rate(mapped(frozen, u), *arguments)
     except (TypeError, ValueError) as error:
-        if not any("read-only" in str(found) for found in (error, _without_trace(rate, u, args))):
+        if "read-only" not in str(error) and "read-only" not in str(_error_without_trace(rate, u, arguments)):
             raise
         raise ValueError(
             "the rate changes the state in place; write u = u + du instead of u += du, or work on a copy"
         ) from None
 
 
-def _without_trace(rate, u, args):
-    """What a rate that fails on traced values raises on plain ones: of a state that is written into NumPy says so."""
-    u, args = untraced((u, args))
+def _error_without_trace(rate: Callable, u: Any, arguments: Sequence) -> Exception | None:
+    """Return the error that a rate raises on plain values: NumPy names a write into the state only there."""
+    u, arguments = untraced((u, arguments))
     try:
-        rate(mapped(frozen, u), *args)
+        rate(mapped(frozen, u), *arguments)
     except Exception as error:
         return error
-
-
-def number(value, name, sign="", advice=""):
-    """One finite real number, traced, or as a float, so that a float32 state stays one."""
-    check_number(name, plain(value), sign, advice)
-    return value if isbox(value) else float(value)
+    return None

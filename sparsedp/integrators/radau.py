@@ -4,32 +4,37 @@ A step of length h from u has three stages, with f_i = f(u + z_i, t + c_i h) and
 
     z_i = h sum_j a_ij f_j,          and the new state is u + z_3.
 
-It is L-stable: what is stiff dies out at any h. Of smooth problems the order is 5, of stiff ones whose data move at
-least 3, where that of Rosenbrock methods (Rodas) falls to less; and the discrete adjoint needs first derivatives of f
-alone, where theirs needs those of the Jacobian. Newton's method takes one Jacobian J of f for all stages, and for as
-many steps as it serves: in the basis of the eigenvectors of A^-1 its system of 3 n unknowns is a real and a complex one
-of n. The error of a step is that of an embedded formula of order 3, filtered by the real matrix,
+It is L-stable: stiff components decay for any h. Of smooth problems the order is 5, of stiff ones with moving data at
+least 3, where Rosenbrock methods (Rodas) fall to less; and the discrete adjoint needs first derivatives of f alone,
+where theirs needs derivatives of the Jacobian. Newton's method uses one Jacobian J of f for all stages, and for as many
+steps as it converges with: in the basis of the eigenvectors of A^-1 its system of 3 n unknowns is a real and a complex
+one of n. The error of a step is estimated by an embedded formula of order 3, filtered by the real matrix,
 
     e = (g/h - J)^-1 (f(u, t) + sum_i e_i z_i / h),          g the real eigenvalue of A^-1.
 
-In a second trial from a state, where it is too large, f(u + e, t) takes the place of f(u, t) once: an error in u that
-dies out at any length would stay in e until h is as short as that takes, 72 trials in a row in u' = -1e6 (u - cos t).
-
-Source: Hairer and Wanner, Solving Ordinary Differential Equations II (1996), IV.8; lengths: see adaptive.py.
+In a second trial from a state, if it is too large, f(u + e, t) replaces f(u, t) once: an error in u that decays at any
+length would stay in e until h is as short as that takes, 72 trials in a row in u' = -1e6 (u - cos t). The lengths of
+steps are chosen as in adaptive.py.
 
 Derivatives are those of the steps taken, by the implicit function theorem for each, never through the iterations. With
 J_i, P_i, q_i the derivatives of f_i in the state, the params and the time,
 
     K dz = h A (J_i du + P_i dp + q_i (dt + c_i dh)) + z/h dh,          K = 1 - h A J_i   (3 n unknowns),
 
-and the backward pass is the transpose of that. Lengths move with the state, dh = d, and the derivative is judged by two
-shadows, as adaptive.py says and for its reasons. Two things differ: the first shadow has the derivative of
-u + z_3 + EPSILON e, and the last step gives the sum of all d back: the rate at its end would not do, since errors of
-stiff parts are large in it.
+and the backward pass is the transpose of this map. Lengths follow the state, dh = d, and the error of the derivative is
+estimated by two perturbed solutions, as adaptive.py says and for its reasons. Two things differ: the first perturbed
+solution has the derivative of u + z_3 + EPSILON e, and the last step gives the sum of all d back: the rate at its end
+would not do, since errors of stiff parts are large in it.
+
+References
+----------
+E. Hairer, G. Wanner, Solving Ordinary Differential Equations II (1996), IV.8.
 """
 
+from __future__ import annotations
+
 from copy import copy
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import autograd.numpy as anp
 import numpy as np
@@ -40,13 +45,19 @@ from sparsedp.autodiff.backend import require_arrays
 from sparsedp.autodiff.tape import cast, dtype_of, is_variable, isbox, linear, plain, traces_of
 from sparsedp.autodiff.tape_constants import constant
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
-from sparsedp.integrators.adaptive import LESS, WINDOW, Adaptive, Moving, Taken, relative
-from sparsedp.integrators.discontinuities import Inspector
+from sparsedp.integrators.adaptive import LESS, WINDOW, AcceptedStep, Adaptive, FlatDeviation, relative_sizes
+from sparsedp.integrators.discontinuities import RateInspector
 from sparsedp.integrators.jacobians import jacobians_of
 from sparsedp.integrators.problem import Sided, combine, like, unsided, untraced
 from sparsedp.integrators.runge_kutta import Scheme, as_matrix
 from sparsedp.solvers.direct import dense_lu
 from sparsedp.solvers.newton import Unknowns
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+    from sparsedp.integrators.events import Event
+    from sparsedp.integrators.problem import Problem
 
 __all__ = ["Radau"]
 
@@ -56,21 +67,25 @@ POWERS = np.arange(3)
 A = (C[:, None] ** (POWERS + 1) / (POWERS + 1)) @ np.linalg.inv(C[:, None] ** POWERS)  # collocation at the nodes
 E = np.array([-13 - 7 * ROOT, -13 + 7 * ROOT, -1]) / 3  # e_i of the embedded formula
 _values, _vectors = np.linalg.eig(np.linalg.inv(A))
-_real, _upper = np.argmin(np.abs(_values.imag)), np.argmax(_values.imag)
-REAL, COMPLEX = float(_values[_real].real), complex(_values[_upper].conj())  # eigenvalues of A^-1
+_real = np.argmin(np.abs(_values.imag))
+_upper = np.argmax(_values.imag)
+# Eigenvalues of A^-1, and its eigenvectors in real form.
+REAL = float(_values[_real].real)
+COMPLEX = complex(_values[_upper].conj())
 BASIS = np.array([_vectors[:, _real].real, _vectors[:, _upper].real, _vectors[:, _upper].imag]).T
-BACK = np.linalg.inv(BASIS)
+BASIS_INVERSE = np.linalg.inv(BASIS)
 CUBIC = np.linalg.inv(np.vander([0.0, *C], increasing=True))  # values at 0, c_1, c_2, c_3 -> coefficients
 
-UNKNOWNS = 500  # most; with more, sparse solves are faster
+UNKNOWNS = 500  # largest number; beyond it sparse solves are faster
 EMBEDDED = 3  # order of the embedded formula
 NEWTON = 1e-3  # error of Newton's method in units of the tolerance: at 0.03 HIRES is 10 to 100 times less accurate
-ROUNDING = 1e-15  # relative correction that no iteration is asked to go below
-STALLED = 1e-11  # relative correction that is taken for rounding where it does not shrink
+ROUNDING = 1e-15  # relative correction below which no iteration is asked to go
+STALLED = 1e-11  # relative correction that counts as rounding where it does not shrink
 ITERATIONS = 10  # of Newton's method in a step with error control
-REFUSALS = UnstableStepError, NonFiniteError, ConvergenceError  # of a rate that is given a state too far away
-TOGETHER, ENTRIES = 32, 2**20  # steps whose derivatives are taken at once; entries of an array of them
-FAST = 0.03  # share of a correction that is left after an iteration, up to which the Jacobian serves the next step
+REFUSALS = UnstableStepError, NonFiniteError, ConvergenceError  # of a rate at a state too far away
+TOGETHER = 32  # steps whose derivatives are computed at once
+ENTRIES = 2**20  # of an array of them
+FAST = 0.03  # ratio of two corrections up to which the Jacobian is used for the next step
 
 
 class Flat:
@@ -85,39 +100,42 @@ class Flat:
         For messages.
     """
 
-    def __init__(self, problem, u, name):
+    def __init__(self, problem: Problem, u: Any, name: str) -> None:
         require_arrays(name, map(plain, leaves(u)))
-        self.problem, self.timed, self.layout = problem, problem.timed, Unknowns(u, name)
+        self.problem = problem
+        self.timed = problem.timed
+        self.layout = Unknowns(u, name)
         self.size = self.layout.size
         if self.size > UNKNOWNS:
             raise ShapeError(
                 f"{name} solves full systems of at most {UNKNOWNS} unknowns, got {self.size}; take tr_bdf2"
             )
-        self.whole = self.layout.shapes == [(self.size,)]
+        self.is_vector = self.layout.shapes == [(self.size,)]
 
-    def state(self, v):
-        """Flat -> tree."""
-        return v if self.whole else self.layout.split(v)
+    def state(self, v: Any) -> Any:
+        """Return the tree of flat unknowns."""
+        return v if self.is_vector else self.layout.split(v)
 
-    def __call__(self, v, params, t):
-        """The flat rate."""
+    def __call__(self, v: Any, params: Any, t: Any) -> Any:
+        """Return the flat rate."""
         rate = self.problem(self.state(v), params, t)
-        return rate if self.whole else self.layout.flat(rate)
+        return rate if self.is_vector else self.layout.flat(rate)
 
-    def rows(self, points, params, moving):
-        """At points (v, t) the rates, and their derivatives in the state, the params that move, and the time."""
+    def rows(self, points: Iterable[tuple], params: Any, moving: Sequence[bool]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rates at points (v, t), and their derivatives in the state, the moving params, and the time."""
         trees = [(self.state(v), params, t) for v, t in points]
-        return jacobians_of(lambda tree: self.problem(*tree), trees, [*[True] * len(self.layout.shapes), *moving, True])
+        is_differentiated = [*[True] * len(self.layout.shapes), *moving, True]
+        return jacobians_of(lambda tree: self.problem(*tree), trees, is_differentiated)
 
 
 class Radau(Adaptive):
-    """Steps of a problem with few unknowns, any tree of real arrays, and the derivative of those taken.
+    """Steps of a problem with few unknowns, any tree of real arrays, and the derivative of the steps taken.
 
     Parameters
     ----------
     problem : Problem
     jacobian : callable or None
-        For Newton's method alone; derivatives are made from the rate.
+        For Newton's method alone; derivatives are computed from the rate.
     tolerance : float or None
         As `Adaptive`; None: one step.
     floor : None, number, or tree like the state
@@ -129,41 +147,65 @@ class Radau(Adaptive):
     ----------
     params, moving : tree, list of bool
         Of an interval, plain, and which leaves are traced. Each interval has a copy of the scheme.
+    v : flat array or None
+        The state at the start of the step.
     f : flat array
-        The rate at the start of the step.
+        The rate there.
+    J : array or None
+        The Jacobian in use.
+    factored_length : float or None
+        The length of a step for which `real` and `complex` solve the systems of Newton's method.
     real, complex : callable
-        Solves of Newton's method.
+    guess : tuple or None
+        State, length and cubic of the last step.
+    is_fresh, is_slow : bool
+        Whether the Jacobian belongs to this state, and whether the last step converged slowly with it.
     """
 
     window = 10 * WINDOW  # a jump at a fine tolerance takes thousands of steps, of little cost
+    follows_path = False
+    quadrature = tuple(C), tuple(A[2])
     params: Any
     moving: Any
     v: Any = None
     J: Any = None
-    held: Any = None
+    factored_length: Any = None
     guess: Any = None
-    fresh = slow = False
+    is_fresh = False
+    is_slow = False
 
-    def __init__(self, problem, jacobian, tolerance, floor, settings, max_step=None):
+    def __init__(
+        self,
+        problem: Problem,
+        jacobian: Callable | None,
+        tolerance: Any,
+        floor: Any,
+        settings: Any,
+        max_step: float | None = None,
+    ) -> None:
         super().__init__(Scheme(problem, "radau", 5), tolerance, floor, max_step)
-        self.given, self.taken = jacobian, [1.0]
-        self.goal = NEWTON * tolerance if tolerance else settings["rtol"]
-        self.most = ITERATIONS if tolerance else settings["maxiter"] or 50
-        self.compared, self.ratio, self.weight = EMBEDDED, 1.0, 1.0
+        self.user_jacobian = jacobian
+        self.taken = [1.0]
+        self.newton_tolerance = NEWTON * tolerance if tolerance else settings["rtol"]
+        self.max_iterations = ITERATIONS if tolerance else settings["maxiter"] or 50
+        self.compared = EMBEDDED
+        self.ratio = 1.0
+        self.weight = 1.0
 
-    def __call__(self, u, params, t, h):
-        """The state after the interval h."""
-        run, given = self.interval(u, params, t, h)
+    def __call__(self, u: Any, params: Any, t: Any, h: Any) -> Any:
+        """Return the state after the interval h."""
+        run, arguments = self.interval(u, params, t, h)
         if not run.problem.size:
             return u
-        new = run._crossed(given, is_variable)
+        new = run._state_after(arguments, is_variable)
         self.taken = run.taken
         return run.rounded(new)
 
-    def interval(self, u, params, t, h):
-        """A copy for an interval, and what it is given: flat unknowns, the params that move, time and length."""
+    def interval(self, u: Any, params: Any, t: Any, h: Any) -> tuple[Radau, tuple]:
+        """Return a copy for an interval, and its arguments: flat unknowns, moving params, time and length."""
         run = copy(self)
-        run.problem, run.params = Flat(self.problem, u, self.name), constant(untraced(params))
+        run.problem = Flat(self.problem, u, self.name)
+        run.params = constant(untraced(params))
         run.moving = [isbox(leaf) for leaf in leaves(params)]
         v = run.problem.layout.space.join(*(cast(leaf, float) for leaf in leaves(u)))
         if v.size:
@@ -171,36 +213,49 @@ class Radau(Adaptive):
         moving = [leaf for leaf in leaves(params) if isbox(leaf)]
         return run, (v, moving, 0.0 if t is None else t + 0.0, h)
 
-    def rerun(self, path, given, event):
-        runs, starts = zip(*(self.interval(*start) for start in given), strict=True)
-        run, known = runs[0], untraced(starts[0])
-        start = Moving(starts[0], is_variable, [*run.sizes(path[0].u), *map(relative, leaves(known[1:]))])
+    def replay(self, path: list[AcceptedStep], starts: Sequence[tuple], event: Event | None) -> list[tuple]:
+        """Return the ends of accepted steps: (state, time of the event or None) for each perturbed solution."""
+        runs, flat_starts = zip(*(self.interval(*start) for start in starts), strict=True)
+        run = runs[0]
+        arguments = untraced(flat_starts[0])
+        sizes = [*run.sizes(path[0].u), *map(relative_sizes, leaves(arguments[1:]))]
+        start = FlatDeviation(flat_starts[0], is_variable, sizes)
         sizes = run.sizes(path[0].u, path[-1].new)
         time = None
         if event:
-            time = known[2] + (path[-1].done + path[-1].length) * known[3]
-            sizes = [*sizes, known[3]]
-        end = Moving((path[-1].new, time), is_variable, sizes if event else [*sizes, 1.0])
-        entered = anp.array([start.off(one) for one in starts])
-        ends = run._runs(path, known, start, end, entered, event)
-        return [(run.rounded(new), time) for new, time in (end.at(ends[k]) for k in range(len(given)))]
+            time = arguments[2] + (path[-1].done + path[-1].length) * arguments[3]
+        end = FlatDeviation((path[-1].new, time), is_variable, [*sizes, arguments[3] if event else 1.0])
+        entered = anp.array([start.deviation(one) for one in flat_starts])
+        deviations = run._deviations_at_end(path, arguments, start, end, entered, event)
+        ends = []
+        for number in range(len(starts)):
+            new, time = end.tree(deviations[number])
+            ends.append((run.rounded(new), time))
+        return ends
 
-    def tree(self, v):
+    def tree(self, v: Any) -> Any:
+        """Return the state of a step as the user knows it."""
         return self.problem.state(v)
 
-    def rounded(self, v):
+    def rounded(self, v: Any) -> Any:
+        """Return the state at the end of an interval."""
         return self.problem.layout.rounded(v)
 
-    def partial(self, step, known, length):
-        goal, most, self.goal, self.most = self.goal, self.most, ROUNDING, 2 * ITERATIONS
+    def partial_step(self, step: AcceptedStep, arguments: tuple, length: float) -> AcceptedStep | None:
+        """Return the step from the same state with another length, to rounding; None if there is none."""
+        newton_tolerance = self.newton_tolerance
+        max_iterations = self.max_iterations
+        self.newton_tolerance = ROUNDING
+        self.max_iterations = 2 * ITERATIONS
         try:
-            return super().partial(step, (known[0], self.params, *known[2:]), length)
+            return super().partial_step(step, (arguments[0], self.params, *arguments[2:]), length)
         finally:
-            self.goal, self.most = goal, most
+            self.newton_tolerance = newton_tolerance
+            self.max_iterations = max_iterations
 
-    def check(self, *given):
-        """Refuse a state, a rate, or derivatives that it cannot serve."""
-        u, _, t, h = untraced(given)
+    def check(self, *arguments: Any) -> None:
+        """Refuse a state, a rate, or derivatives that the method does not support."""
+        u, _, t, h = untraced(arguments)
         rate = self.problem.problem(u, self.params, t)
         require_arrays(self.name, leaves(rate))
         like(combine(u, (0.0, rate)), u)  # refuses other shapes, and complex
@@ -208,8 +263,8 @@ class Radau(Adaptive):
             raise DerivativeError(
                 f"the rate of {self.name} uses a traced value that is not an argument; put it into params"
             )
-        traced = [leaf for leaf in leaves(given) if isbox(leaf)]
-        if len(traces_of(traced)) > 1:  # the rule below is linear: its own derivative would miss that of the steps
+        traced = [leaf for leaf in leaves(arguments) if isbox(leaf)]
+        if len(traces_of(traced)) > 1:  # the rule below is linear: its own derivative would lack that of these steps
             raise DerivativeError(
                 f"{self.name} has first derivatives only, got one inside another; take tr_bdf2 for second ones"
             )
@@ -218,23 +273,23 @@ class Radau(Adaptive):
         if self.tolerance is not None:
             self.check_tolerance(u)
 
-    follows_path = False
-    quadrature = tuple(C), tuple(A[2])
-
-    def inspector(self, known):
-        """As of `Adaptive`; with the params of the interval."""
-        if self.tolerance is None or self.problem.problem.rate is None and not self.problem.problem.moving:
+    def inspector(self, arguments: tuple) -> RateInspector | None:
+        """Return what looks for jumps of the rate, with the params of the interval; None where it has none."""
+        problem = self.problem.problem
+        if self.tolerance is None or (problem.rate is None and not problem.source_takes_time):
             return None
-        return Inspector(self, self.params, *known[2:])
+        return RateInspector(self, self.params, *arguments[2:])
 
-    def inner_state(self, step):
+    def inner_state(self, step: AcceptedStep) -> tuple[Any, float]:
         """Return the second stage, and the share of the step at which it is."""
         return step.u + step.middle[1], C[1]
 
-    def _steps(self, v, params, t, h, inspector=None):
+    def _steps(
+        self, v: Any, params: Any, t: Any, h: Any, inspector: RateInspector | None = None
+    ) -> Iterable[AcceptedStep]:
         if self.tolerance is not None:
             return super()._steps(v, self.params, t, h, inspector)
-        self._first(v, self.params, t, h)  # refuses what is not finite
+        self._first_length(v, self.params, t, h)  # refuses a rate that is not finite
         with np.errstate(all="ignore"):
             z = self.stages(v, t, h)
         if z is None:
@@ -242,18 +297,22 @@ class Radau(Adaptive):
                 f"{self.name}: Newton's method does not converge in a step of {h:.3g}; "
                 "take a smaller dt, or give stepper a tolerance"
             )
-        return [Taken(1.0, 0.0, v, z, v + z[2])]
+        return [AcceptedStep(1.0, 0.0, v, z, v + z[2])]
 
-    def _trial(self, v, params, t, length, h, inspector=None):
-        """The stages, the new state, and the error of the embedded formula in units of the tolerance."""
-        h, again = length * h, v is self.v
-        with np.errstate(all="ignore"):  # a step that is too long is refused, whatever it gave
+    def _trial(
+        self, v: Any, params: Any, t: Any, length: float, h: Any, inspector: RateInspector | None = None
+    ) -> tuple[Any, Any, float]:
+        """Return the stages, the new state, and the error of the embedded formula in units of the tolerance."""
+        h = length * h
+        is_second_trial = v is self.v
+        with np.errstate(all="ignore"):  # a step that is too long is refused in any case
             z = self.stages(v, t, h)
             if z is None:
                 return None, None, np.inf
-            units, e = self.units(v, v + z[2]) * self.tolerance, E @ z / h
+            units = self.units(v, v + z[2]) * self.tolerance
+            e = E @ z / h
             error = self.real(self.f + e, False)
-            if again and norm(error / units) > 1:
+            if is_second_trial and norm(error / units) > 1:
                 try:
                     error = self.real(self.problem(v + error, params, t) + e, False)
                 except REFUSALS:
@@ -261,25 +320,30 @@ class Radau(Adaptive):
             ratio = norm(error / units)
         return z, v + z[2], ratio if np.isfinite(ratio) else np.inf
 
-    def sizes(self, *states):
+    def sizes(self, *states: Any) -> list:
+        """Return |u| + floor, to which errors are compared, flat; the larger of several states."""
         return [np.concatenate([*map(np.ravel, super().sizes(*map(self.problem.state, states)))])]
 
-    def units(self, v, w):
-        """|v| + floor, to which errors are compared, the larger of two states."""
+    def units(self, v: Any, w: Any) -> np.ndarray:
+        """Return |v| + floor, to which errors are compared, the larger of two states; 1 in place of 0."""
         (size,) = self.sizes(v, w)
         return np.where(size > 0, size, 1.0)
 
     # ------------------------------------------------------------ Newton's method
 
-    def stages(self, v, t, h):
-        """The stages z of a step, or None where Newton's method does not converge."""
+    def stages(self, v: Any, t: Any, h: Any) -> np.ndarray | None:
+        """Return the stages z of a step, or None where Newton's method does not converge."""
         try:
             if v is not self.v:
-                self.f, self.J = self.problem(v, self.params, t), None if self.slow else self.J
-                self.v, self.fresh = v, False
+                self.f = self.problem(v, self.params, t)
+                self.v = v
+                self.is_fresh = False
+                if self.is_slow:
+                    self.J = None
             z = self._newton(v, t, h) if self.J is not None else None
-            if z is None and not self.fresh:
-                self.fresh, self.held = True, None
+            if z is None and not self.is_fresh:
+                self.is_fresh = True
+                self.factored_length = None
                 self.J = self.jacobian(v, t)
                 z = self._newton(v, t, h)
         except REFUSALS:
@@ -288,142 +352,193 @@ class Radau(Adaptive):
             self.guess = v, h, CUBIC @ np.vstack([v, v + z])
         return z
 
-    def jacobian(self, v, t):
-        """df/du for Newton's method."""
+    def jacobian(self, v: Any, t: Any) -> np.ndarray:
+        """Return df/du for Newton's method."""
         n = self.problem.size
-        if self.given is None:
+        if self.user_jacobian is None:
             return self.problem.rows([(v, t)], self.params, [False] * len(self.moving))[1][0, :, :n]
         u = self.problem.state(v)
         if type(self.params) is Sided:
             u, t = self.params.side.inside(u, self.params.params, t)
-        args = (u, unsided(self.params), t)
-        J = as_matrix(self.given(*args[: 2 + self.problem.timed])).toarray()
+        arguments = (u, unsided(self.params), t)
+        J = as_matrix(self.user_jacobian(*arguments[: 2 + self.problem.timed])).toarray()
         check_shape(f"the jacobian of {self.name}", J, (n, n))
         return J
 
-    def _newton(self, v, t, h):
+    def _newton(self, v: Any, t: Any, h: Any) -> np.ndarray | None:
+        """Run Newton's method for the stages, by the Jacobian at hand; None where it does not converge."""
         h = float(h)  # complex numbers of Python and of NumPy divide with other roundings
-        if self.held != h:
-            solves = (dense_lu(value / h * np.eye(v.size) - self.J)[0] for value in (REAL, COMPLEX))
-            self.held, (self.real, self.complex) = h, solves
-        z, last, left = np.zeros((3, v.size)), 0.0, 0.0
+        if self.factored_length != h:
+            self.real = dense_lu(REAL / h * np.eye(v.size) - self.J)[0]
+            self.complex = dense_lu(COMPLEX / h * np.eye(v.size) - self.J)[0]
+            self.factored_length = h
+        z = np.zeros((3, v.size))
         if self.guess is not None:  # the cubic through the last stages; from there, or again from the same state
-            start, before, cubic = self.guess
-            z = np.vander(C * h / before + (start is not v), 4, increasing=True) @ cubic - v
-        w = BACK @ z
-        for iteration in range(1, self.most + 1):
+            start, length, cubic = self.guess
+            z = np.vander(C * h / length + (start is not v), 4, increasing=True) @ cubic - v
+        w = BASIS_INVERSE @ z
+        last = 0.0  # size of the last correction
+        ratio = 0.0
+        for iteration in range(1, self.max_iterations + 1):
             rates = [self.problem(v + part, self.params, t + c * h) for part, c in zip(z, C, strict=True)]
-            f = BACK @ np.array(rates)
+            f = BASIS_INVERSE @ np.array(rates)
             one = self.real(f[0] - REAL / h * w[0], False)
             pair = self.complex(f[1] + 1j * f[2] - COMPLEX / h * (w[1] + 1j * w[2]), False)
-            step = np.array([one, pair.real, pair.imag])
-            w, step = w + step, BASIS @ step
-            z = z + step
+            correction = np.array([one, pair.real, pair.imag])
+            w = w + correction
+            correction = BASIS @ correction
+            z = z + correction
             if iteration == 1:
                 size = self.units(v, v + z[2])
-            moved = norm(step / size)
-            left = moved / last if last else 0.0
-            error = moved * left / (1 - left) if left < 1 else np.inf
-            if moved == 0.0 or last and error <= max(self.goal, ROUNDING):
+            moved = norm(correction / size)
+            ratio = moved / last if last else 0.0
+            error = moved * ratio / (1 - ratio) if ratio < 1 else np.inf
+            if moved == 0.0 or (last and error <= max(self.newton_tolerance, ROUNDING)):
                 break
-            if not (np.isfinite(error) and left ** (self.most - iteration - 1) * error <= self.goal):
+            rest = self.max_iterations - iteration
+            if not (np.isfinite(error) and ratio ** (rest - 1) * error <= self.newton_tolerance):
                 return z if moved <= STALLED else None
             last = moved
-        self.slow = left > FAST and iteration > 2
+        self.is_slow = ratio > FAST and iteration > 2
         return z
 
     # ------------------------------------------------------------ the derivative of the steps taken
 
-    def doors(self, count):
-        return super().doors(count) if self.tolerance else (lambda x: x[None], lambda x: x[0])
+    def perturbed_solutions(self, count: int) -> tuple[Callable, Callable]:
+        """Return the functions `perturb` and `evaluate`; without error control there is one solution alone."""
+        if self.tolerance:
+            return super().perturbed_solutions(count)
+        return (lambda x: x[None]), (lambda x: x[0])
 
-    def _runs(self, path, known, start, end, entered, event=None):
-        """As a linear map of (u, params that move, t, h); all d so far stand between the first two.
+    def _deviations_at_end(
+        self,
+        path: list,
+        arguments: tuple,
+        start: FlatDeviation,
+        end: FlatDeviation,
+        entered: Any,
+        event: Event | None = None,
+    ) -> Any:
+        """Return the deviations at the end: a linear map of those of (u, moving params, t, h).
 
-        Where an event ends the path, its time is that of the steps and all d.
+        Inside, the sum of all d so far stands between the first two. Where an event ends the path, its time is the
+        time of the steps and all d.
         """
-        *_, t, h = known
-        n, less = self.problem.size, np.array(LESS[: len(entered)])
-        size, scales = np.concatenate([*map(np.ravel, end.units)]), np.concatenate([*map(np.ravel, start.units)])
-        many = int(np.clip(ENTRIES / (9 * n * scales.size), 1, TOGETHER))
-        parts = [path[first : first + many] for first in range(0, len(path), many)]
+        *_, t, h = arguments
+        n = self.problem.size
+        less = np.array(LESS[: len(entered)])
+        end_units = np.concatenate([*map(np.ravel, end.units)])
+        start_units = np.concatenate([*map(np.ravel, start.units)])
+        n_together = int(np.clip(ENTRIES / (9 * n * start_units.size), 1, TOGETHER))
+        groups = [path[first : first + n_together] for first in range(0, len(path), n_together)]
 
-        def tangent(x):
-            """Tangents of what goes in -> of the states at the end, both in units of their sizes."""
-            y = np.insert(x * scales, n, 0.0, axis=1).T
-            if x.any():  # else it is the value that goes on the tape
-                for part in parts:
-                    for step, shadow in self._linearised(part, path[-1], t, h, event):
-                        y[: n + 1] = step @ y + less * (shadow @ y)
+        def tangent(x: np.ndarray) -> np.ndarray:
+            """Return the tangents at the end, from those at the start, both in units of the sizes."""
+            y = np.insert(x * start_units, n, 0.0, axis=1).T
+            if x.any():  # else it is the value that the tape records
+                for group in groups:
+                    for step, correction in self._linearised(group, path[-1], t, h, event):
+                        y[: n + 1] = step @ y + less * (correction @ y)
             if event:
-                y[n] += y[-2]  # its time: that of the start, and all d
-            return y[: size.size].T / size
+                y[n] += y[-2]  # its time: the start, and all d
+            return y[: end_units.size].T / end_units
 
-        def cotangent(g):
-            """The transpose."""
-            y = np.zeros((scales.size + 1, len(g)))
-            y[: size.size] = (g / size).T
+        def cotangent(g: np.ndarray) -> np.ndarray:
+            """Apply the transpose."""
+            y = np.zeros((start_units.size + 1, len(g)))
+            y[: end_units.size] = (g / end_units).T
             of_time = y[n].copy() if event else 0.0
-            for part in reversed(parts):
-                for step, shadow in self._linearised(part, path[-1], t, h, event)[::-1]:
+            for group in reversed(groups):
+                for step, correction in self._linearised(group, path[-1], t, h, event)[::-1]:
                     head = y[: n + 1].copy()
                     y[: n + 1] = 0.0
-                    y += step.T @ head + shadow.T @ (less * head)
+                    y += step.T @ head + correction.T @ (less * head)
             y[-2] += of_time
-            return np.delete(y, n, 0).T * scales
+            return np.delete(y, n, 0).T * start_units
 
         return linear(f"{self.name}.steps", tangent, cotangent)[0](entered)
 
-    def _linearised(self, steps, end, t, h, event):
-        """Of some steps the derivatives of (u, all d) after each, and what the shadow adds; `end`: the last one of all.
+    def _linearised(
+        self, steps: list[AcceptedStep], end: AcceptedStep, t: float, h: float, event: Event | None
+    ) -> np.ndarray:
+        """Return the derivatives of (u, all d) after each step, and what less extrapolation adds to them.
 
-        Array (steps, 2, n + 1, numbers that go in and all d).
+        Parameters
+        ----------
+        steps : list of AcceptedStep
+        end : AcceptedStep
+            The last one of the interval.
+        t, h : float
+            Of the interval.
+        event : Event or None
+
+        Returns
+        -------
+        array (steps, 2, n + 1, numbers at the start and all d)
         """
-        ends = event and steps[-1] is end
-        n, one = self.problem.size, np.eye(self.problem.size)
+        n = self.problem.size
+        m = len(steps)
+        one = np.eye(n)
         length, done, u, z, new = (np.array(part) for part in zip(*steps, strict=True))
         places = [(u, done), (new[-1:], done[-1:] + length[-1:])]
         places += [(u + z[:, i], done + C[i] * length) for i in (0, 1)]
         states, shares = (np.concatenate(part) for part in zip(*places, strict=True))
-        rates, rows = self.problem.rows([*zip(states, t + shares * h, strict=True)], self.params, self.moving)
-        m, last = len(steps), np.array([step is end for step in steps])
-        first, rows = rows[:m], np.stack([rows[m + 1 : -m], rows[-m:], rows[1 : m + 1]], 1)
+        points = [*zip(states, t + shares * h, strict=True)]
+        rates, rows = self.problem.rows(points, self.params, self.moving)
+        # Points: the starts of the steps, the end of the last one, the first and the second stages.
+        first = rows[:m]
+        rows = np.stack([rows[m + 1 : -m], rows[-m:], rows[1 : m + 1]], 1)
+        is_last = np.array([step is end for step in steps])
         sections = [self.section(*row)[0][0] for row in zip(u, rates[:m, None], length * h)]
-        section = np.where(last[:, None], 0.0, sections)
-        if event:
-            last = np.zeros(m, bool)
-        interval = h
-        length, done, last, h = (part[:, None, None] for part in (length, done, last, length * h))
-        hA = h * A
+        section = np.where(is_last[:, None], 0.0, sections)
+        gives_back = np.zeros(m, bool) if event else is_last
+        lengths = (length * h)[:, None, None]
+        length = length[:, None, None]
+        done = done[:, None, None]
+        last = gives_back[:, None, None]
+        hA = lengths * A
         K = np.eye(3 * n) - np.einsum("sab,sbij->saibj", hA, rows[..., :n]).reshape(m, 3 * n, 3 * n)
-        b = np.concatenate([np.einsum("sab,sbij->saij", hA, rows), (z / h + (hA * C) @ rows[..., -1])[..., None]], -1)
+        by_input = np.einsum("sab,sbij->saij", hA, rows)
+        by_length = z / lengths + (hA * C) @ rows[..., -1]
+        b = np.concatenate([by_input, by_length[..., None]], -1)
         dz = solved(K, b.reshape(m, 3 * n, -1)).reshape(b.shape)
-        error = np.concatenate([first, -np.swapaxes(E[None] @ z / h / h, 1, 2)], 2) + np.tensordot(E, dz, (0, 1)) / h
-        M = np.stack([dz[:, 2] + np.eye(n, b.shape[-1]), solved(REAL / h * one - first[..., :n], error)], 1)
-        stretch = M[..., -1].copy()  # of the new state with the length
+        error = (
+            np.concatenate([first, -np.swapaxes(E[None] @ z / lengths / lengths, 1, 2)], 2)
+            + np.tensordot(E, dz, (0, 1)) / lengths
+        )
+        M = np.stack([dz[:, 2] + np.eye(n, b.shape[-1]), solved(REAL / lengths * one - first[..., :n], error)], 1)
+        stretch = M[..., -1].copy()  # derivative of the new state in the length
         M[..., -1] = done * M[..., -2] + length * stretch
         M = np.insert(M, n, M[..., -2] - last * stretch, axis=3)  # the last step gives all d back
         M[..., :n] += stretch[..., None] * section[:, None, None]
         shift = np.zeros((m, 2, 1, M.shape[3]))
-        shift[:, 0, 0, : n + 1] = np.insert(section, n, ~last[:, 0, 0], axis=1)
-        if ends:
-            start = t + end.done * interval
-            self._end_at(event, end, start, end.length * interval, M[-1], shift[-1, :, 0], stretch[-1])
+        shift[:, 0, 0, : n + 1] = np.insert(section, n, ~gives_back, axis=1)
+        if event and is_last[-1]:
+            start = t + end.done * h
+            self._end_at_event(event, end, start, end.length * h, M[-1], shift[-1, :, 0], stretch[-1])
         return np.concatenate([M, shift], 2)
 
-    def _end_at(self, event, step, t, length, M, shift, stretch):
-        """Let d of the last step be that with which the event stays 0; `M` and `shift` are written into.
+    def _end_at_event(
+        self,
+        event: Event,
+        step: AcceptedStep,
+        t: float,
+        length: float,
+        M: np.ndarray,
+        shift: np.ndarray,
+        stretch: np.ndarray,
+    ) -> None:
+        """Choose d of the last step so that the event stays 0; write it into `M` and `shift`.
 
         With the new state M x + stretch d and the time S + t + d, S all d before,
 
             d = -(g_u M x + g_p p + g_t (S + t)) / (g_u stretch + g_t).
         """
-        n, params = self.problem.size, unsided(self.params)
-        u = self.problem.state(step.new)
+        n = self.problem.size
+        params = unsided(self.params)
+        point = self.problem.state(step.new), params, t + length
         moving = [*[True] * len(self.problem.layout.shapes), *self.moving[: len(leaves(params))], True]
-        _, rows = jacobians_of(
-            lambda point: event.value(point[0], unsided(point[1]), point[2]), [(u, params, t + length)], moving
-        )
+        _, rows = jacobians_of(lambda point: event.value(point[0], unsided(point[1]), point[2]), [point], moving)
         of_state, of_params, of_time = np.split(rows[0, 0], [n, rows.shape[2] - 1])
         change = float(of_state @ stretch[0] + of_time[0])
         self._check_transversal(event, step, (None, self.params, t), change, length)
@@ -439,11 +554,11 @@ class Radau(Adaptive):
         shift[1] += second
 
 
-def solved(matrices, b):
-    """Of each matrix the solution for its right-hand sides."""
+def solved(matrices: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the solution of each matrix for its right-hand sides."""
     return np.array([dense_lu(matrix)[0](part, False) for matrix, part in zip(matrices, b, strict=True)])
 
 
-def norm(x):
-    """Root mean square; of three stages the root of the sum of theirs."""
+def norm(x: np.ndarray) -> float:
+    """Return the root mean square; of three stages the root of the sum of their squares."""
     return float(np.sqrt(np.vdot(x, x) / x.shape[-1]))

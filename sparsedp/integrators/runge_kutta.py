@@ -301,10 +301,10 @@ def imex(stages, u, params, t, h):
         """u and the multiples of rates, where there is a rate."""
         return combine(u, *(pair for pair in pairs if pair[1] is not None))
 
-    first = stages.problem.explicit(u, params, t)
+    first = stages.problem.rate_value(u, params, t)
     b = ahead((D * h, first))
     x = stages.solve(u, b, params, later(t, D * h), D * h)
-    second = stages.problem.explicit(x, params, later(t, D * h))
+    second = stages.problem.rate_value(x, params, later(t, D * h))
     moved = combine(x, (-1.0, b))  # d (z L x + h s)
     b = ahead((E * h, first), ((1 - E) * h, second), ((1 - D) / D, moved))
     return stages.solve(x, b, params, later(t, h), D * h)
@@ -351,7 +351,7 @@ class Linear(Stages):
     def _resolved(self, h, params, b, *shares):
         """(1 - h c L)^-1 (b + the sum of factor * s(t) over pairs (factor, t)), field by field."""
         if self.problem.source is not None:
-            b = combine(b, *((factor, self.problem.given(params, t)) for factor, t in shares))
+            b = combine(b, *((factor, self.problem.source_value(params, t)) for factor, t in shares))
         return self.problem.on_fields(
             lambda L, z, leaf: leaf if L is None else self.resolvents[L](z, leaf), h, params, b
         )

@@ -18,7 +18,7 @@ from sparsedp._utils.validation import (
 from sparsedp.autodiff.derivative import is_finite
 from sparsedp.autodiff.tape import is_variable, plain
 from sparsedp.errors import NonFiniteError, UnstableStepError
-from sparsedp.integrators.problem import Problem, like, number, pair
+from sparsedp.integrators.problem import Problem, check_pair, like, real_number
 from sparsedp.integrators.runge_kutta import (
     EXPLICIT,
     IMPLICIT,
@@ -233,7 +233,7 @@ def stepper(
         check_number("tolerance of stepper", tolerance, "between 0 and 1", "; write for example 1e-6")
     if not all(map(_is_floor, leaves(floor))):
         raise ValueError(f"floor must hold finite numbers >= 0, in the units of u, got {floor!r}; write 1e-3")
-    dt = dt if callable(dt) else number(dt, "dt", "> 0")
+    dt = dt if callable(dt) else real_number(dt, "dt", "> 0")
     scheme, limits = _scheme(method, given, settings), []
     if method in EXPLICIT and tolerance is None and unstable == "raise":
         limits = [(term, largest_step(term.op, EXPLICIT[method].reach)) for term in scheme.problem.stiff]
@@ -307,7 +307,8 @@ def _interrupted(scheme, given):
     breaks, events = given["breaks"], given["events"]
     if breaks is None and events is None:
         return scheme
-    from sparsedp.integrators.interruptions import Interrupted, break_times, event_list
+    from sparsedp.integrators.events import break_times, event_list
+    from sparsedp.integrators.interruptions import Interrupted
 
     breaks = break_times(() if breaks is None else breaks)
     return Interrupted(scheme, breaks, event_list([] if events is None else events))
@@ -420,7 +421,7 @@ class Step(Remade):
         )
 
     def _length(self, params):
-        return number(self.dt(params), "dt", "> 0") if callable(self.dt) else self.dt
+        return real_number(self.dt(params), "dt", "> 0") if callable(self.dt) else self.dt
 
     def check_reversible(self):
         """Refuse a step that `back` cannot turn round."""
@@ -441,7 +442,7 @@ class Step(Remade):
     def _parts(self, state):
         if not self.problem.timed:
             return state, None
-        return pair(f"the state of {self.name}, whose rate takes a time,", state, "(u, t)")
+        return check_pair(f"the state of {self.name}, whose rate takes a time,", state, "(u, t)")
 
     def _blame(self, state, params):
         """Refuse arguments that are not finite."""

@@ -290,7 +290,7 @@ def test_reversed_steps_refuse():
     with pytest.raises(ValueError, match=r"stepper\(rk4\) cannot be reversed; write 'leapfrog'"):
         dp.rollout(dp.stepper("rk4", lambda u, c: u, 0.1), 1.0, None, 3, memory="reverse")
     message = (
-        r"memory='reverse' needs a step with step.back\(state, params\), got .*; write memory='200 MB', or make it by "
+        r"memory='reverse' needs a step with step.back\(state, params\), got .*; write memory='200 MB', or take a step "
     )
     with pytest.raises(ValueError, match=message):
         dp.rollout(lambda u, c: u, 1.0, None, 3, memory="reverse")
