@@ -174,13 +174,13 @@ def test_an_option_that_a_scheme_does_not_use_is_refused(scheme):
 
 
 @pytest.mark.parametrize("word", ["midpoint", "clamped", "unclamped midpoint"])
-def test_the_words_of_form_in_the_first_edition(word):
+def test_old_values_of_form_are_refused(word):
     message = f"form= of transport must be one of flux, advective, got '{word}'; write backtrace= or clamp="
     with pytest.raises(ValueError, match=message):
         dp.transport(GRID, "maccormack", form=word)
 
 
 @pytest.mark.parametrize("options", [{"clamp": 1}, {"clamp": None}, {"backtrace": np.array(["euler"])}, {"form": True}])
-def test_words_of_another_kind_are_refused(options):
+def test_options_of_a_wrong_type_are_refused(options):
     with pytest.raises(ValueError, match="of transport must be one of"):
         dp.transport(GRID, "maccormack", **options)

@@ -55,7 +55,7 @@ class Recovery:
 
 
 @pytest.mark.parametrize("start", ["rest", "mixed"])
-def test_a1_gradient_is_the_hand_formula(start):
+def test_velocity_gradient_agrees_with_a_hand_written_adjoint(start):
     case = Recovery()
     u = np.zeros(case.n) if start == "rest" else np.where(np.arange(64) % 5, 0.7 - case.x, 0.0)
     loss, g = value_and_grad(case.loss)(u)
@@ -65,7 +65,7 @@ def test_a1_gradient_is_the_hand_formula(start):
         assert loss == pytest.approx(9.30, abs=0.005)
 
 
-def test_a1_gradient_is_the_central_difference():
+def test_velocity_gradient_agrees_with_central_differences():
     case = Recovery()
     u = 0.4 + 0.5 * np.cos(7 * case.x)
     d = np.sin(3 * np.arange(64.0))
@@ -74,7 +74,7 @@ def test_a1_gradient_is_the_central_difference():
     assert min(errors) <= 1e-8
 
 
-def test_a1_from_rest():
+def test_velocity_is_recovered_from_rest():
     case = Recovery()
     best = dp.minimize(case.loss, np.zeros(64), maxiter=60)
     assert best.value <= 2.5
@@ -94,14 +94,14 @@ def amplitude(c, steps, **options):
 
 
 @pytest.mark.parametrize("velocity", ["faces", "cells"])
-def test_a2_damping(velocity):
+def test_damping_of_a_wave(velocity):
     assert amplitude(0.5, 200, velocity=velocity) == pytest.approx(0.906003342970, rel=1e-12)
     assert amplitude(0.8, 125, velocity=velocity) == pytest.approx(0.961291201325, rel=1e-12)
 
 
 @pytest.mark.parametrize("velocity, form", [("faces", "flux"), ("faces", "advective"), ("cells", "advective")])
 @pytest.mark.parametrize("speed", [1.0, -1.0, 3.0])
-def test_a2_shift_and_growth(velocity, form, speed):
+def test_exact_shift_and_growth_of_a_wave(velocity, form, speed):
     grid = dp.Grid(100, size=1.0, periodic=True)
     u = np.random.default_rng(0).random(100)
     v = np.full(100, speed)
@@ -131,14 +131,14 @@ def rotate(n, scheme, steps):
     return error.mean(), np.sqrt(np.mean(error**2)), error.max(), u.max()
 
 
-def test_a3_fingerprint():
+def test_errors_of_a_rotating_hump():
     found = rotate(64, "upwind", 8 * 64)
     wanted = 2.425287983808e-02, 8.258573849961e-02, 7.819941318319e-01, 2.139710394875e-01
     np.testing.assert_allclose(found, wanted, rtol=1e-10)
 
 
 @pytest.mark.whole
-def test_a3_van_leer_is_at_least_three_times_better():
+def test_van_leer_is_three_times_more_accurate():
     assert 3 * rotate(128, "van_leer", 16 * 128)[0] <= rotate(128, "upwind", 8 * 128)[0]
 
 
@@ -220,7 +220,7 @@ def test_flux_form_conserves(scheme, of, shape):
 
 @pytest.mark.parametrize("scheme", ["upwind", "van_leer"])
 @pytest.mark.parametrize("of", ["cells", "faces"])
-def test_a_flow_without_divergence_keeps_constants(scheme, of):
+def test_a_divergence_free_flow_preserves_constants(scheme, of):
     rng = np.random.default_rng(3)
     grid = dp.Grid((8, 7), spacing=[rng.uniform(0.5, 1.5, n) for n in (8, 7)], periodic=(True, False))
     psi = rng.normal(size=grid.nodes.shape)
@@ -229,7 +229,7 @@ def test_a_flow_without_divergence_keeps_constants(scheme, of):
     np.testing.assert_allclose(move(np.ones(move.space.shape), v, 0.02), 1.0, rtol=1e-13)
 
 
-def test_van_leer_makes_no_new_extrema():
+def test_van_leer_creates_no_new_extrema():
     grid = dp.Grid(60, size=1.0, periodic=True)
     move = dp.transport(grid, "van_leer")
     u = np.random.default_rng(4).random(60)
@@ -240,7 +240,7 @@ def test_van_leer_makes_no_new_extrema():
         u = new
 
 
-def test_solids_stay_and_let_nothing_through():
+def test_solid_cells_keep_their_value_and_block_fluxes():
     rng = np.random.default_rng(5)
     grid = dp.Grid((9, 8), size=1.0)
     solid = np.zeros((9, 8), bool)

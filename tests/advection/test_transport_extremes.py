@@ -24,7 +24,7 @@ def scene(scheme, shape=(6, 5), velocity="faces", form=None, of="cells", **optio
 
 @SCHEMES
 @pytest.mark.parametrize("velocity, form, of", EVERY)
-def test_rest_is_the_identity_with_a_gradient(scheme, velocity, form, of):
+def test_zero_velocity_is_the_identity_with_a_gradient(scheme, velocity, form, of):
     move, u, v, q = scene(scheme, velocity=velocity, form=form, of=of)
     np.testing.assert_array_equal(move(u, 0 * v, 0.1, q), u)
     slope = value_and_grad(lambda v: anp.sum(move(u, v, 0.1, q) ** 2))(0 * v)[1]
@@ -34,7 +34,7 @@ def test_rest_is_the_identity_with_a_gradient(scheme, velocity, form, of):
 @SCHEMES
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("velocity, form, of", EVERY)
-def test_not_finite(scheme, velocity, form, of, value):
+def test_nonfinite_arguments_are_refused(scheme, velocity, form, of, value):
     move, *args = scene(scheme, velocity=velocity, form=form, of=of)
     for number, words in enumerate(("field", "velocity", "inflow")):
         for index in (0, -1, args[number].size // 2):
@@ -45,7 +45,7 @@ def test_not_finite(scheme, velocity, form, of, value):
 
 
 @SCHEMES
-def test_not_finite_is_found_inside_solids_and_with_closed_walls(scheme):
+def test_nonfinite_values_in_solids_and_at_closed_walls_are_refused(scheme):
     move, u, v, q = scene(scheme, solid=np.ones((6, 5), bool))
     for number in range(3):
         bad = [u.copy(), v.copy(), q.copy()]
@@ -56,14 +56,14 @@ def test_not_finite_is_found_inside_solids_and_with_closed_walls(scheme):
 
 @SCHEMES
 @pytest.mark.parametrize("dt", [0, -1.0, -np.inf, np.nan, np.inf])
-def test_time_step_that_is_none(scheme, dt):
+def test_invalid_time_steps_are_refused(scheme, dt):
     move, u, v, q = scene(scheme)
     with pytest.raises(ValueError, match="dt of .* must be (> 0|finite), got"):
         move(u, v, dt, q)
 
 
 @pytest.mark.parametrize("scheme, most", [("upwind", 1.0), ("van_leer", 0.5)])
-def test_largest_step_is_exact(scheme, most):
+def test_the_stated_largest_step_is_stable(scheme, most):
     """At the limit it passes, a little above it does not, and the message names the limit."""
     move, u, v, q = scene(scheme, (7,))
     with pytest.raises(UnstableStepError, match="the largest stable dt is") as caught:
@@ -91,7 +91,7 @@ def test_scaling_keeps_the_bits(scheme, power):
 
 @SCHEMES
 @pytest.mark.parametrize("velocity", ["faces", "cells"])
-def test_a_derivative_beyond_the_floats_is_an_error(scheme, velocity):
+def test_an_overflowing_derivative_is_an_error(scheme, velocity):
     """Field and cotangent of 2^900: their product, the gradient in the velocity, is refused, not infinity."""
     move, u, v, q = scene(scheme, velocity=velocity)
     u = 2.0**900 * u
@@ -118,7 +118,7 @@ def disguises(x):
 
 @SCHEMES
 @pytest.mark.parametrize("of", ["cells", "faces"])
-def test_every_kind_of_array(scheme, of):
+def test_array_layouts_and_dtypes(scheme, of):
     move, u, v, q = scene(scheme, of=of)
     kept = [x.copy() for x in (u, v, q)]
     wanted = move(u, v, 0.01, q)
@@ -137,7 +137,7 @@ def test_every_kind_of_array(scheme, of):
 
 @SCHEMES
 @pytest.mark.parametrize("kind", [np.float32, np.int32, np.uint8, bool])
-def test_other_kinds_of_numbers(scheme, kind):
+def test_complex_and_integer_arguments(scheme, kind):
     move, u, v, q = scene(scheme)
     x = (np.abs(u) > 0.5).astype(kind) if np.dtype(kind).kind in "bu" else (10 * u).astype(kind)
     w = v.astype(np.float32)

@@ -43,7 +43,7 @@ def results(move, u, v, q):
 
 
 @NUMBA
-def test_compiled_is_the_reference(monkeypatch):
+def test_compiled_loops_agree_with_the_reference(monkeypatch):
     for scene in scenes():
         compiled = results(*scene)
         with monkeypatch.context() as patch:
@@ -65,7 +65,7 @@ def test_bits_do_not_depend_on_threads(monkeypatch):
 
 
 @NUMBA
-def test_the_reference_takes_over_where_nothing_can_be_compiled(monkeypatch):
+def test_fallback_when_compilation_fails(monkeypatch):
     def refuse(words):
         raise TypeError("no such target")
 
@@ -80,7 +80,7 @@ def test_the_reference_takes_over_where_nothing_can_be_compiled(monkeypatch):
     np.testing.assert_allclose(new, wanted, rtol=1e-14)
 
 
-def test_parts_that_are_asked_alone_are_the_same():
+def test_separate_cotangents_are_bit_equal():
     for move, u, v, q in scenes():
         _, *all_three, field, velocity, inflow = results(move, u, v, q)
         np.testing.assert_array_equal(field, all_three[0])
@@ -88,7 +88,7 @@ def test_parts_that_are_asked_alone_are_the_same():
         np.testing.assert_array_equal(inflow, all_three[2])
 
 
-def test_lines_that_are_short_everywhere():
+def test_a_short_last_axis():
     """A grid whose last axis has few cells is gathered instead of cut into segments."""
     grid = dp.Grid((3000, 2), size=1.0)
     move = dp.transport(grid)
@@ -120,7 +120,7 @@ def loop_of(limiter):
 
 @pytest.mark.parametrize("limiter", [minmod, pytest.param(parabola, marks=pytest.mark.whole)])
 @pytest.mark.parametrize("velocity, form", FORMS)
-def test_other_limiters(limiter, velocity, form, monkeypatch):
+def test_custom_limiters(limiter, velocity, form, monkeypatch):
     """A scheme is a function and a line: its loops, its tangent and its cotangents are there."""
     scheme = fluxes.Scheme(limiter, (0.0, 0.75, 1 / 3), 1.0, limiter is minmod)
     monkeypatch.setitem(fluxes.SCHEMES, "van_leer", scheme)
@@ -147,7 +147,7 @@ def test_other_limiters(limiter, velocity, form, monkeypatch):
 
 
 @NUMBA
-def test_arrays_kept_between_calls_change_nothing():
+def test_recycled_buffers_do_not_change_results():
     grid = dp.Grid((200, 190), size=1.0)
     move = dp.transport(grid, "van_leer")
     rng = np.random.default_rng(2)

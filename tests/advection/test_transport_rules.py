@@ -106,7 +106,7 @@ def test_second_order_of_van_leer_is_refused():
         pushforward(lambda u: value_and_grad(lambda u: loss({**args, "u": u}))(u)[1], args["u"], args["u"])
 
 
-def test_operator_is_the_step_and_refused_where_there_is_none():
+def test_operator_agrees_with_the_step_of_linear_schemes():
     for grid, (velocity, form), of in product(GRIDS.values(), FORMS, ("cells", "faces")):
         move, args, _ = scene("upwind", grid, velocity, form, of)
         op = move.operator(args["v"], args["dt"])
@@ -120,7 +120,7 @@ def test_operator_is_the_step_and_refused_where_there_is_none():
 # ---- what is computed -----------------------------------------------------------------------------------------------
 
 
-def test_only_what_is_asked_is_computed(monkeypatch):
+def test_only_requested_cotangents_are_computed(monkeypatch):
     move, args, loss = scene("upwind", GRIDS["2-D"], "faces", "flux")
     asked = []
     pull = Eulerian.vjp
@@ -147,7 +147,7 @@ def test_each_step_is_one_rule():
 
 
 @pytest.mark.parametrize("scheme", ["upwind", "van_leer"])
-def test_the_same_bits_twice(scheme):
+def test_gradients_are_reproducible(scheme):
     _, args, loss = scene(scheme, GRIDS["3-D"], "faces", "flux")
     first, second = (value_and_grad(loss)(args)[1] for _ in range(2))
     for name in args:
@@ -156,7 +156,7 @@ def test_the_same_bits_twice(scheme):
 
 @pytest.mark.parametrize("scheme", ["upwind", "van_leer"])
 @pytest.mark.parametrize("velocity", ["faces", "cells"])
-def test_steps_share_a_velocity(scheme, velocity):
+def test_gradient_in_a_velocity_shared_by_steps(scheme, velocity):
     """They add its cotangent up in one array, that nothing else holds: as if each had a velocity of its own."""
     move, args = scene(scheme, GRIDS["2-D"], velocity, "advective")[:2]
     u, v, dt, inflow = args.values()
@@ -185,7 +185,7 @@ def test_steps_share_a_velocity(scheme, velocity):
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_a_field_that_carries_itself(dtype):
+def test_a_field_that_is_its_own_velocity(dtype):
     """Field and velocity are one array, whose two cotangents meet."""
     grid = dp.Grid(12, periodic=True)
     move = dp.transport(grid, "upwind", velocity="cells")

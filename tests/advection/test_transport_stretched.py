@@ -5,7 +5,7 @@ from itertools import product
 import autograd.numpy as anp
 import numpy as np
 import pytest
-from looking_back import against_twin
+from semi_lagrangian_reference import against_twin
 
 import sparsedp as dp
 
@@ -37,7 +37,7 @@ def scene(shape, periodic, scheme, form, interpolation="linear", of="cells", vel
 @pytest.mark.parametrize("boundary", [dp.neumann, dp.dirichlet], ids=repr)
 @pytest.mark.parametrize(("scheme", "form"), SCHEMES)
 @pytest.mark.parametrize(("shape", "periodic"), GRIDS)
-def test_twin(shape, periodic, scheme, form, boundary):
+def test_agrees_with_the_reference(shape, periodic, scheme, form, boundary):
     """Value and cotangents of field, velocity, step and inflow; the tangent against them."""
     cases = list(product(("linear", "cubic"), PLACES))
     start = SCHEMES.index((scheme, form)) + 3 * (boundary == dp.neumann)  # four of the eight each time, one in 3-D
@@ -48,7 +48,7 @@ def test_twin(shape, periodic, scheme, form, boundary):
 
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
 @pytest.mark.parametrize(("scheme", "form"), SCHEMES)
-def test_linear_fields_are_carried_exactly(scheme, form, interpolation):
+def test_linear_fields_are_transported_exactly(scheme, form, interpolation):
     """u = a + b x + c y goes to a + b (x - w t) + c (y - z t), away from walls, for any widths."""
     grid = dp.Grid((14, 15), spacing=[np.tile(WIDTHS[0], 2), np.tile(WIDTHS[1], 3)])
     move, (x, y) = dp.transport(grid, scheme, interpolation=interpolation, **form), grid.centres()
@@ -60,7 +60,7 @@ def test_linear_fields_are_carried_exactly(scheme, form, interpolation):
 
 @pytest.mark.parametrize("of", ["cells", "faces"])
 @pytest.mark.parametrize(("scheme", "form"), SCHEMES)
-def test_rest_is_the_identity_and_its_slope_the_mean_of_both_sides(scheme, form, of):
+def test_zero_velocity_is_the_identity_with_a_two_sided_mean_slope(scheme, form, of):
     move, (u, v, dt, _) = scene((7, 5), (False, True), scheme, form, of=of)
     assert np.array_equal(move(u, 0 * v, dt), u)
     if scheme == "semi_lagrangian":  # at rest: both sides alike, but for terms of second order
@@ -74,7 +74,7 @@ def test_rest_is_the_identity_and_its_slope_the_mean_of_both_sides(scheme, form,
 @pytest.mark.sampled
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
 @pytest.mark.parametrize(("scheme", "form"), SCHEMES)
-def test_gradient_is_that_of_the_value(scheme, form, interpolation):
+def test_gradient_agrees_with_differences(scheme, form, interpolation):
     move, (u, v, dt, _) = scene((7, 5), (False, True), scheme, form, interpolation, boundary=dp.dirichlet)
     inflow = np.cos(3.0 * np.arange(move.walls.size))
     result = dp.check.gradient(lambda x: (move(*x) ** 3).sum(), (u, v, dt, inflow), directions=1)

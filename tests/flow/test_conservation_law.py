@@ -178,7 +178,7 @@ def test_a_river_over_a_lake_at_rest(flow, n):
     np.testing.assert_allclose(head, flow**2 / (8 * GRAVITY) + 2.0, rtol=4e-3)
 
 
-def test_lakes_and_rivers_are_kept_to_the_last_bit():
+def test_equilibria_are_preserved_bit_for_bit():
     """A lake at rest whose inflow is the lake, and a river whose inflow is its own at both ends."""
     law, lake, _ = river(24, 0.0)
     assert not np.any(law(lake))
@@ -190,7 +190,7 @@ def test_lakes_and_rivers_are_kept_to_the_last_bit():
     assert np.any(slope)
 
 
-def test_an_inflow_acts_alike_with_and_without_an_equilibrium():
+def test_inflow_with_and_without_an_equilibrium():
     """Over flat ground the slopes of the difference to a lake are those of the field."""
     laws = [river(24, 1.0, given, bump=False)[0] for given in ("lake", None)]
     _, lake, _ = river(24, 1.0, bump=False)
@@ -220,7 +220,7 @@ def test_wave_of_euler_in_a_plane():
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_every_axis_is_the_same(axis):
+def test_axes_are_equivalent(axis):
     """A flow along any axis of a box with walls, inflow and stretched cells is the one-dimensional one."""
     widths = np.linspace(0.5, 1.5, 12)
     line = dp.Grid(12, spacing=[widths])
@@ -270,7 +270,7 @@ def twin(u, widths, flux, speed):
     return (f[:, :-1] - f[:, 1:]) / widths
 
 
-def test_twin_and_derivatives():
+def test_values_and_derivatives_agree_with_the_reference():
     widths = np.linspace(0.5, 1.5, 9)
     grid = dp.Grid(9, spacing=[widths])
     law = dp.conservation_law(grid, water_flux, water_speed, boundary=dp.free_slip, momentum=1)
@@ -325,7 +325,7 @@ FRONTS = {
 
 
 @pytest.mark.parametrize("name", ["Burgers", *(pytest.param(name, marks=pytest.mark.whole) for name in [*FRONTS][1:])])
-def test_a_front_that_runs_into_zero_has_a_gradient(name):
+def test_gradient_of_a_front_into_zeros(name):
     """Ahead of the front the waves are 1e-170 fast: their square underflows in the derivative of a quotient."""
     grid = dp.Grid(60, size=1.0)
     law = dp.conservation_law(grid, *FRONTS[name], scheme="upwind")
@@ -340,7 +340,7 @@ def test_a_front_that_runs_into_zero_has_a_gradient(name):
     assert slope == pytest.approx((loss(start) - loss(start - h * along)) / h, rel=1e-4)  # u > 1 is another branch
 
 
-def test_audit_of_a_kink():
+def test_check_gradient_at_a_kink():
     """Where neighbours are equal the limiter has a kink: the check says so."""
     grid = dp.Grid(8, periodic=True)
     law = dp.conservation_law(grid, lambda u, p, axis: u**2 / 2, lambda u, p, axis: anp.abs(u))
@@ -380,7 +380,7 @@ def test_time_step():
     assert fast.time_step(lake) == pytest.approx(0.4 * 25 / 24 / (10 + np.sqrt(2 * GRAVITY)))
 
 
-def test_what_is_at_rest_stays():
+def test_states_at_rest_do_not_change():
     """Where no wave moves the flux is the mean of both sides: of a constant pressure nothing is left."""
     grid = dp.Grid(6)
     law = dp.conservation_law(grid, lambda u, p, axis: 3 + 0 * u, lambda u, p, axis: 0 * u)
@@ -455,7 +455,7 @@ def test_refused_values():
         given(np.ones(4))
 
 
-def test_a_speed_below_0_is_refused():
+def test_negative_speeds_are_refused():
     """It would take the mean flux, which is unstable, for the flux of the wind."""
     u = np.array([1.0, 2.0, 4.0, 3.0])
     for speed in (lambda u, p, axis: -u, lambda u, p, axis: (u + 1.0, u - 1.0)):
@@ -476,7 +476,7 @@ def test_complex_numbers_are_refused(name):
 
 
 @pytest.mark.parametrize("name", ["flux", "speed", "source"])
-def test_functions_cannot_write_into_what_they_get(name):
+def test_functions_cannot_write_into_their_arguments(name):
     def doubled(u, *rest):
         u *= 2.0
         return u
@@ -492,7 +492,7 @@ def test_one_field_is_the_momentum_of_one_axis():
         dp.conservation_law(dp.Grid((3, 4)), carry, carry, boundary=dp.free_slip, momentum=(1, 1))
 
 
-def test_a_lone_field_may_be_the_momentum():
+def test_a_single_field_may_be_the_momentum():
     """Burgers' equation between walls: u is its own momentum, as a field of the grid and as one of a stack."""
     half = lambda u, p, axis: 0.5 * u**2
     walls = dict(boundary=dp.free_slip, momentum=0)

@@ -34,7 +34,7 @@ def scene(scheme, rng, shape=(6, 5), **options):
 
 
 @pytest.mark.parametrize("scheme, of", list(product(SCHEMES, ("cells", "faces"))))
-def test_each_gradient_alone_beside_solids(scheme, of, rng):
+def test_separate_gradients_next_to_solids(scheme, of, rng):
     """What is asked alone is what is asked together."""
     solid = np.zeros((6, 5), bool)
     solid[2:4, 1:3] = solid[5, 4] = True
@@ -104,7 +104,7 @@ def test_a_complex_rate_of_a_real_state(method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_what_is_not_finite_is_named(method):
+def test_nonfinite_values_are_named(method):
     """Also where a solver on the way is the first to meet it."""
     step = made(method, lambda u, p: -p * u)
     timed = made(method, lambda u, p, t: -p * u * anp.cos(t))
@@ -125,7 +125,7 @@ def test_what_is_not_finite_is_named(method):
 
 
 @pytest.mark.parametrize("method", [word for word in METHODS if word != "radau"])  # real states only
-def test_kinds_of_numbers_in_a_loop_of_linear_steps(method, rng):
+def test_dtypes_in_a_loop_of_linear_steps(method, rng):
     """The step's own pullback gives the dtypes of the tape: single precision, complex state and real coefficient."""
     step = dp.stepper(method, dp.laplacian(dp.Grid((6, 5), size=1.0), dp.dirichlet), 1e-3)
     u = rng.random((6, 5))

@@ -38,7 +38,7 @@ def test_explicit_viscosity_at_its_limit_does_not_grow():
 
 @pytest.mark.parametrize("shape", [(6, 5), (4, 3, 5), (7,)])
 @pytest.mark.parametrize("word", [dp.no_slip, dp.free_slip])
-def test_viscosity_is_symmetric_and_takes_energy(shape, word):
+def test_viscosity_is_symmetric_and_dissipates_energy(shape, word):
     """With W the volumes of the faces and K those inside, W K L K is symmetric and not positive."""
     for grid in grids(shape):
         K = dp.interior(grid)
@@ -56,7 +56,7 @@ def test_laplacian_of_a_solenoidal_field_is_minus_curl_curl():
 
 
 @pytest.mark.parametrize("word", [dp.no_slip, dp.free_slip])
-def test_obstacles_by_hand(word):
+def test_laplacian_around_obstacles_agrees_with_a_hand_calculation(word):
     """One solid cell in the middle of 5 x 5 unit cells; the x-face just above it."""
     grid = dp.Grid((5, 5))
     solid = np.zeros(grid.shape, bool)
@@ -114,7 +114,7 @@ def slices(u, w, h):
     return (xx - back(xx, 0) + ahead(xy, 1) - xy) / h, (yy - back(yy, 1) + ahead(yx, 0) - yx) / h
 
 
-def test_convection_and_its_derivatives_against_slices():
+def test_convection_and_its_derivatives_agree_with_slices():
     grid = dp.Grid((6, 5), spacing=0.3, periodic=True)
     convect = dp.convection(grid)
     twin = lambda v, w: grid.join(*slices(grid.split(v), grid.split(w), 0.3))
@@ -215,7 +215,7 @@ def test_implicit_viscosity_is_stable_at_any_step():
     assert np.max(np.abs(state["v"])) < np.max(np.abs(vortex(grid)))
 
 
-def test_what_a_scene_does_not_need_is_not_built():
+def test_unneeded_operators_are_not_built():
     grid = dp.Grid((8, 8), periodic=True)
     plain = dp.flow_step(grid, 0.1)
     assert plain.viscous.op is None and plain.scalars == {}
@@ -261,7 +261,7 @@ def test_nothing_flows_in_a_closed_line_of_cells(shape):
     assert np.any(dp.projection(dp.Grid(7), boundary={"x": (dp.inflow, dp.outflow)})(np.ones(8)))
 
 
-def test_what_is_refused():
+def test_refused_arguments():
     grid = dp.Grid((4, 4))
     with pytest.raises(ValueError, match="dt of flow_step must be > 0, got 0"):
         dp.flow_step(grid, 0)
@@ -309,7 +309,7 @@ def test_what_is_refused():
 
 
 @pytest.mark.parametrize("convective", [False, True])
-def test_a_short_step_drags_alike_with_explicit_and_implicit_viscosity(convective):
+def test_short_steps_with_explicit_and_implicit_viscosity_agree(convective):
     """Moving walls drag the field at both ends of an implicit step: a short one ends where the explicit one does."""
     grid = dp.Grid((6, 5), size=1.0)
     dt = 1e-6
@@ -324,7 +324,7 @@ def test_a_short_step_drags_alike_with_explicit_and_implicit_viscosity(convectiv
     np.testing.assert_allclose(implicit["v"], explicit["v"], rtol=0, atol=1e-4 * np.max(np.abs(explicit["v"])))
 
 
-def test_a_source_has_the_shape_of_its_field_and_changes_none():
+def test_sources_have_the_shape_of_their_field():
     def doubled(s, params):
         s["heat"] *= 2.0
         return s["heat"]

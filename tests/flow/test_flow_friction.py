@@ -41,7 +41,7 @@ def twin(grid, dt, v, f, n):
     return v
 
 
-def test_the_steps_of_a_twin_and_its_gradient():
+def test_steps_and_gradient_agree_with_the_reference():
     grid, _, friction = scene()
     f = np.minimum(friction(0.2), 500.0)
     start = 0.1 * np.sin(np.arange(grid.faces.size))
@@ -95,7 +95,7 @@ def test_stable_for_any_friction(large):
     assert max(sizes) < first and sizes[-1] < 1e-6 * first
 
 
-def test_alone_it_damps_as_its_formula():
+def test_damping_by_friction_alone():
     """A uniform wind on a periodic line, under a uniform friction; bits are those of a function of params."""
     grid = dp.Grid(4, periodic=True)
     dt = 0.5
@@ -114,7 +114,7 @@ def test_alone_it_damps_as_its_formula():
     np.testing.assert_array_equal(ends[0], ends[2])
 
 
-def test_nothing_on_walls_and_inflows():
+def test_friction_has_no_effect_on_walls_and_inflows():
     grid, _, _ = scene()
     inflows = grid.join(1.0, 0.0)
     step = dp.flow_step(grid, 0.02, 0.05, boundary=SIDES, friction=np.full(grid.faces.size, 7.0))
@@ -126,7 +126,7 @@ def test_nothing_on_walls_and_inflows():
 
 @pytest.mark.parametrize("friction", [False, True])
 @pytest.mark.parametrize("term", ["number", "function", "diffusivity"])
-def test_a_step_that_is_too_long_is_told_what_is_possible(term, friction):
+def test_advice_for_a_step_that_is_too_long(term, friction):
     """Friction, and a viscosity that is a function, are refused beside implicit viscosity."""
     grid = dp.Grid((4, 4))
     given = {"friction": np.ones(grid.faces.size)} if friction else {}
@@ -152,7 +152,7 @@ def test_a_step_that_is_too_long_is_told_what_is_possible(term, friction):
             run(implicit=True)
 
 
-def test_frictions_refused_by_name():
+def test_refused_frictions():
     grid = dp.Grid((2, 2))
     wrong = [
         (

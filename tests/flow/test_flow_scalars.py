@@ -83,7 +83,7 @@ def test_dye_that_flows_in_and_past_a_solid():
     assert np.min(late[~solid]) > 0.95
 
 
-def test_sources_see_all_scalars():
+def test_sources_get_all_scalars():
     grid = dp.Grid((4, 4), periodic=True)
     sources = {"a": {"source": lambda s, k: -k * s["a"]}, "b": {"source": lambda s, k: k * s["a"]}}
     step = dp.flow_step(grid, 0.01, convective=False, scalars=sources)
@@ -117,7 +117,7 @@ def test_a_step_beyond_the_courant_limit_is_refused():
 
 
 @pytest.mark.parametrize("implicit", [False, True])
-def test_the_limit_is_where_waves_grow(implicit):
+def test_growth_of_waves_at_the_stability_limit(implicit):
     """The predicted growth agrees with the growth of the fastest wave in the linear scheme."""
     from sparsedp.flow.diffusion import wave_growth
 
@@ -134,7 +134,7 @@ def test_the_limit_is_where_waves_grow(implicit):
         assert wave_growth(courant, damping, implicit) == pytest.approx(fastest, rel=2e-3)
 
 
-def test_refusals():
+def test_refused_scalars():
     grid = dp.Grid((4, 4))
     with pytest.raises(ValueError, match="unstable must be one of raise, allow, got 'warn'"):
         dp.flow_step(grid, 0.1, unstable="warn")
@@ -158,7 +158,7 @@ def test_refusals():
 
 
 @pytest.mark.parametrize("implicit", [False, True])
-def test_a_wall_does_not_heat_an_obstacle_beside_it(implicit):
+def test_a_wall_does_not_heat_an_adjacent_obstacle(implicit):
     grid = dp.Grid((4, 3), size=1.0)
     solid = np.zeros((4, 3), bool)
     solid[0, 1] = True

@@ -11,7 +11,7 @@ BOX = {1: np.s_[1:3], 2: np.s_[1:3, 2:], 3: np.s_[1:3, :2, :]}
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_flux_is_the_divergence_in_the_box(shape, rng):
+def test_flux_equals_the_divergence_in_a_box(shape, rng):
     for grid in grids(shape, rng):
         D = dp.divergence(grid)
         v = rng.standard_normal(grid.faces.size)
@@ -53,7 +53,7 @@ def incoming(grid, v, p, nu):
 
 @pytest.mark.parametrize("periodic", [False, True])
 @pytest.mark.parametrize("slip", [dp.no_slip, dp.free_slip])
-def test_sums_telescope(periodic, slip, rng):
+def test_total_force_equals_the_momentum_through_the_boundary(periodic, slip, rng):
     """The momentum equation, summed over the free faces, and the force on the obstacles are what comes in."""
     grid, sides, cells, v, p = obstacles(periodic, rng)
     slope = dp.gradient(grid, {} if periodic else {"x": (dp.neumann, dp.dirichlet)}, cells)
@@ -63,7 +63,7 @@ def test_sums_telescope(periodic, slip, rng):
     assert abs(np.sum(gained) + force - incoming(grid, v, p, 0.3)) <= 1e-13 * (np.sum(abs(gained)) + abs(force))
 
 
-def test_parts_add_up_and_a_box_holds_what_is_in_it(rng):
+def test_forces_are_additive_over_cells(rng):
     grid, sides, cells, v, p = obstacles(False, rng)
     one = cells.copy()
     other = cells.copy()
@@ -117,7 +117,7 @@ def flat_wall(grid, angle, place):
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.4, np.pi / 4, 2.0])
-def test_a_flat_wall_is_felt_where_it_stands(angle):
+def test_effective_position_of_a_flat_wall(angle):
     """The profile of the formula solves the equation on the grid, at every slope and every place."""
     grid = dp.Grid((12, 12), size=3.0)
     h = 0.25
@@ -161,7 +161,7 @@ def test_derivatives_of_brinkman(shape, periodic, rng):
     assert np.allclose(dp.hvp(loss, level, t), (near(1e-6) - near(-1e-6)) / 2e-6, rtol=1e-5, atol=1e-4)
 
 
-def test_levels_as_they_come(rng):
+def test_level_sets_of_any_scale(rng):
     grid = dp.Grid((5, 4), spacing=0.5)
     friction = dp.brinkman(grid)
     s = flat_wall(dp.Grid((5, 4), spacing=0.5), 0.7, 1.0)

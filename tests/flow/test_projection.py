@@ -60,7 +60,7 @@ def scenes(shape, drawn):
 
 
 @pytest.mark.parametrize("shape", SHAPES[:-1])
-def test_it_is_the_dense_map_and_its_transpose(shape, scenes):
+def test_agrees_with_the_dense_projection_and_its_transpose(shape, scenes):
     for grid, solid in scenes:
         P = dp.projection(grid, solid)
         matrix = dense(grid, solid, {})
@@ -137,7 +137,7 @@ def test_one_node_and_two_solves():
 
 
 @pytest.mark.parametrize("solid", [False, True])
-def test_derivatives_of_every_kind(solid):
+def test_all_derivative_modes(solid):
     grid = dp.Grid((6, 5), spacing=[np.linspace(1, 2, 6), np.linspace(2, 1, 5)])
     mask = np.zeros(grid.shape, bool)
     mask[2:4, 1:3] = solid
@@ -169,7 +169,7 @@ def test_nan_anywhere_is_refused():
         P.T(v)
 
 
-def test_what_is_refused():
+def test_refused_arguments():
     grid = dp.Grid((4, 3), periodic=(False, True))
     with pytest.raises(ValueError, match="boundary names axis 'z', but .* has x, y; give the two sides of an axis"):
         dp.projection(grid, boundary={"z": dp.inflow})
@@ -217,7 +217,7 @@ def test_extremes():
         assert np.array_equal(dp.projection(tiny).pressure(v), np.ldexp(P.pressure(v), power))
 
 
-def test_kinds_of_arrays():
+def test_array_layouts_and_dtypes():
     grid = dp.Grid((6, 5))
     P = dp.projection(grid)
     v = velocity(grid)

@@ -72,7 +72,7 @@ def rounding(flow):
 
 
 @pytest.mark.parametrize(("shape", "every"), KINDS)
-def test_terms(shape, every):
+def test_each_term_preserves_a_uniform_flow(shape, every):
     for flow in flows(shape, every):
         grid = flow.grid
         v = flow.v
@@ -90,7 +90,7 @@ def test_terms(shape, every):
 
 
 @pytest.mark.parametrize(("shape", "every"), KINDS)
-def test_transport_of_faces(shape, every):
+def test_transport_on_faces_preserves_a_uniform_flow(shape, every):
     for flow in flows(shape, every):
         for options in SCHEMES:
             if options.get("interpolation") == "cubic" and not all(flow.grid.uniform):
@@ -108,7 +108,7 @@ STEPPING += [pytest.param(shape, True, name, id=f"{shape}-{name}", marks=WHOLE) 
 
 
 @pytest.mark.parametrize(("shape", "every", "name"), STEPPING)
-def test_steps(shape, every, name):
+def test_flow_steps_preserve_a_uniform_flow(shape, every, name):
     """With wall velocities as a function, and, where they can be told apart, as what `face_lift` makes of them."""
     for flow in flows(shape, every):
         grid = flow.grid
@@ -121,7 +121,7 @@ def test_steps(shape, every, name):
             np.testing.assert_allclose(end["v"], flow.v, rtol=0, atol=1e-11)
 
 
-def test_scalars_and_friction_leave_it_as_it_is():
+def test_scalars_and_friction_preserve_a_uniform_flow():
     """Heat that is 1 everywhere, at the walls too; a friction that is far away."""
     flow = Uniform((4, 5), (False, False), True)
     grid = flow.grid
@@ -213,7 +213,7 @@ def cylinder(angle, cells=10, far=8.0):
 
 
 @WHOLE
-def test_cylinder_in_a_stream_that_enters_at_an_angle():
+def test_cylinder_in_an_oblique_flow():
     """The drag does not depend on how the grid is turned, and there is no lift."""
     (straight, _), (turned, around) = cylinder(0.0), cylinder(np.deg2rad(20.0))
     assert turned[0] == pytest.approx(1.62, rel=0.02) and turned[0] == pytest.approx(straight[0], rel=0.015)
@@ -249,7 +249,7 @@ def by_hand(grid, v, w, walls):
     )
 
 
-def test_convection_with_wall_velocities_and_its_derivatives_by_hand(rng):
+def test_convection_with_wall_velocities_agrees_with_a_hand_calculation(rng):
     grid = dp.Grid((4, 3), spacing=0.3)
     sides = {"x": (dp.inflow, dp.outflow), "y": dp.inflow}
     walls = dp.face_lift(grid, sides).domain
@@ -297,7 +297,7 @@ def blown(t):
 
 
 @pytest.mark.parametrize("implicit", [False, pytest.param(True, marks=pytest.mark.whole)])
-def test_wall_velocities_that_change_keep_the_second_order_in_time(implicit):
+def test_changing_wall_velocities_are_second_order_in_time(implicit):
     answers = []
     for n in (10, 20, 40, 80):
         step, v = channel(implicit, 0.4 / n)
@@ -335,7 +335,7 @@ def test_single_precision_with_functions_as_walls():
     assert {name: part.dtype for name, part in end.items()} == dict.fromkeys(("v", "p", "a", "walls"), np.float32)
 
 
-def test_a_lid_is_the_same_as_a_function_and_as_a_lift():
+def test_a_lid_given_as_a_function_and_as_a_lift():
     grid = dp.Grid((5, 4), size=1.0)
     lift = dp.face_lift(grid)
     values = lift.domain.join(0.0, 0.2, -0.5, 1.0)
@@ -345,7 +345,7 @@ def test_a_lid_is_the_same_as_a_function_and_as_a_lift():
         np.testing.assert_allclose(*ends, rtol=0, atol=1e-14)
 
 
-def test_an_array_as_walls_says_how_flow_enters():
+def test_an_array_as_walls_gives_the_inflow_angle():
     """What `face_lift` makes of velocities that differ along the inflow, with the same value and gradient."""
     grid = dp.Grid((4, 3), size=1.0)
     lift = dp.face_lift(grid, CHANNEL)
@@ -475,10 +475,10 @@ REFUSED = [
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_wall_velocities_that_are_refused(case):
+def test_refused_wall_velocities(case):
     with pytest.raises(case.error, match=case.match):
         case.act()
 
 
-def test_no_walls_have_no_velocities():
+def test_a_periodic_grid_has_no_wall_velocities():
     assert dp.face_lift(dp.Grid(3, periodic=True)).domain.join().shape == (0,)

@@ -25,7 +25,7 @@ def _python(folder, *words, **environment):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not kernels.compiled(), reason="needs numba")
-def test_the_first_use_says_so_once_and_later_ones_say_nothing(tmp_path):
+def test_compilation_is_announced_once(tmp_path):
     first = _python(tmp_path, "-c", APPLY)
     assert first.stderr.count(NOTICE) == 1
     again = _python(tmp_path, "-c", APPLY)
@@ -34,20 +34,20 @@ def test_the_first_use_says_so_once_and_later_ones_say_nothing(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not kernels.compiled(), reason="needs numba")
-def test_the_command_compiles_all_and_nothing_is_left(tmp_path):
+def test_compile_command_compiles_all_loops(tmp_path):
     done = _python(tmp_path, "-m", "sparsedp", "compile")
     assert done.returncode == 0, done.stderr
     assert "done in" in done.stdout
     assert _python(tmp_path, "-c", APPLY).stderr == ""
 
 
-def test_without_numba_the_command_says_so(tmp_path):
+def test_compile_command_without_numba(tmp_path):
     answer = _python(tmp_path, "-m", "sparsedp", "compile", SPARSEDP_NUMBA="0")
     assert answer.returncode == 2
     assert "there is nothing to compile: numba is not installed or switched off" in answer.stderr
 
 
-def test_the_command_knows_every_file_with_loops():
+def test_compile_command_lists_every_file_with_loops():
     def defines(path):
         functions = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)]
         return any(

@@ -100,7 +100,7 @@ def test_sum_of_axes_is_the_sparse_matrix(side):
 
 
 @NUMBA
-def test_even_rows_have_the_bits_of_any_rows():
+def test_uniform_rows_give_the_same_bits():
     """The same three numbers in every row, read once or read in each."""
     rng = np.random.default_rng(4)
     for shape in ((1, 1, 1), (1, 1, 2), (1, 5, 3), (1, 7, 40), (4, 1, 37), (3, 5, 40), (2, 3, 1)):
@@ -174,7 +174,7 @@ def test_matrix_along_an_axis_is_the_sparse_matrix(side):
 
 
 @pytest.mark.parametrize("shape", [(0, 3, 3), (2, 0, 3), (2, 3, 0)])
-def test_nothing_is_done_for_empty_arrays(shape):
+def test_empty_arrays(shape):
     axes = tuple(line(np.random.default_rng(0), n, False, False) if n else None for n in shape)
     kernels.summed(shape, axes, 1.0)(np.zeros(shape), np.zeros(shape))
     rows = record(sp.csr_array((shape[1], shape[1])), True)
@@ -215,7 +215,7 @@ def double(x, start, stop):
 
 
 @NUMBA
-def test_a_loop_is_compiled_without_a_place_to_keep_it(monkeypatch):
+def test_compilation_without_a_cache_directory(monkeypatch):
     import numba
 
     real = numba.njit
@@ -232,7 +232,7 @@ def test_a_loop_is_compiled_without_a_place_to_keep_it(monkeypatch):
 
 
 @NUMBA
-def test_numpy_steps_in_where_nothing_compiles(monkeypatch):
+def test_numpy_fallback_when_compilation_fails(monkeypatch):
     import numba
 
     from sparsedp.kernels import stencil
@@ -249,7 +249,7 @@ def test_numpy_steps_in_where_nothing_compiles(monkeypatch):
 
 
 @NUMBA
-def test_an_error_in_a_slab_comes_out_when_all_have_ended(monkeypatch):
+def test_an_error_in_a_slab_is_raised_after_all_slabs_end(monkeypatch):
     monkeypatch.setattr(team, "SERIAL", 0)
     kernel = team.Kernel(double, "write1")
     ended = []

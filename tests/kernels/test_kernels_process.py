@@ -24,7 +24,7 @@ def test_too_many_threads_are_refused(monkeypatch):
         kernels.set_threads(3)
 
 
-def test_the_number_of_threads_is_remembered_and_checked():
+def test_set_threads():
     most = kernels.threads()
     kernels.set_threads(1)
     assert kernels.threads() == 1
@@ -57,13 +57,13 @@ def run(code, **environment):
     return subprocess.run([sys.executable, "-c", SCRIPT + code], env=os.environ | environment, check=False, timeout=120)
 
 
-def test_the_environment_switches_numba_off():
+def test_environment_variable_disables_numba():
     assert run("assert 'numba' not in sys.modules and not kernels.compiled()", SPARSEDP_NUMBA="0").returncode == 0
 
 
 @NUMBA
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
-def test_a_forked_child_may_use_the_kernels():
+def test_kernels_in_a_forked_process():
     code = """
 child = os.fork()
 kernels.summed(u.shape, (None, axis, axis), 1.0)(u, out)
@@ -76,7 +76,7 @@ sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 
 @NUMBA
 @pytest.mark.whole
-def test_numba_compiles_what_the_house_counts():
+def test_numba_compiles_the_functions_counted_by_the_house_test():
     """Every function of the package that numba holds when all loops are compiled is one that test_house.py sees."""
     from numba.core.dispatcher import Dispatcher
 

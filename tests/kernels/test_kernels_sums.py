@@ -13,7 +13,7 @@ SIZES = (0, 1, 4097, 40_000)
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_norms_on_the_way(size, rng):
+def test_norms_of_the_fused_pass(size, rng):
     x, b = rng.standard_normal((2, size))
     fresh = x - 0.3
     rest = fresh.copy()
@@ -25,7 +25,7 @@ def test_norms_on_the_way(size, rng):
     assert np.allclose(remainder(z, rest, z), (np.linalg.norm(z - (b + 1j * x)), np.linalg.norm(z)))
 
 
-def test_what_is_not_finite_stays_so():
+def test_nonfinite_values_propagate():
     for value in (np.nan, np.inf):
         x = np.zeros(40_000)
         x[20_000] = value

@@ -11,7 +11,7 @@ from functools import lru_cache
 import autograd.numpy as anp
 import numpy as np
 from autograd.tracer import getval, isbox
-from transport_twin import twin as transport_twin
+from eulerian_reference import twin as transport_twin
 
 import sparsedp as dp
 from campaign.boxes import boundary, dense, numbers, obstacle

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import autograd.numpy as anp
 import numpy as np
-from looking_back import moved as lagrangian_twin
+from semi_lagrangian_reference import moved as lagrangian_twin
 
 import sparsedp as dp
 from campaign.boxes import boundary, condition, dense, numbers, obstacle

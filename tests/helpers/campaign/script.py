@@ -7,8 +7,8 @@ from pathlib import Path
 HELPERS = Path(__file__).resolve().parent.parent
 FILES = [
     HELPERS / "dense.py",
-    HELPERS / "transport_twin.py",
-    HELPERS / "looking_back.py",
+    HELPERS / "eulerian_reference.py",
+    HELPERS / "semi_lagrangian_reference.py",
     *(HELPERS / "campaign" / f"{name}.py" for name in ("boxes", "operators", "ingredients", "physics", "scene")),
 ]
 OWN = {path.stem for path in FILES} | {"campaign"}

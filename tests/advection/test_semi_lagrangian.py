@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from looking_back import against_twin
+from semi_lagrangian_reference import against_twin
 
 import sparsedp as dp
 from sparsedp import kernels
@@ -47,7 +47,7 @@ def every_case(test):
 
 @pytest.mark.sampled
 @every_case
-def test_twin(without_numba, shape, periodic, scheme, form, interpolation, of, velocity, boundary):
+def test_agrees_with_the_reference(without_numba, shape, periodic, scheme, form, interpolation, of, velocity, boundary):
     """Value and cotangents of field, velocity, step and inflow; the tangent against them."""
     move, point = setting(shape, periodic, scheme, form, interpolation, of, velocity, boundary=boundary)
     against_twin(move, point, 1e-12)
@@ -73,7 +73,7 @@ def test_compiled_against_numpy(monkeypatch, shape, interpolation, scheme, form)
 
 @pytest.mark.parametrize(("scheme", "form"), SCHEMES)
 @pytest.mark.parametrize("of", ["cells", "faces"])
-def test_gradient_is_that_of_the_value(scheme, form, of):
+def test_gradient_agrees_with_differences(scheme, form, of):
     move, (u, v, dt, _) = setting((6, 5), (False, True), scheme, form, "linear", of, boundary=dp.dirichlet)
     inflow = np.cos(3.0 * np.arange(move.walls.size))  # equal ones would be a kink of the clamp
     loss = lambda x: (move(x["u"], x["v"], x["dt"], x["inflow"]) ** 3).sum()
@@ -102,7 +102,7 @@ def test_solid(without_numba, scheme, form, of):
     assert result.verdict == "agrees", str(result)
 
 
-def test_nothing_but_solid(without_numba):
+def test_all_cells_solid(without_numba):
     move, (u, v, dt, _) = setting((3, 2), False, "maccormack", {}, "linear", solid=np.ones((3, 2), bool))
     assert np.array_equal(move(u, v, dt), u)
 
@@ -124,7 +124,7 @@ def test_matrix(without_numba, of, interpolation):
     assert op.T(g) == pytest.approx(pullback(lambda u: move(u, v, dt), u)[1](g), rel=1e-13, abs=1e-13)
 
 
-def test_no_matrix():
+def test_maccormack_has_no_matrix():
     move, (_, v, dt, _) = setting((6, 5), True, "maccormack", {}, "linear")
     with pytest.raises(ValueError, match="transport maccormack is not linear in u and has no matrix"):
         move.operator(v, dt)
@@ -144,7 +144,7 @@ def test_second_derivatives(without_numba):
 
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
 @pytest.mark.parametrize("shape", [(5,), (4, 3), (3, 4, 2), (1, 300)])
-def test_loops_against_the_matrix_and_nothing_is_read_beside_the_samples(shape, interpolation):
+def test_loops_agree_with_the_matrix_and_stay_within_the_samples(shape, interpolation):
     """Departure points far out on all sides and at the points; what lies around the samples is NaN."""
     periodic = (False, True, False)[: len(shape)]
     points = departure_samples.Points.of(shape, periodic, interpolation)

@@ -26,7 +26,7 @@ def projections(shape):
 
 @pytest.mark.skipif(not kernels.compiled(), reason="numba is not installed")
 @pytest.mark.parametrize("shape", SHAPES)
-def test_passes_are_what_the_operators_do(shape):
+def test_compiled_passes_agree_with_the_operators(shape):
     rng = np.random.default_rng(1)
     many = 0
     for grid, setup in projections(shape):

@@ -5,7 +5,7 @@ from itertools import product
 import autograd.numpy as anp
 import numpy as np
 import pytest
-from transport_twin import twin
+from eulerian_reference import twin
 
 import sparsedp as dp
 from sparsedp._utils.pytree import leaves
@@ -44,7 +44,7 @@ def arguments(move, rng):
 @pytest.mark.parametrize("velocity, form", FORMS)
 @pytest.mark.parametrize("of", ["cells", "faces"])
 @pytest.mark.parametrize("scheme", ["upwind", "van_leer"])
-def test_it_is_the_twin(scheme, of, velocity, form, dim):
+def test_agrees_with_the_reference(scheme, of, velocity, form, dim):
     rng = np.random.default_rng(0)
     for grid in grids(dim):
         for boundary in boundaries(grid):

@@ -11,7 +11,7 @@ from sparsedp.advection import transport
 from sparsedp.kernels import fluxes
 
 
-def test_the_page(monkeypatch):
+def test_example_of_contributing(monkeypatch):
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     scheme, order = [block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "third_order" in block]
     page = {"SCHEMES": {}, "Scheme": fluxes.Scheme, "dp": dp, "np": np}

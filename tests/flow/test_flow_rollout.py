@@ -51,7 +51,7 @@ def scene(shape=(8, 6), spacing=0.2, periodic=False, walls=None, dtype=float, **
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_rollout_and_loop(name):
+def test_rollout_agrees_with_a_loop(name):
     step, state, params = scene(**SCENES[name])
     weights = np.random.default_rng(5).standard_normal(state["v"].size)
 

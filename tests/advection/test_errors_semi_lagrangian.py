@@ -65,7 +65,7 @@ def test_message(case):
 @pytest.mark.parametrize("scheme", ["semi_lagrangian", "maccormack"])
 @pytest.mark.parametrize("velocity", ["faces", "cells"])
 @pytest.mark.parametrize("of", ["faces", "cells"])
-def test_whatever_is_not_finite_is_found(scheme, velocity, of):
+def test_nonfinite_values_are_refused(scheme, velocity, of):
     move = dp.transport(GRID, scheme, velocity=velocity, of=of)
     u = np.zeros(move.space.shape)
     v = np.zeros((2, 3, 2) if velocity == "cells" else 17)

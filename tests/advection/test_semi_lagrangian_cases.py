@@ -122,7 +122,7 @@ def test_slope_at_a_point_is_the_mean_of_both_sides():
         assert pull(np.ones(4)) == pytest.approx(-0.25 * np.array([ends[0], 4, 8, ends[1]]))
 
 
-def test_value_at_a_bound_takes_half_of_each_side():
+def test_derivative_at_a_bound_is_the_mean_of_both_sides():
     """A straight line moved by half a cell: MacCormack gives 1/2, and 1 below a bound that it meets exactly."""
     move = dp.transport(dp.Grid(4, periodic=True), "maccormack", velocity="cells")
     value, pull = pullback(lambda u: move(u, np.zeros(4), 1.0), np.array([0.0, 1.0, 2.0, 3.0]))
@@ -132,7 +132,7 @@ def test_value_at_a_bound_takes_half_of_each_side():
 
 @pytest.mark.parametrize("boundary", [dp.neumann, dp.dirichlet])
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
-def test_far_outside(boundary, interpolation):
+def test_departure_points_far_outside(boundary, interpolation):
     """What comes from far away has the value at the wall, and no slope in the velocity."""
     move = dp.transport(dp.Grid(3), "semi_lagrangian", boundary, "cells", interpolation=interpolation)
     u = np.array([1.0, 5.0, 7.0])
@@ -144,7 +144,7 @@ def test_far_outside(boundary, interpolation):
     assert of_inflow == pytest.approx([0, 0] if boundary is dp.neumann else [2, 1])
 
 
-def test_whole_turns_of_a_periodic_axis_are_exact():
+def test_shifts_by_whole_periods_are_exact():
     move = dp.transport(dp.Grid((4, 3), periodic=True), "semi_lagrangian", velocity="cells", interpolation="cubic")
     u = np.arange(12.0).reshape(4, 3)
     v = np.stack([np.full((4, 3), 9.0), np.full((4, 3), -6.0)])
@@ -154,7 +154,7 @@ def test_whole_turns_of_a_periodic_axis_are_exact():
 @pytest.mark.parametrize("scheme", ["semi_lagrangian", "maccormack"])
 @pytest.mark.parametrize("of", ["cells", "faces"])
 @pytest.mark.parametrize("shape", [(1,), (1, 4), (2, 2)])
-def test_small_grids_keep_constants(scheme, of, shape):
+def test_small_grids_preserve_constants(scheme, of, shape):
     for periodic in (True, False):
         grid = dp.Grid(shape, periodic=periodic)
         move = dp.transport(grid, scheme, of=of)
@@ -190,7 +190,7 @@ LAYOUTS = {
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("scheme", ["semi_lagrangian", "maccormack"])
-def test_layouts(scheme, layout):
+def test_array_layouts(scheme, layout):
     grid = dp.Grid((4, 3))
     move = dp.transport(grid, scheme, dp.dirichlet)
     u = LAYOUTS[layout](np.arange(12.0).reshape(4, 3))
@@ -214,7 +214,7 @@ def test_layouts(scheme, layout):
 
 
 @pytest.mark.parametrize("scheme", ["semi_lagrangian", "maccormack"])
-def test_step(scheme):
+def test_step_in_a_rollout(scheme):
     """A step with fixed dt, alone, on the tape and in a rollout."""
     grid = dp.Grid((6, 5))
     move = dp.transport(grid, scheme)
