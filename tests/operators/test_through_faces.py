@@ -39,7 +39,7 @@ def test_forward_and_transposed_against_the_entries(shape, rng):
                 assert np.max(wrong) <= 1e-15 * np.max(abs(matrix) @ np.abs(x))
 
 
-def test_masked_faces_shield_what_is_not_a_number(rng):
+def test_masked_faces_exclude_nan(rng):
     grid = dp.Grid((6, 5))
     solid = np.zeros((6, 5), bool)
     solid[2:4, 1:3] = True
@@ -49,7 +49,7 @@ def test_masked_faces_shield_what_is_not_a_number(rng):
     assert np.array_equal(op(spoilt)[~solid], op(np.where(solid, 0.0, u))[~solid])
 
 
-def test_a_coefficient_that_is_zero_shields_nothing(rng):
+def test_a_zero_coefficient_passes_nan_on(rng):
     grid = dp.Grid((6, 5))
     k = rng.uniform(1, 2, grid.faces.size)
     k[10] = 0.0
@@ -61,7 +61,7 @@ def test_a_coefficient_that_is_zero_shields_nothing(rng):
     assert np.array_equal(np.isnan(op(u)), np.isnan(one_after_the_other.reshape(u.shape)))
 
 
-def test_other_products_are_left_to_their_members():
+def test_other_products_are_applied_member_by_member():
     grid = dp.Grid((6, 5))
     line = dp.Grid(8)
     middle = dp.diagonal(grid.faces, np.ones(grid.faces.size) * 1j)

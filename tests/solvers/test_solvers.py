@@ -101,7 +101,7 @@ def test_bits_do_not_depend_on_the_scale_of_the_operator(method, exponent, rng):
         assert np.array_equal(np.ldexp(solve(b), exponent), other(b))
 
 
-def test_what_cannot_be_represented_is_refused():
+def test_solutions_beyond_the_range_of_floats_are_refused():
     inv = dp.inverse(1e-10 * dp.identity(dp.Grid(3).cells))
     with pytest.raises(
         dp.errors.NonFiniteError, match=r"the solution of .* is beyond 1.8e308; scale the right-hand side down"
@@ -152,7 +152,7 @@ def test_an_inexact_method_is_refined():
 
 
 @pytest.mark.parametrize("error, status", [(0.7, "stagnated"), (np.nan, "nonfinite_output")])
-def test_a_method_that_claims_to_be_done_is_not_believed(error, status):
+def test_an_engine_that_reports_success_is_tested_by_the_true_residual(error, status):
     inv, _ = scripted(error)
     for solve in (inv, inv.T):
         with pytest.raises(dp.errors.ConvergenceError, match=re.escape(f"wanted 1e-10 ({status})")) as caught:
@@ -162,20 +162,20 @@ def test_a_method_that_claims_to_be_done_is_not_believed(error, status):
     assert inv.info.forward.status == inv.info.adjoint.status == status
 
 
-def test_the_word_of_a_failed_method_is_reported():
+def test_the_status_of_a_failed_engine_is_reported():
     inv, _ = scripted(0.7, "indefinite_operator")
     with pytest.raises(dp.errors.ConvergenceError, match="indefinite_operator"):
         inv(np.ones(101))
 
 
-def test_a_method_of_fixed_length_is_taken_as_it_is():
+def test_an_engine_that_does_not_refine_is_called_once():
     inv, engine = scripted(0.1, "max_iterations", refines=False)
     inv(np.ones(101))
     assert engine.calls == 1 and inv.info.forward.status == "max_iterations"
     assert inv.info.forward.residual == pytest.approx(0.1)
 
 
-def test_the_tolerance_is_relative_and_attainable_accuracy_has_a_name():
+def test_the_tolerance_is_relative_and_roundoff_has_its_own_status():
     inv, _ = scripted(1e-3, rtol=1e-2)
     inv(1e-200 * np.ones(101))
     assert inv.info.forward.status == "converged" and inv.info.forward.residual == pytest.approx(1e-3)
@@ -185,7 +185,7 @@ def test_the_tolerance_is_relative_and_attainable_accuracy_has_a_name():
     assert 0 < tight.info.forward.backward_error <= 8 * np.finfo(float).eps
 
 
-def test_a_right_hand_side_of_zero_is_not_solved():
+def test_a_zero_right_hand_side_needs_no_iteration():
     inv, engine = scripted(0.0)
     for solve in (inv, inv.T):
         assert np.array_equal(solve(np.zeros(101)), np.zeros(101))

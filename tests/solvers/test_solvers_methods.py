@@ -49,7 +49,7 @@ def test_the_transposed_cycle_is_the_transpose(cycle, sweeps, rng):
 
 
 @pytest.mark.parametrize("sweeps", SWEEPS)
-def test_the_adjoint_takes_as_many_cycles_and_no_second_set_up(sweeps, rng):
+def test_the_adjoint_needs_as_many_cycles_and_no_second_set_up(sweeps, rng):
     op = wind(60)
     with recording() as calls:
         inv = dp.inverse(op, "multigrid", rtol=1e-8, sweeps=SWEEPS[sweeps])
@@ -95,7 +95,7 @@ def coefficients(name, n=64):
 
 @pytest.mark.parametrize("method", ["direct", "multigrid"])
 @pytest.mark.parametrize("name", ["inclusion", "checkerboard", "layers", "random decades"])
-def test_jumps(name, method, rng):
+def test_jumps_of_the_coefficient(name, method, rng):
     inv = dp.inverse(heterogeneous(coefficients(name)), method)
     b = rng.standard_normal((64, 64))
     for solve in (inv, inv.T):
@@ -121,7 +121,7 @@ def test_anisotropy_and_aspect(boundary, rng):
 # ---------------------------------------------------------------- krylov
 
 
-def test_an_operator_that_only_acts(rng):
+def test_an_operator_without_entries(rng):
     op = PROBLEMS["robin, stretched"]()
     bare = dp.from_functions(op, op.T, op.domain, op.codomain, name="black box")
     inv = dp.inverse(bare)
@@ -172,7 +172,7 @@ def test_an_indefinite_operator_is_named():
 
 @pytest.mark.parametrize("method", ["multigrid", *(["structured"] if compiled() else [])])
 @pytest.mark.parametrize("nu", [1e-3, 1.0, 1e3])
-def test_obstacles_that_are_held_follow_from_the_fluid(method, nu, rng):
+def test_obstacles_held_at_zero_are_found_by_substitution(method, nu, rng):
     """Their rows of 1 - nu L read the fluid, and no row reads them: beside the solves they are an assignment."""
     grid = dp.Grid((12, 15), size=(1.0, 2.0))
     solid = np.hypot(*(x - 0.4 for x in grid.centres())) < 0.25
@@ -201,7 +201,7 @@ def test_implicit_diffusion_around_held_obstacles_converges_by_itself(rng):
     assert solve.info.forward.iterations <= 12
 
 
-def test_mixed_signs_go_to_gmres(rng):
+def test_a_diagonal_of_mixed_signs_is_solved_by_gmres(rng):
     matrix = rng.standard_normal((25, 25))
     inv = dp.inverse(dp.from_matrix(matrix + matrix.T), "krylov")
     assert "GMRES" in inv.info.hierarchy
@@ -259,7 +259,7 @@ def test_a_start_can_be_trained_through_a_few_iterations(rng):
 # ---------------------------------------------------------------- direct
 
 
-def test_the_kinds_of_factors(rng):
+def test_dense_and_sparse_factors(rng):
     for op, words in (
         (dp.laplacian(dp.Grid(60), dp.dirichlet), "dense LU"),
         (dp.laplacian(dp.Grid(300), dp.neumann), "sparse LU"),

@@ -57,7 +57,7 @@ def test_neumann_defects(grid, method, defect, rng):
 
 
 @EVERY
-def test_data_that_are_almost_only_null_space(method, rng):
+def test_data_almost_in_the_null_space(method, rng):
     """The right-hand side after the projection has to be compatible to its own digits."""
     op = neumann(stretched(20, 22))
     inv = dp.inverse(op, method, nullspace="project")
@@ -125,7 +125,7 @@ def test_each_region_has_its_own_mean(method, count, rng):
     assert np.sum(both(b) * g) == pytest.approx(np.sum(b * both.T(g)), rel=1e-9)
 
 
-def test_noise_on_a_quiet_region_is_not_refused():
+def test_rounding_on_a_region_without_data_is_not_refused():
     """Rounding left by a divergence, on a region where nothing happens, is below the tolerance."""
     grid = dp.Grid((14, 9))
     solid = walled(3)[:14]
@@ -182,7 +182,7 @@ def advection(grid, rng):
 
 @GENERAL
 @pytest.mark.parametrize("turned", [False, True])
-def test_a_null_vector_that_is_not_known_beforehand(method, turned, rng):
+def test_a_computed_null_vector(method, turned, rng):
     op = advection(dp.Grid((18, 17), periodic=True), rng)
     op = op.T if turned else op
     inv = dp.inverse(op, method, nullspace="project")
@@ -325,7 +325,7 @@ def test_small_grids(shape, boundary, method, rng):
 
 
 @EVERY
-def test_nothing_to_solve(method):
+def test_systems_without_unknowns(method):
     grid = dp.Grid((4, 3))
     inv = dp.inverse(neumann(grid, np.ones(grid.shape, dtype=bool)), method)
     assert not np.any(inv(np.zeros(grid.shape))) and not np.any(inv.T(np.ones(grid.shape)))
@@ -337,7 +337,7 @@ def test_nothing_to_solve(method):
 
 
 @pytest.mark.parametrize("share, stretched", [(0.45, False), (0.6, False), (0.6, True)])
-def test_multigrid_leaves_rounding_residues_alone(share, stretched):
+def test_multigrid_ignores_rounding_residues(share, stretched):
     """Regions that shrink to one unknown on a coarse level have a row of rounding there, and no equation."""
     for seed in range(4):
         rng = np.random.default_rng(seed)

@@ -70,7 +70,7 @@ def both(request, monkeypatch):
 
 @pytest.mark.parametrize("dtype", [float, complex])
 @pytest.mark.parametrize("seed", range(4))
-def test_the_unknowns_found_by_substitution_are_those_of_peeling(seed, dtype):
+def test_the_unknowns_found_by_substitution_are_those_of_repeated_removal(seed, dtype):
     matrix = blocks(np.random.default_rng(seed), dtype)
     links = matrix.toarray() != 0
     found = split(matrix, None)
@@ -251,7 +251,7 @@ def network():
     return matrix, np.array([0.0, 0.0, 1.0, 1.0, 0.5]), np.array([1.0, 1.0, 1.0, 1.0, 0.0])
 
 
-def test_null_vectors_reach_into_the_triangular_parts(both, rng):
+def test_null_vectors_extend_into_the_triangular_parts(both, rng):
     matrix, right, left = network()
     space = System(dp.from_matrix(matrix)).null_space
     assert space.count == 1
@@ -341,7 +341,7 @@ def test_components_in_another_numbering_are_not_split(monkeypatch):
 # ---------------------------------------------------------------- decisions and limits
 
 
-def test_the_choice_is_about_the_coupled_unknowns():
+def test_the_choice_depends_on_the_coupled_unknowns():
     """A ring of 30 cells with a long inlet and a long outlet: 30 unknowns are factored."""
     size = 30_060
     matrix = chain(30_060).tolil()

@@ -21,7 +21,7 @@ BOX = np.arange(21 * 26).reshape(21, 26) % 3 > 0
 # ---------------------------------------------------------------- records
 
 
-def test_the_record():
+def test_the_record_of_a_solve():
     inv = dp.inverse(PROBLEMS["dirichlet"](), "multigrid")
     log = inv.info
     assert log is inv.T.info and log.forward is None and log.adjoint is None and log.setup_seconds > 0
@@ -33,7 +33,7 @@ def test_the_record():
     assert log.adjoint.status == "converged"
 
 
-def test_an_inverse_says_what_it_is():
+def test_the_description_of_an_inverse():
     inv = dp.inverse(PROBLEMS["dirichlet"](), "multigrid")
     text = str(inv)
     for word in ("multigrid: as asked", "572 of 572", "1e-10", "0 singular components", "levels", "complexity"):
@@ -41,7 +41,7 @@ def test_an_inverse_says_what_it_is():
     assert repr(inv) == "<inverse(-divergence @ gradient): cells(26, 22) -> cells(26, 22), multigrid>"
 
 
-def test_transposes_know_each_other():
+def test_the_transpose_of_a_transpose_is_the_same_object():
     inv = dp.inverse(PROBLEMS["wind"]())
     b = np.ones((24, 25))
     assert inv.T is inv.T and inv.T.T.T is inv.T
@@ -54,7 +54,7 @@ def test_transposes_know_each_other():
 
 
 @EVERY
-def test_kind_and_layout_of_the_data(method, rng):
+def test_dtype_and_memory_layout_of_the_data(method, rng):
     op = PROBLEMS["dirichlet"]()
     inv = dp.inverse(op, method)
     b = np.round(8 * rng.standard_normal(op.domain.shape))
@@ -84,7 +84,7 @@ def test_complex_data(method, rng):
 
 
 @pytest.mark.parametrize("adjoint", [False, True])
-def test_complex_data_leave_one_record_of_both_solves(adjoint, rng):
+def test_complex_data_have_one_record_of_both_solves(adjoint, rng):
     op = PROBLEMS["dirichlet"]()
     inv = dp.inverse(op, "krylov")
     solve = inv.T if adjoint else inv
@@ -111,7 +111,7 @@ def test_complex_data_leave_one_record_of_both_solves(adjoint, rng):
 
 
 @pytest.mark.parametrize("part", [1.0, 1j])
-def test_complex_data_leave_the_record_of_the_half_that_failed(part, rng):
+def test_complex_data_have_the_record_of_the_part_that_failed(part, rng):
     inv = dp.inverse(PROBLEMS["dirichlet"](), "krylov", maxiter=1)
     with pytest.raises(dp.errors.ConvergenceError):
         inv(part * rng.standard_normal((26, 22)) + 0j)
@@ -190,7 +190,7 @@ def test_derivatives_of_every_order(problem, method, rng):
 @pytest.mark.parametrize(
     "wrap", [lambda inv: 2 * inv, lambda inv: inv + inv, lambda inv: dp.mask(inv.domain, BOX) @ inv]
 )
-def test_what_is_composed_with_an_inverse_refuses_no_cotangent_either(wrap, rng):
+def test_products_and_sums_with_an_inverse_refuse_no_cotangent(wrap, rng):
     """The transpose of a transpose is the twin that never refuses, also inside scalings, sums and chains."""
     op = ALL["stretched neumann"]()
     strict, free = (wrap(dp.inverse(op, nullspace=word)) for word in ("raise", "project"))
@@ -268,7 +268,7 @@ def test_fixed_iterations_give_the_last_iterate_in_both_forms(rng):
         assert np.max(np.abs(mine)) > 0 and mine == pytest.approx(tape, rel=1e-8, abs=1e-14)
 
 
-def test_unrolled_solves_leave_a_record(rng):
+def test_unrolled_solves_are_recorded(rng):
     op = PROBLEMS["negative"]()
     inv = dp.inverse(op, "krylov", diff="unrolled")
     b = rng.standard_normal(op.domain.shape)
