@@ -1,8 +1,13 @@
 """The report as one page of HTML: it needs no other file and no network."""
 
+from __future__ import annotations
+
 import base64
+from collections.abc import Sequence
+from pathlib import Path
 
 from sparsedp._utils.html import cell, curves, folded
+from sparsedp.check.summary import Result
 
 __all__ = ["page", "section"]
 
@@ -68,17 +73,31 @@ fit();
 """
 
 
-def section(title, result, files, caption):
-    """A result with its picture: the PNG among its files, or a plainer one, and how to read it."""
-    pictures = [base64.b64encode(path.read_bytes()).decode() for path in files if path.suffix == ".png"]
-    drawn = [f'<img alt="{cell(title)}" src="data:image/png;base64,{one}">' for one in pictures]
-    picture = "".join(drawn) or curves(*result.curves(), log=(True, True))
+def section(title: str, result: Result, files: Sequence[Path], caption: str) -> str:
+    """Return a result as HTML with its picture, the PNG among its files or a plainer one, and a caption."""
+    picture = ""
+    for path in files:
+        if path.suffix == ".png":
+            data = base64.b64encode(path.read_bytes()).decode()
+            picture += f'<img alt="{cell(title)}" src="data:image/png;base64,{data}">'
+    if not picture:
+        picture = curves(*result.curves(), log=(True, True))
     figure = f"<figure>{picture}<figcaption>{cell(caption)}</figcaption></figure>" if picture else ""
     return f'<section><h2>{cell(title)}</h2>{figure}<div class="wide">{result.html()}</div></section>'
 
 
-def page(title, verdict, meaning, sections, skipped):
-    """Title, verdict with its meaning, sections, what was left out -> the page."""
+def page(title: str, verdict: str, meaning: str, sections: Sequence[str], skipped: Sequence[str]) -> str:
+    """Return the page of a report.
+
+    Parameters
+    ----------
+    title, verdict, meaning : str
+        The meaning is a sentence about the verdict.
+    sections : sequence of str
+        From `section`.
+    skipped : sequence of str
+        Sentences about what was left out.
+    """
     return f"""<!doctype html>
 <html lang="en">
 <head>

@@ -1,30 +1,59 @@
 """Pictures of fields, charts of measurements. The only file of the package that imports matplotlib (extra `plot`)."""
 
+from __future__ import annotations
+
 import contextlib
 import io
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial, reduce
 from importlib import import_module
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from sparsedp._utils.validation import check_choice, check_kind, check_type
 from sparsedp.autodiff.tape import plain
 from sparsedp.check.gradient_check import Audit
+from sparsedp.check.summary import Result
 from sparsedp.errors import ShapeError
-from sparsedp.grid.grid import check_grid
+from sparsedp.grid.grid import Grid, check_grid
 from sparsedp.io.atomic_files import write_file
 from sparsedp.optimize.result import Minimum
 
 __all__ = [
-    "animate", "convergence", "current", "curves", "figure", "opened", "plot", "sample_data", "stability_chart",
-    "unbeaten", "v_curve", "write_picture", "write_result",
-]  # fmt: skip
+    "animate",
+    "convergence",
+    "current",
+    "curves",
+    "figure",
+    "opened",
+    "plot",
+    "sample_data",
+    "stability_chart",
+    "unbeaten",
+    "v_curve",
+    "write_picture",
+    "write_result",
+]
 
-ARROWS = 24  # arrows along an axis of a face field, at most
+MOST_ARROWS = 24  # along an axis of a face field
+MOST_MARKERS = 64  # points of a line that are marked
+LARGEST_FACTOR = 2.0  # growth factor at the red end of the colours
 
 
-def plot(grid, u, ax=None, title=None, label=None, limits=None, cmap="viridis", at=None):
-    """Field on a grid -> picture in which axis 0 is x, axis 1 is y, lengths are to scale.
+def plot(
+    grid: Grid,
+    u: ArrayLike,
+    ax: Any = None,
+    title: str | None = None,
+    label: str | None = None,
+    limits: tuple[float, float] | None = None,
+    cmap: str = "viridis",
+    at: str | None = None,
+) -> Any:
+    """Draw a field on a grid: axis 0 is x, axis 1 is y, lengths are to scale.
 
     Parameters
     ----------
@@ -63,33 +92,43 @@ def plot(grid, u, ax=None, title=None, label=None, limits=None, cmap="viridis", 
     ('x', 'y', 'flat')
     """
     check_grid("plot", grid)
-    u = np.asarray(plain(u))
-    check_kind("u of plot", u.dtype, "real numbers", "; plot its real part or its absolute value")
-    u, kind, arrows = _scalar(grid, u, at)
+    values = np.asarray(plain(u))
+    check_kind("u of plot", values.dtype, "real numbers", "; plot its real part or its absolute value")
+    values, kind, components = _scalar_field(grid, values, at)
     ax = current(ax)
     if title is not None:
         ax.set_title(title)
     if grid.dim == 1:
-        ax.plot(grid.coordinates(0, kind), u, marker="." if u.size <= 64 else None)
+        marker = "." if values.size <= MOST_MARKERS else None
+        ax.plot(grid.coordinates(0, kind), values, marker=marker)
         ax.set(xlim=(grid.origin[0], grid.origin[0] + grid.size[0]), xlabel="x", ylabel=label or "")
         return ax
-    low, high = limits or _range(u)
-    for view, values, axes in [(ax, u, (0, 1))] if grid.dim == 2 else _slices(grid, u, kind, ax):
-        # pcolormesh wants rows along y, so the array is turned here and nowhere else.
-        # It takes nodes, or the ends of cells.
-        lines = [grid.coordinates(a, "nodes" if kind == "nodes" else "ends") for a in axes]
-        image = view.pcolormesh(*lines, values.T, shading="auto", vmin=low, vmax=high, cmap=cmap, rasterized=True)
+    low, high = limits or _range(values)
+    views = [(ax, values, [0, 1])] if grid.dim == 2 else _middle_slices(grid, values, kind, ax)
+    places = "nodes" if kind == "nodes" else "ends"  # pcolormesh takes nodes, or the ends of cells
+    for view, part, axes in views:
+        lines = [grid.coordinates(axis, places) for axis in axes]
+        # pcolormesh has rows along y, so the array is transposed.
+        image = view.pcolormesh(*lines, part.T, shading="auto", vmin=low, vmax=high, cmap=cmap, rasterized=True)
         view.set(aspect="equal", xlabel=grid.axes[axes[0]], ylabel=grid.axes[axes[1]])
     bar = ax.inset_axes((1.03, 0.0, 0.04, 1.0))  # as high as the map, whatever its shape
     ax.figure.colorbar(image, cax=bar, label=label or "")
-    if arrows and grid.dim == 2:
-        steps = tuple(slice(n // ARROWS // 2, None, -(-n // ARROWS)) for n in grid.shape)
-        ax.quiver(*(part[steps] for part in (*grid.centres(), *arrows)), color="white", pivot="mid")
+    if components and grid.dim == 2:
+        strides = tuple(slice(n // MOST_ARROWS // 2, None, -(-n // MOST_ARROWS)) for n in grid.shape)
+        ax.quiver(*(part[strides] for part in (*grid.centres(), *components)), color="white", pivot="mid")
     return ax
 
 
-def animate(grid, frames, path, title=None, limits=None, cmap="viridis", rate=12):
-    """Frames of a field -> animated GIF.
+def animate(
+    grid: Grid,
+    frames: Sequence[ArrayLike],
+    path: Any,
+    title: str | None = None,
+    limits: tuple[float, float] | None = None,
+    cmap: str = "viridis",
+    rate: float = 12,
+) -> None:
+    """Write frames of a field as an animated GIF.
 
     Parameters
     ----------
@@ -122,23 +161,32 @@ def animate(grid, frames, path, title=None, limits=None, cmap="viridis", rate=12
     >>> film.getvalue()[:3]
     b'GIF'
     """
-    frames = [np.asarray(plain(frame)) for frame in frames]
-    if not frames:
+    arrays = [np.asarray(plain(frame)) for frame in frames]
+    if not arrays:
         raise ValueError("animate needs at least one frame, got none; run with keep='all'")
-    limits = limits or _range(np.concatenate([_scalar(grid, frame)[0].ravel() for frame in frames]))
+    limits = limits or _range(np.concatenate([_scalar_field(grid, frame)[0].ravel() for frame in arrays]))
     images = []
-    for frame in frames:
-        picture, pixels = figure(), io.BytesIO()
+    for frame in arrays:
+        picture = figure()
+        pixels = io.BytesIO()
         plot(grid, frame, ax=picture.add_subplot(), title=title, limits=limits, cmap=cmap)
         picture.savefig(pixels, format="png", dpi="figure")
         images.append(opened(pixels).convert("RGB").quantize(256))
     first, *others = images
-    film = partial(first.save, format="GIF", save_all=True, append_images=others, duration=round(1000 / rate), loop=0)
-    film(path) if hasattr(path, "write") else write_file(path, film)
+    write = partial(first.save, format="GIF", save_all=True, append_images=others, duration=round(1000 / rate), loop=0)
+    if hasattr(path, "write"):
+        write(path)
+    else:
+        write_file(path, write)
 
 
-def _scalar(grid, u, at=None):
-    """(the numbers that a map shows, "cells" or "nodes", components): of a face field its magnitude, at the centres."""
+def _scalar_field(
+    grid: Grid, u: NDArray[Any], at: str | None = None
+) -> tuple[NDArray[Any], str, Sequence[NDArray[Any]]]:
+    """Return the numbers that a map shows, "cells" or "nodes", and the components of a face field.
+
+    A map of a face field shows its magnitude at the centres of the cells.
+    """
     kinds = (at,) if at else ("cells", "faces", "nodes")
     kind = next((kind for kind in kinds if u.shape == getattr(grid, kind).shape), None)
     if kind is None:
@@ -148,21 +196,23 @@ def _scalar(grid, u, at=None):
         return u, kind, []
     if grid.dim == 1:
         return u, "nodes", []
-    inside = tuple(map(slice, grid.shape))  # the last face of a bounded axis has no other beyond it
-    parts = [0.5 * (part + np.roll(part, -1, a))[inside] for a, part in enumerate(grid.split(u))]
+    inside = tuple(map(slice, grid.shape))  # the last face of a bounded axis has no neighbour beyond it
+    parts = [0.5 * (part + np.roll(part, -1, axis))[inside] for axis, part in enumerate(grid.split(u))]
     return reduce(np.hypot, parts), "cells", parts
 
 
-def _range(u):
+def _range(u: NDArray[Any]) -> tuple[float, float]:
+    """Return the least and the largest finite value; 0 and 1 without any."""
     finite = u[np.isfinite(u)]
     return (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
 
 
-def _slices(grid, u, kind, ax):
-    """The three middle slices of a 3-D field, side by side inside one pair of axes: (axes, array, its two axes)."""
+def _middle_slices(grid: Grid, u: NDArray[Any], kind: str, ax: Any) -> Iterator[tuple[Any, NDArray[Any], list[int]]]:
+    """Yield axes, array and its two grid axes of the three middle slices of a 3-D field, side by side."""
     ax.set_axis_off()
     for place, across in enumerate((2, 1, 0)):
-        inset, middle = ax.inset_axes((0.35 * place, 0.0, 0.25, 1.0)), u.shape[across] // 2
+        inset = ax.inset_axes((0.35 * place, 0.0, 0.25, 1.0))
+        middle = u.shape[across] // 2
         inset.set_title(f"{grid.axes[across]} = {grid.coordinates(across, kind)[middle]:.3g}", fontsize="medium")
         yield inset, u.take(middle, across), [axis for axis in range(3) if axis != across]
 
@@ -170,23 +220,23 @@ def _slices(grid, u, kind, ax):
 # ---------------------------------------------------------------- charts
 
 
-def unbeaten(points):
-    """Tuples that begin with two costs -> those that no other one beats in both, in the order of the first cost.
+def unbeaten(points: Sequence[Any]) -> list[Any]:
+    """Return the tuples, each beginning with two costs, that no other one beats in both, by the first cost.
 
     Examples
     --------
     >>> unbeaten([(3, 1), (1, 5), (2, 6), (2, 2)])
     [(1, 5), (2, 2), (3, 1)]
     """
-    best: list = []
+    best: list[Any] = []
     for point in sorted(points, key=lambda point: point[:2]):
         if not best or point[1] < best[-1][1]:
             best.append(point)
     return best
 
 
-def curves(lines, ax, xlabel, ylabel):
-    """Named curves -> one log-log picture; the best points reached at any time are marked.
+def curves(lines: Mapping[str, Any], ax: Any, xlabel: str, ylabel: str) -> Any:
+    """Draw named curves on log-log axes, and mark the best points reached at any time.
 
     Parameters
     ----------
@@ -201,10 +251,13 @@ def curves(lines, ax, xlabel, ylabel):
     """
     best = unbeaten([point for points in lines.values() for point in points if point[1] > 0])
     ax.plot(*np.reshape(best, (-1, 2)).T, color="0.8", linewidth=6, solid_capstyle="round", label="best so far")
-    return _dressed(lines, ax, xlabel, ylabel)
+    return _labelled_curves(lines, ax, xlabel, ylabel)
 
 
-def _dressed(lines, ax, xlabel, ylabel, title=None, xscale="log"):
+def _labelled_curves(
+    lines: Mapping[str, Any], ax: Any, xlabel: str, ylabel: str, title: str | None = None, xscale: str = "log"
+) -> Any:
+    """Draw named curves with labels, a grid and a legend."""
     for name, points in lines.items():
         ax.plot(*np.reshape(points, (-1, 2)).T, marker=".", markersize=4, linewidth=1, label=name)
     ax.set(xlabel=xlabel, ylabel=ylabel, title=title, xscale=xscale)
@@ -214,8 +267,8 @@ def _dressed(lines, ax, xlabel, ylabel, title=None, xscale="log"):
     return ax
 
 
-def convergence(best, ax=None, against="iteration"):
-    """Result of `minimize` -> picture of the loss and the gradient norm over iterations, seconds or solves.
+def convergence(best: Minimum, ax: Any = None, against: str = "iteration") -> Any:
+    """Draw the loss and the gradient norm of a run of `minimize` over iterations, seconds or solves.
 
     Parameters
     ----------
@@ -254,13 +307,13 @@ def convergence(best, ax=None, against="iteration"):
     records = [(getattr(record, against), record.value, record.gradient_norm) for record in best.history]
     numbers = np.array(records, float)
     least = numbers[:, 1].min()
-    lines = {"loss - least loss" if least <= 0 else "loss": numbers[:, :2] - (0.0, min(least, 0.0))}
-    lines["gradient norm"] = numbers[:, ::2]
-    return _dressed(lines, ax, against, "", f"{best.method}: {best.message.split(':')[0]}", xscale="linear")
+    name = "loss - least loss" if least <= 0 else "loss"
+    lines = {name: numbers[:, :2] - (0.0, min(least, 0.0)), "gradient norm": numbers[:, ::2]}
+    return _labelled_curves(lines, ax, against, "", f"{best.method}: {best.message.split(':')[0]}", xscale="linear")
 
 
-def v_curve(audit, ax=None):
-    """Audit of a gradient -> picture of |difference - gradient| over the step, one curve for each direction.
+def v_curve(audit: Audit, ax: Any = None) -> Any:
+    """Draw |difference - gradient| of an audit over the step, one curve for each direction.
 
     A right gradient gives a V: the error of the differences falls with the step until rounding lifts it. A
     wrong one gives a plateau.
@@ -291,12 +344,13 @@ def v_curve(audit, ax=None):
     'step'
     """
     check_type("v_curve", audit, Audit, "what check.gradient returns", "dp.v_curve(dp.check.gradient(loss, x))")
-    lines, across, up = audit.curves()
-    return _dressed(lines, current(ax), across, up, ": ".join(filter(None, (audit.verdict, audit.culprit))))
+    lines, xlabel, ylabel = audit.curves()
+    title = f"{audit.verdict}: {audit.culprit}" if audit.culprit else audit.verdict
+    return _labelled_curves(lines, current(ax), xlabel, ylabel, title)
 
 
-def stability_chart(growth, ax):
-    """Stability map -> picture: growth factor over viscosity (across) and time step (up); refused steps are grey.
+def stability_chart(growth: Any, ax: Any) -> Any:
+    """Draw a stability map: growth factor over viscosity (across) and time step (up); refused steps are grey.
 
     Parameters
     ----------
@@ -309,16 +363,17 @@ def stability_chart(growth, ax):
     """
     ylabel, xlabel = growth.names
     ax.set(xlabel=xlabel, ylabel=ylabel, title="stable: blue; grows: red; refused: grey", facecolor="0.75")
-    factors = np.clip(growth.factors, 0.0, 2.0)
-    ends = map(_ends_between, (growth.viscosities, growth.time_steps))
-    image = ax.pcolormesh(*ends, factors, cmap="coolwarm", vmin=0, vmax=2)
+    factors = np.clip(growth.factors, 0.0, LARGEST_FACTOR)
+    x = _ends_between(growth.viscosities)
+    y = _ends_between(growth.time_steps)
+    image = ax.pcolormesh(x, y, factors, cmap="coolwarm", vmin=0, vmax=LARGEST_FACTOR)
     ax.figure.colorbar(image, ax=ax, label="growth factor of a step (2 and more: red)")
     ax.loglog(*growth.here[::-1], marker="*", color="black", markersize=12)
     return ax
 
 
-def _ends_between(values):
-    """Rising numbers > 0 -> the ends of cells around them, as wide on both sides on a logarithmic axis."""
+def _ends_between(values: NDArray[Any]) -> NDArray[Any]:
+    """Return the ends of cells around rising positive numbers, equally wide on both sides on a logarithmic axis."""
     ends = np.sqrt(values[1:] * values[:-1])
     return np.concatenate([values[:1] ** 2 / ends[:1], ends, values[-1:] ** 2 / ends[-1:]])
 
@@ -326,47 +381,61 @@ def _ends_between(values):
 # ---------------------------------------------------------------- figures and files
 
 
-def figure():
-    """An empty figure that belongs to no window."""
+def figure() -> Any:
+    """Return an empty figure that belongs to no window."""
     return _matplotlib(".figure").Figure(figsize=(5.5, 4.4), layout="constrained")
 
 
-def current(ax):
-    """The axes given, or the current ones of pyplot."""
+def current(ax: Any) -> Any:
+    """Return the axes, or the current ones of pyplot for None."""
     return _matplotlib(".pyplot").gca() if ax is None else ax
 
 
-def write_picture(path, draw):
-    """``draw(axes) -> axes`` -> PNG at a path."""
+def write_picture(path: Path, draw: Callable[[Any], Any]) -> None:
+    """Write what ``draw(axes)`` draws as a PNG file."""
     picture = draw(figure().add_subplot()).figure
     write_file(path, partial(picture.savefig, format="png", dpi=150, bbox_inches="tight", pad_inches=0.15))
 
 
-def write_result(result, folder, stem, draw=None, heading=""):
-    """A result, and ``draw(axes) -> axes`` -> paths of stem.md, stem.csv and, with matplotlib, stem.png in a folder."""
-    page, numbers, picture = [folder / f"{stem}.{kind}" for kind in ("md", "csv", "png")]
-    write_file(page, heading + result.markdown())
-    write_file(numbers, result.csv())
+def write_result(
+    result: Result, folder: Path, stem: str, draw: Callable[[Any], Any] | None = None, heading: str = ""
+) -> list[Path]:
+    """Write a result as stem.md, stem.csv and, with matplotlib, stem.png into a folder, and return the paths.
+
+    Parameters
+    ----------
+    result : Result
+    folder : pathlib.Path
+    stem : str
+    draw : callable, optional
+        ``draw(axes)`` draws the picture.
+    heading : str
+        Before the text.
+    """
+    paths = [folder / f"{stem}.md", folder / f"{stem}.csv"]
+    write_file(paths[0], heading + result.markdown())
+    write_file(paths[1], result.csv())
     if draw:
+        picture = folder / f"{stem}.png"
         with contextlib.suppress(ImportError):
             write_picture(picture, draw)
-            return [page, numbers, picture]
-    return [page, numbers]
+            paths.append(picture)
+    return paths
 
 
-def sample_data(name):
-    """Name of an archive in matplotlib's sample data -> the archive."""
+def sample_data(name: str) -> Any:
+    """Return an archive of matplotlib's sample data."""
     return _matplotlib(".cbook").get_sample_data(name)
 
 
-def opened(file):
-    """File or stream -> picture of Pillow, which comes with matplotlib; one too large for memory is refused."""
+def opened(file: Any) -> Any:
+    """Return a file or stream as a picture of Pillow, which refuses one that is too large for memory."""
     _matplotlib()
     return import_module("PIL.Image").open(file)
 
 
-def _matplotlib(part=""):
-    """matplotlib or one of its modules (with the dot), imported when a picture is asked for."""
+def _matplotlib(part: str = "") -> Any:
+    """Import matplotlib or one of its modules (with the dot), since a picture is needed."""
     try:
         import_module("matplotlib")
         return import_module(f"matplotlib{part}")

@@ -1,10 +1,13 @@
 """The demo from the first line to the last: hide a ground, survey it, check the gradient, recover it on three grids.
 
-What the reader sees is printed; pictures, the table and the recovered field are left behind.
+Progress is printed; pictures, the table and the recovered field are written to files.
 """
 
+from __future__ import annotations
+
 from functools import partial
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,7 +24,8 @@ from sparsedp.report.scene_file import claim_folder
 
 __all__ = ["FILES", "Study", "grids_for", "prepare", "tell"]
 
-SMALLEST, LARGEST = 12, 512  # cells along the longest side
+SMALLEST = 12  # cells along the longest side
+LARGEST = 512
 THINNEST = 0.25  # shortest side of the box
 ITERATIONS = 80
 WARM_UP = 2  # iterations whose time is not measured
@@ -42,10 +46,10 @@ class Study(NamedTuple):
     truth: np.ndarray
 
 
-def grids_for(terrain, size):
-    """Terrain and cells along the longest side -> three grids in its proportions, the longest side of length 1.
+def grids_for(terrain: Terrain, size: int) -> list[dp.Grid]:
+    """Return three grids in the proportions of a terrain, the longest side of length 1.
 
-    They have half, three quarters and all of these cells.
+    They have half, three quarters and all of `size` cells along the longest side.
 
     Raises
     ------
@@ -59,67 +63,99 @@ def grids_for(terrain, size):
     return [dp.Grid(tuple(shape), size=tuple(sides)) for shape in cells.tolist()]
 
 
-def prepare(terrain, grids):
-    """Terrain and grids -> Study: hide the ground, make the survey on a grid twice as fine as the finest.
+def prepare(terrain: Terrain, grids: list[dp.Grid]) -> Study:
+    """Hide the ground, and compute the survey on a grid twice as fine as the finest.
 
     Raises
     ------
     ValueError
-        If nothing of the terrain is left at this size.
+        If the terrain is constant at this size.
     """
     fine = dp.Grid(tuple(2 * n for n in grids[-1].shape), size=grids[-1].size)
     hidden = hidden_ground(fine, terrain)
     return Study(terrain, grids, survey(fine, hidden), remap(fine, grids[-1])(hidden))
 
 
-def recover(study, grid):
-    """Study and grid -> (log-conductivity, row of the table, pairs of seconds and error).
+def recover(study: Study, grid: dp.Grid) -> tuple[np.ndarray, dict[str, Any], list[tuple[float, float]]]:
+    """Check the gradient, then find the ground by L-BFGS, and print some iterations.
 
-    The gradient is checked, then the ground is found by L-BFGS; the iterations in `PRINTED` and the last one are
-    printed. Two iterations run beforehand, on a ground of their own: the seconds do not contain compilation.
-    Misfit: root mean square of (computed - read) / noise, 1 is a fit within the noise. Error: distance from the truth,
-    relative, 1 for the flat start.
+    Two iterations run beforehand, on a ground of their own: the seconds do not contain compilation.
+
+    Returns
+    -------
+    logk : ndarray
+        Log-conductivity.
+    row : dict
+        Of the table. Misfit: root mean square of (computed - read) / noise, 1 is a fit within the noise. Error:
+        distance from the truth, relative, 1 for the flat start.
+    curve : list of (float, float)
+        Seconds and error of each iteration.
     """
-    loss, warm_up = (objective(Ground(grid, study.data.wells, study.data.sensors), study.data) for _ in range(2))
-    x, y = grid.centres()  # a ground that is nowhere special
+    loss = objective(Ground(grid, study.data.wells, study.data.sensors), study.data)
+    check = _check_gradient(study, grid, loss)
+    progress = _Progress(study, grid)
+    _warm_up(study, grid)
+    print("  iteration   misfit/noise   error   seconds", flush=True)  # a log is read while it is written
+    with recording() as calls:
+        best = dp.minimize(loss, np.zeros(grid.shape), maxiter=ITERATIONS, callback=progress.note, memory=20)
+    if best.message.startswith("interrupted"):  # minimize keeps its best point; the demo ends
+        raise KeyboardInterrupt
+    rows = progress.rows
+    if best.history[-1].iteration > len(rows):  # the iteration that meets the tolerance is not reported
+        progress.note(best.history[-1], best.x)
+    if len(rows) not in PRINTED:
+        progress.show(rows[-1])
+    counts = {name: total(calls, kind) for name, kind in COUNTED.items()}
+    print(f"  {', '.join(f'{count} {name}' for name, count in counts.items())}\n", flush=True)
+    row = {"grid": " x ".join(map(str, grid.shape)), "unknowns": best.x.size, **rows[-1], **counts}
+    row["gradient"] = check.verdict
+    row["gradient_error"] = max((line.share for line in check.lines), default=np.nan)
+    return best.x, row, [(point["seconds"], point["error"]) for point in rows]
+
+
+def _check_gradient(study: Study, grid: dp.Grid, loss: Any) -> Any:
+    """Check the gradient at a ground without special values, and print the result."""
+    x, y = grid.centres()
     check = dp.check.gradient(loss, 0.5 * np.sin(5 * x + 1) * np.cos(4 * y), directions=1)
     shown = check if grid is study.grids[-1] else check.verdict  # one table is enough
     print(f"On {grid}. Is the gradient right?", shown, sep="\n", end="\n\n", flush=True)
-    roughness, to_finest = regulariser(grid), remap(grid, study.grids[-1])
-    rows: list[dict] = []
+    return check
 
-    def note(record, logk):
-        misfit = float(np.sqrt(max(0.0, 2 * (record.value - roughness(logk)))))
-        error = distance(to_finest(logk), study.truth)
-        rows.append({"iterations": len(rows) + 1, "seconds": record.seconds, "misfit": misfit, "error": error})
-        if len(rows) in PRINTED:
-            show(rows[-1])
 
-    def show(row):
-        print("  {iterations:9d}   {misfit:12.3f}   {error:5.3f}   {seconds:7.2f}".format(**row), flush=True)
-
+def _warm_up(study: Study, grid: dp.Grid) -> None:
+    """Run some iterations whose time is not measured."""
+    loss = objective(Ground(grid, study.data.wells, study.data.sensors), study.data)
     with recording():
-        dp.minimize(warm_up, np.zeros(grid.shape), maxiter=WARM_UP, memory=20)
-    print("  iteration   misfit/noise   error   seconds", flush=True)  # a log is read while it is written
-    with recording() as calls:
-        best = dp.minimize(loss, np.zeros(grid.shape), maxiter=ITERATIONS, callback=note, memory=20)
-    if best.message.startswith("interrupted"):  # minimize keeps its best point; the demo ends
-        raise KeyboardInterrupt
-    if best.history[-1].iteration > len(rows):  # the iteration that meets the tolerance is not reported
-        note(best.history[-1], best.x)
-    if len(rows) not in PRINTED:
-        show(rows[-1])
-    counts = {name: total(calls, kind) for name, kind in COUNTED.items()}
-    print(f"  {', '.join(f'{many} {name}' for name, many in counts.items())}\n", flush=True)
-    row = {"grid": " x ".join(map(str, grid.shape)), "unknowns": best.x.size, **rows[-1], **counts}
-    row |= {"gradient": check.verdict, "gradient_error": max((line.share for line in check.lines), default=np.nan)}
-    return best.x, row, [(one["seconds"], one["error"]) for one in rows]
+        dp.minimize(loss, np.zeros(grid.shape), maxiter=WARM_UP, memory=20)
+
+
+class _Progress:
+    """The iterations of one run: noted, and some of them printed."""
+
+    def __init__(self, study: Study, grid: dp.Grid) -> None:
+        self.truth = study.truth
+        self.roughness = regulariser(grid)
+        self.to_finest = remap(grid, study.grids[-1])
+        self.rows: list[dict[str, Any]] = []
+
+    def note(self, record: Any, logk: np.ndarray) -> None:
+        """Note an iteration."""
+        misfit = float(np.sqrt(max(0.0, 2 * (record.value - self.roughness(logk)))))
+        error = distance(self.to_finest(logk), self.truth)
+        number = len(self.rows) + 1
+        self.rows.append({"iterations": number, "seconds": record.seconds, "misfit": misfit, "error": error})
+        if number in PRINTED:
+            self.show(self.rows[-1])
+
+    def show(self, row: dict[str, Any]) -> None:
+        """Print an iteration."""
+        print("  {iterations:9d}   {misfit:12.3f}   {error:5.3f}   {seconds:7.2f}".format(**row), flush=True)
 
 
 # ---------------------------------------------------------------- what the reader sees
 
 
-def tell(study, folder, force):
+def tell(study: Study, folder: Path, force: bool) -> bool:
     """Run the demo, print what happens, write the files.
 
     Parameters
@@ -139,13 +175,18 @@ def tell(study, folder, force):
     OSError
         If a file cannot be written.
     ValueError
-        If one has come there during the run, and `force` is not set.
+        If one has appeared there during the run, and `force` is not set.
     """
     print(INTRODUCTION.format(s=study, d=study.data, noise=100 * NOISE), flush=True)
-    (*_, logk), rows, curves = zip(*(recover(study, grid) for grid in study.grids))
+    rows = []
+    curves = []
+    for grid in study.grids:
+        logk, row, curve = recover(study, grid)
+        rows.append(row)
+        curves.append(curve)
     print("Error against run time. Misfit/noise 1: the readings are met to the noise. Error 1: the flat start.")
     print(table_of(rows, SHOWN), end="\n\n")
-    claim_folder(folder, FILES, force)  # once more: it is a while since the run began
+    claim_folder(folder, FILES, force)  # again: files may have appeared during the run
     write_file(folder / "table.csv", table_of(rows).csv())
     write_file(folder / "recovered.npy", lambda stream: np.save(stream, logk, allow_pickle=False))
     try:
@@ -172,8 +213,8 @@ To try next:
   python -m sparsedp report FILE.py                       all instruments on it, in one folder"""
 
 
-def _map(study, title, field, ax):
-    """A field with the wells and the sensors; truth and recovery with the same colours."""
+def _map(study: Study, title: str, field: np.ndarray, ax: Any) -> Any:
+    """Draw a field with the wells and the sensors; truth and recovery with the same colours."""
     limits = float(study.truth.min()), float(study.truth.max())
     plots.plot(study.grids[-1], field, ax, title, "log of conductivity / mean conductivity", limits)
     ax.plot(*study.data.sensors.T, ".", color="black", markersize=1, alpha=0.6)
@@ -181,7 +222,7 @@ def _map(study, title, field, ax):
     return ax
 
 
-def _convergence(rows, curves, ax):
-    """Error against run time, one curve for each grid."""
+def _convergence(rows: list[dict[str, Any]], curves: list[Any], ax: Any) -> Any:
+    """Draw error against run time, one curve for each grid."""
     lines = {f"{row['grid']} cells": curve for row, curve in zip(rows, curves)}
     return plots.curves(lines, ax, "run time [s]", "relative error of log conductivity (flat start: 1)")

@@ -1,10 +1,13 @@
-"""The field that plays the hidden ground: real terrain, the reader's own file, or a generated one.
+"""The field that serves as the hidden ground: real terrain, the reader's own file, or a generated one.
 
 Files are read by NumPy, which unpickles nothing.
 """
 
+from __future__ import annotations
+
 import os
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,12 +33,13 @@ class Terrain(NamedTuple):
     source: str
 
 
-def load(path=None):
-    """Path of a file, or None -> Terrain. None: the sample data of matplotlib, or a generated terrain.
+def load(path: Path | None = None) -> Terrain:
+    """Load a terrain from a file.
 
     Parameters
     ----------
     path : pathlib.Path or None
+        None: the sample data of matplotlib, or a generated terrain.
 
     Returns
     -------
@@ -57,14 +61,14 @@ def load(path=None):
     return Terrain(rows[::-1].T.astype(float), f"elevation model {SAMPLE} from matplotlib's sample data")
 
 
-def generated(shape):
-    """Shape -> winding ridges, the same in every run."""
+def generated(shape: tuple[int, int]) -> np.ndarray:
+    """Return winding ridges, the same in every run."""
     x, y = np.indices(shape) / max(shape)
     return np.sin(9 * x + 2 * np.sin(7 * y)) + 0.5 * np.cos(17 * y - 5 * x)
 
 
-def remap(source, grid):
-    """Two grids over the same box -> Operator from cells of the one to cells of the other: the mean over each cell.
+def remap(source: dp.Grid, grid: dp.Grid) -> dp.Operator:
+    """Return the operator from cells of a grid to cells of another one over the same box: the mean over each cell.
 
     Each cell is cut into `FINEST` parts or fewer along each axis, the field is interpolated there
     (`sample`), and the parts are averaged (`restrict`). Linear fields are exact.
@@ -89,8 +93,8 @@ def remap(source, grid):
     return dp.restrict(fine, parts) @ dp.sample(source, centres_of(fine))
 
 
-def hidden_ground(grid, terrain):
-    """Terrain -> log-conductivity of the ground on a grid: mean 0, standard deviation 1 (or a little less).
+def hidden_ground(grid: dp.Grid, terrain: Terrain) -> np.ndarray:
+    """Return a terrain as log-conductivity on a grid: mean 0, standard deviation 1 (or a little less).
 
     Parameters
     ----------
@@ -118,10 +122,10 @@ def hidden_ground(grid, terrain):
 # ---------------------------------------------------------------- a file from anywhere
 
 
-def read_field(path):
-    """Path of a .npy, .npz or .png file -> field, shape (nx, ny), finite.
+def read_field(path: Path) -> np.ndarray:
+    """Read a finite field of shape (nx, ny) from a .npy, .npz or .png file.
 
-    An array is taken as a field: axis 0 is x. A picture has its rows from the top, and is turned.
+    An array is taken as a field: axis 0 is x. A picture has its rows from the top, and is rotated.
 
     Parameters
     ----------
@@ -176,14 +180,14 @@ def read_field(path):
     return np.ldexp(field, -np.frexp(np.abs(field).max())[1])
 
 
-def _grey(path):
-    """Path of a picture -> its grey values; its rows run from the top."""
+def _grey(path: Path) -> np.ndarray:
+    """Return the grey values of a picture, whose rows run from the top."""
     with plots.opened(path) as picture:
         return np.asarray(picture.convert("F"))[::-1].T
 
 
-def _only_map(path):
-    """Path of a .npz file -> the 2-D array in it."""
+def _only_map(path: Path) -> np.ndarray:
+    """Return the only 2-D array of a .npz file."""
     with np.load(path) as archive:
         maps = {name: values for name, values in archive.items() if np.ndim(values) == 2}
         if len(maps) != 1:
