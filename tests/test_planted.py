@@ -117,7 +117,7 @@ BUGS = {
         "solvers",
         "            self.lu = direct_engine(self.system)\n",
         "",
-        "tests/solvers/test_steady.py::test_a_jacobian_leans_on_the_factors_of_one_before",
+        "tests/solvers/test_steady.py::test_factors_of_an_earlier_jacobian_precondition_the_next",
     ),
     "a culprit that is not where the derivative is infinite": Bug(
         "autodiff/derivative.py",
@@ -395,13 +395,13 @@ BUGS = {
         "solvers",
         "_rates(op.matrix, equation.unknowns) / time_step",
         "-_rates(op.matrix, equation.unknowns) / time_step",
-        "tests/solvers/test_steady.py::test_convection_at_32_takes_pseudo_time",
+        "tests/solvers/test_steady.py::test_convection_at_32_needs_pseudo_time",
     ),
     "what the weights miss of the constant, with the wrong sign": Bug(
         "solvers",
         "image = self.inverse_root * self.extra - self.apply_scaled(",
         "image = self.inverse_root * self.extra + self.apply_scaled(",
-        "tests/solvers/test_multigrid_loops.py::test_the_coarse_matrix_is_that_of_galerkin",
+        "tests/solvers/test_multigrid_loops.py::test_the_coarse_matrix_is_the_galerkin_product",
         compiled=True,
     ),
     # ---- advection

@@ -45,7 +45,7 @@ def test_solution_and_gradients_are_the_dense_formulas(rng):
     np.testing.assert_allclose(of_data, -np.outer(y, x)[solve.rows, solve.columns], rtol=1e-11)
 
 
-def test_planted_mistakes_are_seen(rng, monkeypatch):
+def test_planted_errors_are_detected(rng, monkeypatch):
     """A for its transpose in the adjoint; rows for columns in the cotangent."""
     solve, data, b = system(rng)
     loss = lambda p: anp.sum(solve(*p) ** 2)
@@ -82,7 +82,7 @@ def test_taylor_rates_and_every_mode_of_second_order(rng):
     assert rate(lambda h: change(h) - h * first - h**2 / 2 * dot(hessian, d)) >= 2.9
 
 
-def test_one_adjoint_solve_one_set_up_and_none_when_nothing_asks(rng):
+def test_one_adjoint_solve_one_set_up_and_none_without_a_gradient(rng):
     solve, data, b = system(rng)
     with recording() as calls:
         value_and_grad(lambda p: anp.sum(solve(*p)))((data, b))
@@ -98,14 +98,14 @@ def test_one_adjoint_solve_one_set_up_and_none_when_nothing_asks(rng):
     assert calls[name, "adjoint"] == calls[name, "setup"] == 0
 
 
-def test_data_that_change_in_place_are_set_up_anew(rng):
+def test_data_that_change_in_place_get_a_new_set_up(rng):
     solve, data, b = system(rng)
     solve(data, b)
     data *= 2.0
     np.testing.assert_allclose(dense(solve, data) @ solve(data, b), b, rtol=1e-11)
 
 
-def test_nothing_traced_is_kept(rng):
+def test_the_cache_holds_no_traced_values(rng):
     solve, data, b = system(rng)
     slope = lambda p: value_and_grad(lambda p: anp.sum(solve(*p) ** 2))(p)[1]
     first = pushforward(slope, (data, b), (data, b))[1]
@@ -199,7 +199,7 @@ def test_complex_entries_and_dtypes(rng):
     assert solve(np.where(solve.rows == solve.columns, 2, 0), np.ones(8, int)).tolist() == [0.5] * 8
 
 
-def test_what_is_refused(rng):
+def test_invalid_arguments_raise(rng):
     solve, data, b = system(rng, 8)
     wrong = data.copy()
     wrong[3] = np.nan
@@ -224,7 +224,7 @@ def test_what_is_refused(rng):
 # ---- places in any order, some many times ----------------------------------------------------------------------------
 
 
-def test_values_on_one_place_are_summed_and_differentiable(rng):
+def test_values_at_one_place_are_summed_and_differentiable(rng):
     n = 6
     many = 40
     rows = rng.integers(0, n, many)
@@ -268,7 +268,7 @@ def test_a_domain_of_a_grid_takes_flat_places(rng):
         (np.zeros(0, int), np.zeros(0, int), {}, ShapeError, "one place at least; give others$"),
     ],
 )
-def test_places_that_are_refused(rows, columns, options, error, message):
+def test_invalid_places_raise(rows, columns, options, error, message):
     with pytest.raises(error, match=message):
         matrix_solver.from_coo(rows, columns, **options)
 

@@ -208,7 +208,7 @@ def test_one_adjoint_solve_for_all_arguments(places):
 
 
 @METHODS
-def test_set_ups_are_kept_by_content(method):
+def test_set_ups_are_cached_by_content(method):
     solve, (k, b, shift), _ = setting(method=method)
     fresh = lambda: setting(method=method)[0]
 
@@ -239,7 +239,7 @@ def test_the_cache_holds_plain_values():
     )
 
 
-def test_the_log_and_the_words():
+def test_the_log_and_the_printed_text():
     solve, point, _ = setting(method="multigrid")
     assert "not set up yet" in str(solve) and solve.info.forward is None
     value_and_grad(loss_of(solve))(point)

@@ -133,7 +133,7 @@ def test_batches_and_one_adjoint_solve_for_all():
     assert [calls["elliptic_solver", word] for word in ("solve", "adjoint", "setup")] == [1, 1, 0]
 
 
-def test_set_ups_are_kept_by_the_content_of_the_shift():
+def test_set_ups_are_cached_by_the_content_of_the_shift():
     solve, (k, b, shift), _ = setting("real field")
     shift = shift.copy()
 
@@ -191,7 +191,7 @@ def waves(n, method="krylov", cells=10, **options):
     return dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet), method, **options), shift, b
 
 
-def test_waves_are_no_task_for_multigrid():
+def test_multigrid_refuses_waves():
     grid = dp.Grid((140, 120), size=1.0)
     solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet))
     message = r"multigrid on <shift - .*>: .* wanted 1e-10 \(indefinite_operator\); write method='direct'"
@@ -217,7 +217,7 @@ def test_shifted_laplace_preconditions_waves_and_their_adjoint():
         alone(1.0, b, shift)
 
 
-def test_auto_leaves_lu_where_it_would_not_fit(monkeypatch):
+def test_auto_avoids_lu_that_exceeds_the_memory(monkeypatch):
     monkeypatch.setitem(COMPLEX_UP_TO, 2, 2000)
     for n, word in ((40, "direct: complex entries"), (50, "krylov: 2500 complex unknowns in 2-D: LU would not fit")):
         solve, shift, b = waves(n, "auto")
@@ -300,7 +300,7 @@ def test_factors_in_single_precision_meet_the_same_tolerance(damped):
     assert solve.info.adjoint.residual <= 1e-10
 
 
-def test_single_precision_is_left_where_refinement_would_not_converge():
+def test_single_precision_is_abandoned_where_refinement_would_not_converge():
     """Next to an eigenvalue, and where entries leave its range."""
     grid = dp.Grid((12, 12))
     b = np.cos(np.arange(144.0)).reshape(12, 12)
@@ -337,7 +337,7 @@ def test_single_precision_takes_as_many_rounds_as_an_eigenvalue_close_by_needs()
     dp.inverse(uneven, "direct", precision="double")(np.cos(n))
 
 
-def test_single_precision_lifts_faint_regions_of_complex_operators():
+def test_single_precision_rescales_faint_regions_of_complex_operators():
     block = sp.diags_array([np.ones(39), np.full(40, 3.0 + 1j), np.ones(39)], offsets=[-1, 0, 1])
     op = dp.from_matrix(sp.csr_array(sp.block_diag([block, block])))
     b = np.cos(np.arange(80.0)) * np.repeat([1.0, 1e-30], 40) * (1 + 2j)
@@ -345,7 +345,7 @@ def test_single_precision_lifts_faint_regions_of_complex_operators():
     close(x[40:], np.linalg.solve(block.toarray(), b[40:]), 1e-9)
 
 
-def test_precision_is_one_of_three_words():
+def test_an_unknown_precision_raises():
     with pytest.raises(ValueError, match="precision must be one of auto, single, double, got 'half'"):
         dp.inverse(dp.identity(dp.Grid(3).cells), "direct", precision="half")
 
@@ -391,7 +391,7 @@ def test_bits_do_not_depend_on_units(exponent):
 
 @pytest.mark.parametrize("turn", [1.0, 1.0 + 0j])
 @pytest.mark.parametrize("field", [False, True])
-def test_a_shift_that_is_an_eigenvalue_is_refused(turn, field):
+def test_a_shift_that_is_an_eigenvalue_raises(turn, field):
     grid = dp.Grid((6, 5), size=1.0)
     solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet))
     values = np.linalg.eigvalsh(-(solve.D @ solve.G).matrix.toarray())

@@ -83,7 +83,7 @@ def test_gradient_is_the_dense_formula(name):
 
 
 @pytest.mark.slow
-def test_checker_agrees_and_sees_planted_mistakes(monkeypatch):
+def test_check_gradient_agrees_and_detects_planted_errors(monkeypatch):
     """J for its transpose, and a second derivative that holds x still."""
     problem = PROBLEMS["advection 1-D"]()
     loss = problem.loss(implicit(problem.residual))
@@ -118,7 +118,7 @@ def test_a_wrong_guess_of_a_stencil_is_not_used_for_products(monkeypatch):
 # ---- how often ---------------------------------------------------------------------------------------------------
 
 
-def test_one_adjoint_solve_for_all_parameters_and_none_when_nothing_asks():
+def test_one_adjoint_solve_for_all_parameters_and_none_without_a_gradient():
     problem = PROBLEMS["diffusion 1-D"]()
     root = implicit(problem.residual)
     linear = f"{root.name}.jacobian"
@@ -162,7 +162,7 @@ def test_the_adjoint_uses_the_jacobian_at_the_root_not_the_last_one(monkeypatch)
     assert gap() > 1e-4
 
 
-def test_the_set_up_is_reused_where_the_guess_was_the_root():
+def test_the_set_up_is_reused_where_the_guess_is_the_root():
     problem = PROBLEMS["diffusion 1-D"]()
     root = implicit(problem.residual)
     x = root(problem.guess, problem.params)
@@ -172,7 +172,7 @@ def test_the_set_up_is_reused_where_the_guess_was_the_root():
     assert calls[f"{root.name}.jacobian", "setup"] == 1 and calls[f"{root.name}.jacobian", "vjp"] == 3
 
 
-def test_nothing_traced_is_kept():
+def test_the_cache_holds_no_traced_values():
     problem = PROBLEMS["diffusion 1-D"]()
     root = implicit(problem.residual)
     loss = problem.loss(root)
@@ -228,7 +228,7 @@ def test_a_full_row_is_coloured_by_rows_and_a_full_jacobian_by_columns(residual,
     assert rate(lambda h: loss(p + h * d) - value - h * (slope @ d)) >= 1.95
 
 
-def test_entries_that_probing_missed_are_found():
+def test_entries_missed_by_probing_are_added():
     """With p = 0 the pattern has no upper diagonal; the next call has one."""
     residual = lambda x, p: 2 * x + x**3 / 10 + p * anp.roll(x, -1) - 1.0
     root = implicit(residual)
@@ -241,7 +241,7 @@ def test_entries_that_probing_missed_are_found():
         assert slopes[0] == pytest.approx(slopes[1], rel=1e-12)
 
 
-def test_upwind_switches_are_met():
+def test_probing_finds_both_sides_of_an_upwind_switch():
     """Each side of the switch is an entry, whatever the sign at the guess."""
 
     def residual(u, f):
@@ -275,7 +275,7 @@ def forms_of_jacobian():
 
 
 @pytest.mark.parametrize("form", ["array", "sparse", "Operator", "functions"])
-def test_a_jacobian_that_is_given(form):
+def test_a_supplied_jacobian_is_used(form):
     problem, given = forms_of_jacobian()
     root = implicit(problem.residual, given[form])
     wanted = implicit(problem.residual)
@@ -285,7 +285,7 @@ def test_a_jacobian_that_is_given(form):
     np.testing.assert_allclose(flat(slope), flat(value_and_grad(problem.loss(wanted))(problem.params)[1]), rtol=1e-8)
 
 
-def test_a_wrong_jacobian_is_named():
+def test_a_wrong_supplied_jacobian_raises():
     problem, given = forms_of_jacobian()
     right = given["array"]
     simpler = implicit(problem.residual, lambda u, p: 1.25 * right(u, p))
@@ -299,7 +299,7 @@ def test_a_wrong_jacobian_is_named():
     assert caught.value.info.status == "stagnated"
 
 
-def test_one_wrong_entry_is_named():
+def test_one_wrong_entry_of_a_supplied_jacobian_raises():
     exact = np.diag(np.full(12, 3.0)) - np.diag(np.ones(11), 1)
     wrong = exact.copy()
     wrong[5, 6] *= 1.001
@@ -309,7 +309,7 @@ def test_one_wrong_entry_is_named():
         value_and_grad(lambda f: anp.sum(root(0 * f, f)))(np.ones(12))
 
 
-def test_sparsity_that_is_given():
+def test_supplied_sparsity_is_used():
     problem = PROBLEMS["advection 1-D"]()
     n = problem.guess.size
     band = sp.diags_array([np.ones(n - abs(k)) for k in (-1, 0, 1)], offsets=(-1, 0, 1))

@@ -26,7 +26,7 @@ GRIDS += [
 
 
 def engine_of(shape, periodic, rng):
-    """The engine of a finest level with random coefficients."""
+    """Return the engine of an operator with random coefficients."""
     grid = dp.Grid(shape, spacing=[rng.uniform(0.5, 2, n) for n in shape], periodic=periodic)
     faces = dp.diagonal(grid.faces, rng.uniform(0.1, 9.0, grid.faces.size))
     op = 0.3 * dp.identity(grid.cells) - dp.divergence(grid) @ faces @ dp.gradient(grid, dp.dirichlet)
@@ -35,100 +35,106 @@ def engine_of(shape, periodic, rng):
 
 def matrix_of(function, rows, columns):
     """Return the matrix of a linear function of fields in natural order."""
-    return np.stack([function(unit.reshape(columns)).reshape(-1) for unit in np.eye(np.prod(columns))], axis=1).reshape(
-        np.prod(rows), np.prod(columns)
-    )
+    images = [function(unit.reshape(columns)).reshape(-1) for unit in np.eye(np.prod(columns))]
+    return np.stack(images, axis=1).reshape(np.prod(rows), np.prod(columns))
 
 
 def dense(level, extras=True):
     """Return the matrix of a level."""
     cells = level.grid.cells
     number = np.arange(cells(level.extra).size).reshape(level.grid.shape)
-    matrix = np.diag(cells(level.extra).reshape(-1)) if extras else np.zeros((number.size,) * 2)
+    matrix = np.zeros((number.size, number.size))
+    if extras:
+        matrix += np.diag(cells(level.extra).reshape(-1))
     for links, step in zip(cells(level.links), level.steps, strict=True):
-        there = np.roll(number, [-d for d in step], range(number.ndim))
-        for i, j, a in zip(number.flat, there.flat, links.flat, strict=True):
-            matrix[i, i], matrix[j, j] = matrix[i, i] + a, matrix[j, j] + a
-            matrix[i, j], matrix[j, i] = matrix[i, j] - a, matrix[j, i] - a
+        neighbour = np.roll(number, [-d for d in step], range(number.ndim))
+        for i, j, a in zip(number.flat, neighbour.flat, links.flat, strict=True):
+            matrix[i, i] += a
+            matrix[j, j] += a
+            matrix[i, j] -= a
+            matrix[j, i] -= a
     return matrix
 
 
 def prolongation(level):
-    """The weights of black-box interpolation as a matrix."""
+    """Return the black-box interpolation as a matrix, and the transfer."""
     from sparsedp.solvers.multigrid.cycle import Transfer, interpolation_weights
 
-    layout = level.grid
+    fine = level.grid
     coarse = level.grid.coarse()
-    transfer = Transfer(layout, coarse, interpolation_weights(level))
+    transfer = Transfer(fine, coarse, interpolation_weights(level))
 
     def interpolated_field(values):
         field = coarse.zeros()
         coarse.cells(field)[...] = values
-        return layout.cells(transfer.prolong(coarse.fill_ghosts(field), layout.zeros()))
+        return fine.cells(transfer.prolong(coarse.fill_ghosts(field), fine.zeros()))
 
-    return matrix_of(interpolated_field, layout.shape, coarse.shape), transfer
+    return matrix_of(interpolated_field, fine.shape, coarse.shape), transfer
 
 
 @pytest.mark.parametrize("shape, periodic", GRIDS)
-def test_the_coarse_matrix_is_that_of_galerkin(shape, periodic, rng):
-    """Of the links; extras are summed up by rows, which keeps them on the diagonal. Twice: of 5 points, and of 9."""
+def test_the_coarse_matrix_is_the_galerkin_product(shape, periodic, rng):
+    """For the links; the extras are summed by rows, so they stay on the diagonal. Two levels: 5 points, then 9."""
     level = engine_of(shape, periodic, rng).level
     for _ in range(2):
         P, _ = prolongation(level)
-        wanted = P.T @ dense(level, extras=False) @ P
+        expected = P.T @ dense(level, extras=False) @ P
         extra = level.grid.cells(level.extra).reshape(-1)
         level, _ = level.coarsened()
-        wanted += np.diag(P.T @ (extra * P.sum(axis=1)))
-        assert np.max(np.abs(dense(level) - wanted)) <= 1e-13 * np.max(np.abs(wanted))
+        expected += np.diag(P.T @ (extra * P.sum(axis=1)))
+        assert np.max(np.abs(dense(level) - expected)) <= 1e-13 * np.max(np.abs(expected))
 
 
 @pytest.mark.parametrize("shape, periodic", GRIDS)
 def test_restriction_is_the_transpose_of_interpolation(shape, periodic, rng):
     level = engine_of(shape, periodic, rng).level
-    (P, transfer), layout, coarse = prolongation(level), level.grid, level.grid.coarse()
+    P, transfer = prolongation(level)
+    fine = level.grid
+    coarse = level.grid.coarse()
 
     def restricted(values):
-        field = layout.zeros()
-        layout.cells(field)[...] = values
-        return coarse.cells(transfer.restrict(layout.fill_ghosts(field), coarse.zeros()))
+        field = fine.zeros()
+        fine.cells(field)[...] = values
+        return coarse.cells(transfer.restrict(fine.fill_ghosts(field), coarse.zeros()))
 
-    assert np.max(np.abs(matrix_of(restricted, coarse.shape, layout.shape) - P.T)) <= 1e-14
+    assert np.max(np.abs(matrix_of(restricted, coarse.shape, fine.shape) - P.T)) <= 1e-14
 
 
 @pytest.mark.parametrize("shape, periodic", GRIDS)
 def test_the_cycle_is_symmetric_and_positive(shape, periodic, rng):
     engine = engine_of(shape, periodic, rng)
     fine = engine.finest
-    layout = engine.padded_grid
-    held = layout.cells(engine.level.root_diagonal).reshape(-1) > 0.0
+    grid = engine.padded_grid
+    is_unknown = grid.cells(engine.level.root_diagonal).reshape(-1) > 0.0
 
     def cycle(field):
         fine.b[...] = 0.0
-        layout.cells(fine.b)[...] = field
-        layout.fill_ghosts(fine.b)
+        grid.cells(fine.b)[...] = field
+        grid.fill_ghosts(fine.b)
         fine.cycle()
-        return layout.cells(fine.x)
+        return grid.cells(fine.x)
 
-    M = matrix_of(cycle, layout.shape, layout.shape)[np.ix_(held, held)]
+    M = matrix_of(cycle, grid.shape, grid.shape)[np.ix_(is_unknown, is_unknown)]
     assert np.max(np.abs(M - M.T)) <= 1e-12 * np.max(np.abs(M))
     assert np.linalg.eigvalsh(M + M.T).min() > 0.0
 
 
 @pytest.mark.parametrize("shape", [(5, 4), (5, 4, 3)])
-def test_every_neighbour_is_where_the_layout_says(shape, rng):
+def test_steps_lead_to_the_neighbours(shape, rng):
     from sparsedp.solvers.multigrid.loops import PaddedGrid
 
     for periodic in product((False, True), repeat=len(shape)):
-        layout = PaddedGrid(shape, periodic)
+        grid = PaddedGrid(shape, periodic)
         values = rng.standard_normal(shape)
-        field = layout.zeros()
-        layout.cells(field)[...] = values
-        layout.fill_ghosts(field)
+        field = grid.zeros()
+        grid.cells(field)[...] = values
+        grid.fill_ghosts(field)
         for step in product((-1, 0, 1), repeat=len(shape)):
-            wanted = np.roll(values, [-d for d in step], range(len(shape)))
+            expected = np.roll(values, [-d for d in step], range(len(shape)))
             for axis, (n, d, flag) in enumerate(zip(shape, step, periodic, strict=True)):
                 if d and not flag:
-                    np.moveaxis(wanted, axis, 0)[n - 1 if d > 0 else 0] = 0.0
-            assert np.array_equal(layout.cells(field, step), wanted)
-            second = layout.cells(field, step, 2)
-            assert np.array_equal(second, wanted[(slice(None, None, 2),) * len(shape)])
+                    end = n - 1 if d > 0 else 0
+                    np.moveaxis(expected, axis, 0)[end] = 0.0
+            assert np.array_equal(grid.cells(field, step), expected)
+            second = grid.cells(field, step, 2)
+            assert np.array_equal(second, expected[(slice(None, None, 2),) * len(shape)])

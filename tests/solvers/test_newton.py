@@ -23,7 +23,7 @@ def square(x, p):
 
 
 @pytest.mark.parametrize("method", ["auto", "krylov"])
-def test_no_power_of_two_on_the_residual_changes_a_bit(method):
+def test_scaling_the_residual_by_a_power_of_two_keeps_all_bits(method):
     op = dp.laplacian(dp.Grid(40, size=1.0), dp.dirichlet)
     root = implicit(lambda u, f, scale: scale * (5 * anp.sin(u) - op(u) - f), method=method)
     f = np.cos(np.arange(40.0))
@@ -123,7 +123,7 @@ def test_a_residual_without_jvp_is_assembled_by_rows():
 # ---- guesses and dtypes ------------------------------------------------------------------------------------------
 
 
-def test_the_root_looks_like_the_guess():
+def test_the_root_has_the_structure_and_dtypes_of_the_guess():
     p = np.array([4.0, 9.0])
     assert isinstance(implicit(square)(1.0, 9.0), float) and isinstance(implicit(square)(1, 9.0), float)
     for guess in (np.ones(2, np.float32), np.ones(2, int), np.ones(2, bool), np.ones(4)[::2]):
@@ -144,7 +144,7 @@ def test_a_result_that_is_overwritten_does_not_change_the_derivative():
     np.testing.assert_allclose(pull(np.ones(2)), [0.25, 1 / 6], rtol=1e-12)
 
 
-def test_a_trial_point_that_the_residual_refuses_is_not_taken():
+def test_a_trial_point_where_the_residual_raises_is_rejected():
     for refuse in (UnstableStepError, NonFiniteError, ConvergenceError):
 
         def residual(x, p, refuse=refuse):
@@ -173,7 +173,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("residual", "guess", "p", "error", "message"), REFUSED)
-def test_what_is_refused(residual, guess, p, error, message):
+def test_invalid_problems_raise(residual, guess, p, error, message):
     root = implicit(residual)
     with pytest.raises(error, match=message) as caught:
         root(guess, p)
@@ -186,12 +186,12 @@ def test_what_is_refused(residual, guess, p, error, message):
 @pytest.mark.parametrize(
     ("name", "value"), [("method", "magic"), ("rtol", 0.0), ("maxiter", 0), ("maxiter", None), ("nullspace", "x")]
 )
-def test_settings_that_are_refused(name, value):
+def test_invalid_settings_raise(name, value):
     with pytest.raises(ValueError, match=f"^{name} must be"):
         implicit(square, **{name: value})
 
 
-def test_a_failed_solve_hands_over_its_best_iterate():
+def test_the_error_of_a_failed_solve_holds_its_best_iterate():
     problem = PROBLEMS["diffusion 1-D"]()
     root = implicit(problem.residual, maxiter=2)
     with pytest.raises(ConvergenceError) as caught:
@@ -202,12 +202,12 @@ def test_a_failed_solve_hands_over_its_best_iterate():
     assert np.linalg.norm(problem.residual(error.best, problem.params)) < 0.2 * np.linalg.norm(start)
 
 
-def test_a_traced_value_that_is_not_a_parameter_is_named():
+def test_a_traced_value_that_is_not_a_parameter_raises():
     with pytest.raises(DerivativeError, match="uses a traced value that is not an argument; make it a parameter"):
         value_and_grad(lambda q: implicit(lambda x, p: x - p * q)(1.0, 2.0))(3.0)
 
 
-def test_a_root_that_is_not_isolated_has_no_derivative_unless_asked():
+def test_a_root_that_is_not_isolated_has_a_derivative_only_with_project():
     op = dp.laplacian(dp.Grid(10, size=1.0))
     f = np.cos(np.pi * (np.arange(10) + 0.5) / 10)
     loss = lambda root: lambda f: anp.sum(root(np.zeros(10), f) ** 2)
@@ -220,7 +220,7 @@ def test_a_root_that_is_not_isolated_has_no_derivative_unless_asked():
     np.testing.assert_allclose(value_and_grad(loss(projected))(f)[1], wanted, atol=1e-14)
 
 
-def test_a_jacobian_of_the_wrong_kind():
+def test_a_jacobian_of_the_wrong_kind_raises():
     for jacobian, error, message in (
         (
             lambda x, p: np.eye(3),

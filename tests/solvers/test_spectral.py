@@ -139,7 +139,7 @@ BOXES = [dp.Grid((33, 32), size=(1.0, 2.0)), dp.Grid((33, 32), periodic=True), d
 
 @pytest.mark.parametrize("grid", BOXES, ids=["box", "periodic", "stretched"])
 @pytest.mark.parametrize("boundary", [dp.neumann, dp.dirichlet])
-def test_what_is_made_of_one_laplacian_is_inverted_by_transforms(grid, boundary):
+def test_functions_of_one_laplacian_are_inverted_by_transforms(grid, boundary):
     """Powers, functions, and their sums: one pair of transforms, and the eigenvalues of the whole."""
     L = dp.laplacian(grid, boundary)
     I = dp.identity(grid.cells)
@@ -167,7 +167,7 @@ def test_what_is_made_of_one_laplacian_is_inverted_by_transforms(grid, boundary)
     )
 
 
-def test_squares_where_no_transform_is_written_out():
+def test_squares_where_an_axis_has_no_fast_transform():
     grid = dp.Grid((66, 65), size=1.0)
     L = dp.laplacian(grid, dp.dirichlet)
     u = np.cos(np.arange(grid.cells.size)).reshape(grid.shape)
@@ -189,7 +189,7 @@ def test_squares_in_space():
     np.testing.assert_allclose(found.apply(values, u), wanted, rtol=0, atol=1e-13 * np.max(np.abs(wanted)))
 
 
-def test_what_is_not_made_of_one_laplacian():
+def test_combinations_of_different_operators_have_no_eigenbasis():
     """Near misses: other walls, other widths, a line that bends along one axis."""
     grid = dp.Grid((33, 32), spacing=(1e-3, 1.0))
     L = dp.laplacian(grid)
@@ -235,7 +235,7 @@ def test_kuramoto_sivashinsky_in_a_plane():
     assert dp.check.gradient(lambda p: anp.sum(dp.rollout(step, start, p, 5) ** 2), 1.0, quick=True).verdict == "agrees"
 
 
-def test_functions_that_are_refused():
+def test_invalid_functions_raise():
     L = dp.laplacian(dp.Grid(4))
     with pytest.raises(ValueError, match="matrix_function needs a separable operator that can be diagonalised"):
         dp.matrix_function(dp.from_matrix(np.triu(np.ones((3, 3)))), np.exp)

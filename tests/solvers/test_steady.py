@@ -123,7 +123,7 @@ def test_burgers_in_one_dimension():
     assert result.verdict == "agrees"
 
 
-def test_a_fold_is_met_with_true_derivatives_or_an_error():
+def test_derivatives_near_a_fold_are_right_or_raise():
     """Bratu in 2-D by its height: lambda is an unknown of the tree, the fold is where it is largest."""
     rate = bratu(15, 2)
     middle = (7, 7)
@@ -155,7 +155,7 @@ def test_a_fold_is_met_with_true_derivatives_or_an_error():
 # ---- flows -----------------------------------------------------------------------------------------------------------
 
 
-def test_cavity_is_what_the_time_loop_comes_to():
+def test_cavity_equals_the_end_of_a_time_loop():
     scene = Flow(12)
     project = dp.projection(scene.grid)
     x = dp.steady(scene.cavity, scene.rest, 50.0)
@@ -184,7 +184,7 @@ def test_gradients_of_flows(kind):
     assert result.verdict == "agrees" and "Hessian product: agrees" in str(result), str(result)
 
 
-def test_convection_at_32_takes_pseudo_time(monkeypatch):
+def test_convection_at_32_needs_pseudo_time(monkeypatch):
     """Ra 1e5 from rest: Newton's method alone stalls."""
     scene = Flow(32)
     x = dp.steady(scene.convection, scene.warm, 1e5)
@@ -301,7 +301,7 @@ def test_kinds_of_guesses():
     assert single.dtype == np.float32 and np.allclose(single, dp.steady(bratu(8), np.zeros(8), 1.0), rtol=1e-6)
 
 
-def test_guesses_as_they_come_are_left_as_they_are(rng):
+def test_guesses_are_not_modified(rng):
     """Fortran order, strides, read-only and broadcast arrays give the same bits."""
     scene = Flow(4)
     plain = rng.standard_normal((4, 4))
@@ -314,7 +314,7 @@ def test_guesses_as_they_come_are_left_as_they_are(rng):
         assert all(np.array_equal(x[name], want[name]) for name in want) and np.array_equal(p, before)
 
 
-def test_powers_of_two_on_the_residual_change_no_bit():
+def test_scaling_the_residual_by_a_power_of_two_keeps_all_bits():
     """At a Rayleigh number that takes pseudo-time."""
     scene = Flow(4)
     want = dp.steady(scene.convection, scene.warm, 2e4)
@@ -326,7 +326,7 @@ def test_powers_of_two_on_the_residual_change_no_bit():
     assert all(np.allclose(x[name], want[name], rtol=1e-9, atol=1e-9 * np.max(np.abs(want[name]))) for name in want)
 
 
-def test_the_plan_says_where_pseudo_time_was_needed():
+def test_explain_reports_pseudo_time():
     scene = Flow(16)
     plan = dp.explain(lambda ra: scene.nusselt(dp.steady(scene.convection, scene.warm, ra)), 2e5)
     assert "pseudo-time, as Newton steps stalled" in str(plan)
@@ -335,7 +335,7 @@ def test_the_plan_says_where_pseudo_time_was_needed():
 # ---- what is refused -------------------------------------------------------------------------------------------------
 
 
-def test_a_pressure_without_a_pin_is_refused():
+def test_a_pressure_without_a_pin_raises():
     scene = Flow(6)
 
     def free(x, re):
@@ -347,7 +347,7 @@ def test_a_pressure_without_a_pin_is_refused():
         dp.steady(free, scene.rest, 10.0)
 
 
-def test_refusals():
+def test_invalid_arguments_raise():
     square = lambda x, p: x**2 - p
     for give, error, message in (
         (lambda: dp.steady(None, 1.0), TypeError, r"steady takes a function, got NoneType"),
@@ -365,7 +365,7 @@ def test_refusals():
 
 
 @pytest.mark.parametrize(("most", "own"), [(12, False), (1, True)])
-def test_a_jacobian_leans_on_the_factors_of_one_before(monkeypatch, most, own):
+def test_factors_of_an_earlier_jacobian_precondition_the_next(monkeypatch, most, own):
     """GMRES with the LU of a matrix nearby, an LU of its own where that does not do: the same root, the same bits."""
     grid, residual = burgers(200, 0.1)
     ends = np.array([1.0, -1.0])
