@@ -1,25 +1,43 @@
-"""Nested containers of arrays: taken apart into leaves, put together again, paired with each other, and measured.
+"""Pytrees: nested containers of arrays, their leaves, their paths, and the pairing of two of them.
 
-A tree is any nesting of tuples (named ones too), lists and dicts (``defaultdict``, ``OrderedDict`` and other subclasses
-too). Everything else is a leaf. Entries of dicts keep their order.
+A tree is any nesting of
 
-Two trees are always paired by `paired`: entries of dicts by key, those of named tuples by field, and only those of
-plain tuples and lists by position.
+- tuples, also named ones,
+- lists,
+- dicts, also ``defaultdict``, ``OrderedDict`` and other subclasses, whose entries keep their order,
+- instances of dataclasses, whose entries are their fields.
+
+Everything else is a leaf, also dataclasses that cannot be rebuilt from their fields, because they have a
+``__post_init__`` or fields that are not arguments, and objects of this library.
+
+Two trees are always paired by `paired`: entries of dicts by key, those of named tuples and dataclasses by field, and
+those of plain tuples and lists by position.
 """
 
+from __future__ import annotations
+
 from copy import copy
+from functools import cached_property
 from math import hypot, isfinite
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.errors import ShapeError
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
 __all__ = [
+    "Structure",
     "branches_mapped",
+    "child",
     "copied",
     "described",
+    "field_names",
     "flatten",
+    "is_branch",
     "is_uniform",
     "keys",
     "labels",
@@ -33,18 +51,126 @@ __all__ = [
     "subscript",
 ]
 
-BRANCHES = tuple, list, dict  # types of what is not a leaf
-DEEPEST = 100  # containers in containers: recursions over deeper trees would leave Python's limit
-SMALL, LARGE = 2.0**-200, 2.0**200  # between these, products of four numbers and a few more are floats
+BRANCHES = tuple, list, dict  # types of containers beside dataclasses
+DEEPEST = 100  # containers in containers: recursions over deeper trees would exceed Python's limit
+SMALL = 2.0**-200  # between these, products of four numbers and a few more are floats
+LARGE = 2.0**200
 MOST_EXPONENT = 1023  # of a power of two that is a float
 
 
-def flatten(tree):
-    """Tree -> (list of leaves, function that builds the same tree from other leaves).
+class Structure:
+    """The containers of a tree without its leaves: builds, names and pairs trees of the same structure.
 
     Parameters
     ----------
-    tree : any nesting of tuple, list and dict
+    tree : tree
+    root : str
+        Name of the tree in messages.
+
+    Attributes
+    ----------
+    count : int
+        Of leaves.
+
+    Examples
+    --------
+    >>> structure = Structure({"u": (1.0, 2.0), "n": 3}, "x")
+    >>> structure.names
+    ["x['u'][0]", "x['u'][1]", "x['n']"]
+    >>> structure.build("abc")
+    {'u': ('a', 'b'), 'n': 'c'}
+    >>> structure.leaves_of({"n": 0, "u": [5, 6]})
+    [5, 6, 0]
+    """
+
+    def __init__(self, tree: Any, root: str = "tree"):
+        self.root = root
+        self.count = len(leaves(tree))
+        self._numbered = _build(tree, iter(range(self.count)))
+
+    @cached_property
+    def names(self) -> list[str]:
+        """Names of the leaves, as one would write them: ``x['u'][0]``."""
+        return self.names_under(self.root)
+
+    def names_under(self, root: str) -> list[str]:
+        """Return the names of the leaves of a tree with this structure and another name."""
+        return labels(self._numbered, root)
+
+    def build(self, values: Iterable) -> Any:
+        """Return the tree with these leaves."""
+        return _build(self._numbered, iter(values))
+
+    def leaves_of(self, tree: Any, name: str = "tree", **options: Any) -> list:
+        """Return the leaves of a tree that must have this structure, in its order: see `paired`."""
+        return paired(tree, self._numbered, name, **options)
+
+
+# ---- containers ------------------------------------------------------------------------------------------------------
+
+
+def field_names(tree: Any) -> tuple[str, ...] | None:
+    """Return the fields of an instance of a dataclass that can be rebuilt from them; None for all other values."""
+    kind = type(tree)
+    fields = getattr(kind, "__dataclass_fields__", None)
+    if fields is None or hasattr(kind, "__post_init__") or kind.__module__.partition(".")[0] == "sparsedp":
+        return None
+    if not all(field.init for field in fields.values()):
+        return None
+    return tuple(fields)
+
+
+def is_branch(tree: Any) -> bool:
+    """Whether a tree is a container, not a leaf."""
+    return isinstance(tree, BRANCHES) or field_names(tree) is not None
+
+
+def keys(tree: Any) -> Any:
+    """Return the keys of the entries of a container, see `child`; None for a leaf."""
+    if isinstance(tree, dict):
+        return tree.keys()
+    if isinstance(tree, (tuple, list)):
+        return range(len(tree))
+    return field_names(tree)
+
+
+def child(tree: Any, key: Any) -> Any:
+    """Return the entry of a container for one of its `keys`."""
+    return tree[key] if isinstance(tree, BRANCHES) else getattr(tree, key)
+
+
+def branches_mapped(function: Callable, tree: Any) -> Any:
+    """Return a container of the same type and keys, with ``function(key)`` in place of each entry."""
+    if isinstance(tree, dict):
+        if type(tree) is dict:
+            return {key: function(key) for key in tree}
+        built = copy(tree)  # keeps what a subclass knows beside its entries, such as a default
+        for key in tree:
+            built[key] = function(key)
+        return built
+    if not isinstance(tree, BRANCHES):
+        return type(tree)(**{name: function(name) for name in keys(tree)})
+    entries = [function(place) for place in range(len(tree))]
+    return type(tree)(*entries) if hasattr(tree, "_fields") else type(tree)(entries)
+
+
+def subscript(tree: Any, key: Any) -> str:
+    """Return how one would write an entry of a container: ``['u']``, ``[0]``, or ``.k`` of a field."""
+    if not isinstance(tree, BRANCHES):
+        return f".{key}"
+    fields = getattr(tree, "_fields", None)
+    return f".{fields[key]}" if fields else f"[{key!r}]"
+
+
+# ---- leaves ----------------------------------------------------------------------------------------------------------
+
+
+def flatten(tree: Any) -> tuple[list, Callable]:
+    """Return the leaves of a tree, and a function that builds the same tree from other leaves.
+
+    Parameters
+    ----------
+    tree : tree
 
     Returns
     -------
@@ -64,50 +190,14 @@ def flatten(tree):
     return leaves(tree), lambda values: _build(tree, iter(values))
 
 
-def placed(entries, places, values):
-    """A sequence as a list with other values at some places.
-
-    Examples
-    --------
-    >>> placed((1.0, 2.0, 3.0), [0, 2], "ab")
-    ['a', 2.0, 'b']
-    """
-    entries = list(entries)
-    for place, value in zip(places, values, strict=True):
-        entries[place] = value
-    return entries
-
-
-def copied(tree):
-    """Tree -> the same tree with copies of its arrays and sparse matrices: the caller may reuse them."""
-    return mapped(lambda leaf: leaf.copy() if isinstance(leaf, np.ndarray) or sp.issparse(leaf) else leaf, tree)
-
-
-def mapped(function, tree, *others):
-    """Apply a function to every leaf of a tree, or to the leaves of several trees that are paired with the first one.
-
-    Examples
-    --------
-    >>> mapped(max, {"a": 1.0, "b": 5.0}, {"b": 3.0, "a": 2.0})
-    {'a': 2.0, 'b': 5.0}
-    """
-    if not isinstance(tree, BRANCHES):
-        return function(tree, *others)
-    return _build(tree, map(function, leaves(tree), *(paired(other, tree, "tree") for other in others)))
-
-
-def leaves(tree, depth=0):
-    """Tree -> list of its leaves, from left to right.
+def leaves(tree: Any, depth: int = 0) -> list:
+    """Return the leaves of a tree, from left to right.
 
     Parameters
     ----------
-    tree : any nesting of tuple, list and dict
+    tree : tree
     depth : int
-        How many containers it is in.
-
-    Returns
-    -------
-    list
+        Number of containers around it.
 
     Raises
     ------
@@ -126,14 +216,97 @@ def leaves(tree, depth=0):
         raise ValueError(
             f"a tree has containers nested more than {DEEPEST} deep, or one that contains itself; flatten it"
         )
-    return [leaf for name in names for leaf in leaves(tree[name], depth + 1)]
+    return [leaf for name in names for leaf in leaves(child(tree, name), depth + 1)]
 
 
-def paired(tree, reference, name, owner="", advice="", shapes=False, prefix=None, error=ShapeError):
+def _build(tree, values):
+    """Return a tree of the same structure and types, its leaves taken from an iterator."""
+    if keys(tree) is None:
+        return next(values)
+    return branches_mapped(lambda key: _build(child(tree, key), values), tree)
+
+
+def placed(entries: Iterable, places: Iterable[int], values: Iterable) -> list:
+    """Return a sequence as a list with other values at some places.
+
+    Examples
+    --------
+    >>> placed((1.0, 2.0, 3.0), [0, 2], "ab")
+    ['a', 2.0, 'b']
+    """
+    entries = list(entries)
+    for place, value in zip(places, values, strict=True):
+        entries[place] = value
+    return entries
+
+
+def copied(tree: Any) -> Any:
+    """Return a tree with copies of its arrays and sparse matrices, so that the caller may reuse them."""
+    return mapped(_copied_leaf, tree)
+
+
+def _copied_leaf(leaf):
+    return leaf.copy() if isinstance(leaf, np.ndarray) or sp.issparse(leaf) else leaf
+
+
+def mapped(function: Callable, tree: Any, *others: Any) -> Any:
+    """Apply a function to every leaf of a tree, or to the leaves of several trees that are paired with the first one.
+
+    Examples
+    --------
+    >>> mapped(max, {"a": 1.0, "b": 5.0}, {"b": 3.0, "a": 2.0})
+    {'a': 2.0, 'b': 5.0}
+    """
+    if keys(tree) is None:
+        return function(tree, *others)
+    return _build(tree, map(function, leaves(tree), *(paired(other, tree, "tree") for other in others)))
+
+
+def labels(tree: Any, root: str) -> list[str]:
+    """Return the names of the leaves of a tree, from left to right, as one would write them.
+
+    Examples
+    --------
+    >>> labels({"u": (1.0, 2.0), "n": 3}, "x")
+    ["x['u'][0]", "x['u'][1]", "x['n']"]
+    """
+    names = keys(tree)
+    if names is None:
+        return [root]
+    return [label for name in names for label in labels(child(tree, name), root + subscript(tree, name))]
+
+
+def described(tree: Any) -> str:
+    """Describe a tree in words: its kind and its size."""
+    if isinstance(tree, dict):
+        return f"a dict of {', '.join(map(str, tree)) or 'nothing'}"
+    if isinstance(tree, (tuple, list)):
+        return f"a {type(tree).__name__} of length {len(tree)}"
+    fields = field_names(tree)
+    if fields is not None:
+        return f"a {type(tree).__name__} of {', '.join(fields) or 'nothing'}"
+    if hasattr(tree, "shape") or isinstance(tree, (float, complex)):
+        return f"an array of shape {np.shape(tree)}"
+    return getattr(tree, "described", type(tree).__name__)
+
+
+# ---- pairs of trees --------------------------------------------------------------------------------------------------
+
+
+def paired(
+    tree: Any,
+    reference: Any,
+    name: str,
+    owner: str = "",
+    advice: str = "",
+    shapes: bool = False,
+    prefix: Callable | None = None,
+    error: type[Exception] = ShapeError,
+) -> list:
     """Return the leaves of a tree in the order of the leaves of a reference tree.
 
-    Entries of dicts are paired by key, whatever their order, those of named tuples by field, and those of plain tuples
-    and lists by position.
+    Entries of dicts are paired by key, whatever their order, those of named tuples and dataclasses by field, and those
+    of plain tuples and lists by position.
 
     Parameters
     ----------
@@ -150,7 +323,7 @@ def paired(tree, reference, name, owner="", advice="", shapes=False, prefix=None
         ``prefix(leaf)``: whether this leaf may stand for a whole branch of the reference; it is then repeated for each
         of its leaves. Default: none may.
     error : type
-        What is raised.
+        Of the exception.
 
     Returns
     -------
@@ -176,7 +349,7 @@ def paired(tree, reference, name, owner="", advice="", shapes=False, prefix=None
         raise error(f"{path}{owner}: {mismatch.words}{advice}") from None
 
 
-def is_uniform(leaf):
+def is_uniform(leaf: Any) -> bool:
     """Whether a leaf is one number or None, which may stand for a whole branch."""
     return leaf is None or (np.ndim(leaf) == 0 and np.asarray(leaf).dtype.kind in "biufc")
 
@@ -186,11 +359,12 @@ class _MismatchError(Exception):
 
     def __init__(self, words):
         super().__init__(words)
-        self.words, self.subscripts = words, []
+        self.words = words
+        self.subscripts: list[str] = []
 
 
 def _pair(tree, reference, shapes, prefix):
-    """The recursion of `paired`."""
+    """Return the leaves of a branch in the order of a reference branch."""
     names = keys(reference)
     if names is None:
         if keys(tree) is not None:
@@ -200,12 +374,13 @@ def _pair(tree, reference, shapes, prefix):
         return [tree]
     if prefix and keys(tree) is None and prefix(tree):
         return [tree] * len(leaves(reference))
-    if keys(tree) is None or isinstance(tree, dict) != isinstance(reference, dict):
+    if keys(tree) is None or _kind(tree) is not _kind(reference):
         raise _MismatchError(f"expected {described(reference)}, got {described(tree)}")
     entries = []
     for name, place in zip(names, _places(tree, reference)):
-        branch, wanted = tree[place], reference[name]
-        if not (shapes or isinstance(branch, BRANCHES) or isinstance(wanted, BRANCHES)):  # most often: quickly
+        branch = child(tree, place)
+        wanted = child(reference, name)
+        if not (shapes or is_branch(branch) or is_branch(wanted)):  # the most frequent case
             entries.append(branch)
             continue
         try:
@@ -216,70 +391,55 @@ def _pair(tree, reference, shapes, prefix):
     return entries
 
 
+def _kind(tree):
+    """Return the type of container with which a container can be paired; `object` for dataclasses."""
+    if isinstance(tree, dict):
+        return dict
+    return tuple if isinstance(tree, (tuple, list)) else object
+
+
 def _places(tree, reference):
-    """Where a branch holds the entries of a reference branch, in the order of the reference."""
+    """Return the keys of a container in the order of the entries of a reference container."""
     if isinstance(reference, dict):
         if tree.keys() != reference.keys():
             _check_names("key", tree, reference)
         return reference.keys()
-    fields, others = getattr(tree, "_fields", None), getattr(reference, "_fields", None)
-    if fields and others and fields != others:
-        _check_names("field", fields, others)
-        return [fields.index(field) for field in others]
+    if not isinstance(reference, BRANCHES):
+        _check_names("field", keys(tree), keys(reference))
+        return keys(reference)
+    fields = getattr(tree, "_fields", None)
+    wanted_fields = getattr(reference, "_fields", None)
+    if fields and wanted_fields and fields != wanted_fields:
+        _check_names("field", fields, wanted_fields)
+        return [fields.index(field) for field in wanted_fields]
     if len(tree) != len(reference):
         raise _MismatchError(f"expected {described(reference)}, got {described(tree)}")
     return range(len(reference))
 
 
-def _check_names(kind, given, wanted):
+def _check_names(kind, names, wanted):
     """Refuse unknown and missing names."""
-    unknown = [repr(name) for name in given if name not in wanted]
-    missing = [repr(name) for name in wanted if name not in given]
-    if not (unknown or missing):
+    unknown = [repr(name) for name in names if name not in wanted]
+    missing = [repr(name) for name in wanted if name not in names]
+    if unknown:
+        problem = f"unknown {kind}{'s' if len(unknown) > 1 else ''} {', '.join(unknown)}"
+    elif missing:
+        problem = f"missing {kind}{'s' if len(missing) > 1 else ''} {', '.join(missing)}"
+    else:
         return
-    problem, names = ("unknown", unknown) if unknown else ("missing", missing)
-    plural = "s" if len(names) > 1 else ""
-    expected = ", ".join(map(repr, wanted)) or "none"
-    raise _MismatchError(f"{problem} {kind}{plural} {', '.join(names)}; expected {expected}")
+    raise _MismatchError(f"{problem}; expected {', '.join(map(repr, wanted)) or 'none'}")
 
 
-def described(tree):
-    """Say in words what a tree is: its kind, and how large it is."""
-    if isinstance(tree, dict):
-        return f"a dict of {', '.join(map(str, tree)) or 'nothing'}"
-    if isinstance(tree, (tuple, list)):
-        return f"a {type(tree).__name__} of length {len(tree)}"
-    is_array = hasattr(tree, "shape") or isinstance(tree, (float, complex))
-    return f"an array of shape {np.shape(tree)}" if is_array else getattr(tree, "described", type(tree).__name__)
+# ---- norms -----------------------------------------------------------------------------------------------------------
 
 
-def labels(tree, root):
-    """Tree and its name -> the names of its leaves, from left to right, as one would write them.
-
-    Examples
-    --------
-    >>> labels({"u": (1.0, 2.0), "n": 3}, "x")
-    ["x['u'][0]", "x['u'][1]", "x['n']"]
-    """
-    names = keys(tree)
-    if names is None:
-        return [root]
-    return [label for name in names for label in labels(tree[name], root + subscript(tree, name))]
-
-
-def subscript(tree, name):
-    """A branch and a key of it -> how one would write the entry: ``['u']``, ``[0]``, ``.k`` of a named tuple."""
-    fields = getattr(tree, "_fields", None)
-    return f".{fields[name]}" if fields else f"[{name!r}]"
-
-
-def norm(tree):
-    """Tree -> Euclidean norm over the numbers of all leaves, without overflow or underflow.
+def norm(tree: Any) -> float:
+    """Return the Euclidean norm over the numbers of all leaves, without overflow or underflow.
 
     Parameters
     ----------
-    tree : any nesting of tuple, list and dict
-        Of arrays and numbers, real or complex; None counts for nothing.
+    tree : tree
+        Of arrays and numbers, real or complex; None is ignored.
 
     Returns
     -------
@@ -298,38 +458,14 @@ def norm(tree):
     return largest * hypot(*(float(np.linalg.norm(a / largest)) for a in arrays))
 
 
-def power_of_two(value):
+def power_of_two(value: float) -> float:
     """Return the next larger power of two that is a float; dividing by it changes no digits. 1 for 0."""
-    return float(np.ldexp(1.0, min(np.frexp(value)[1], MOST_EXPONENT))) if value > 0 else 1.0
+    if value <= 0:
+        return 1.0
+    exponent = np.frexp(value)[1]
+    return float(np.ldexp(1.0, min(exponent, MOST_EXPONENT)))
 
 
-def safe_unit(size):
+def safe_unit(size: float) -> float:
     """Return a power of two near a size whose square may underflow or overflow; 1 where it does not."""
     return 1.0 if SMALL < size < LARGE else power_of_two(size)
-
-
-def keys(tree):
-    """The keys of the branches of a tree; None of a leaf."""
-    if isinstance(tree, dict):
-        return tree.keys()
-    return range(len(tree)) if isinstance(tree, (tuple, list)) else None
-
-
-def branches_mapped(function, tree):
-    """A branch of the same type and keys, with ``function(key)`` in place of each entry."""
-    if isinstance(tree, dict):
-        if type(tree) is dict:
-            return {key: function(key) for key in tree}
-        built = copy(tree)  # keeps what a subclass knows beside its entries, such as a default
-        for key in tree:
-            built[key] = function(key)
-        return built
-    entries = [function(place) for place in range(len(tree))]
-    return type(tree)(*entries) if hasattr(tree, "_fields") else type(tree)(entries)
-
-
-def _build(tree, values):
-    """A tree of the same structure and types, its leaves taken from an iterator."""
-    if keys(tree) is None:
-        return next(values)
-    return branches_mapped(lambda key: _build(tree[key], values), tree)

@@ -173,7 +173,7 @@ def check_leaves(name, tree, containers=True):
         elif containers and type(leaf) not in PLAIN_LEAVES and any(map(_is_floating, hidden_leaves(leaf))):
             raise TypeError(
                 f"{labels(tree, name)[number]} is a {type(leaf).__name__}, which is not a tree: its numbers would have "
-                "no derivative; write a dict or a NamedTuple"
+                "no derivative; write a dict, a NamedTuple or a plain dataclass"
             )
 
 

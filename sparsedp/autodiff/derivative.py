@@ -9,7 +9,7 @@ import numpy as np
 
 from sparsedp._utils.calls import frames_inside, public
 from sparsedp._utils.counters import thread
-from sparsedp._utils.pytree import copied, described, flatten, labels, leaves, mapped, paired
+from sparsedp._utils.pytree import copied, described, flatten, is_branch, labels, leaves, mapped, paired
 from sparsedp._utils.reconstruction import Made
 from sparsedp._utils.validation import (
     advise,
@@ -659,7 +659,7 @@ def _value_and_gradient(loss, argnum, args):
 
 def check_loss(value):
     """Refuse what a loss returned, traced or not, if it is not one real number."""
-    if isinstance(value, (tuple, list, dict)):
+    if is_branch(value):
         raise ShapeError(f"the loss must be a scalar, got a {type(value).__name__}; return one number")
     if np.shape(plain(value)) != ():
         raise ShapeError(f"the loss must be a scalar, got an array of shape {np.shape(plain(value))}; sum it")

@@ -1,33 +1,38 @@
-"""The floating leaves of a tree as one vector of doubles, and back: what a search moves and a check examines."""
+"""The floating leaves of a tree as one vector of doubles, and back: the unknowns of a search or of a check."""
+
+from __future__ import annotations
 
 from functools import cached_property
 from itertools import accumulate, compress
+from typing import TYPE_CHECKING, Any
 
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp._utils.pytree import copied, labels, paired
-from sparsedp._utils.pytree import flatten as taken_apart
+from sparsedp._utils.pytree import Structure, copied, leaves
 from sparsedp._utils.reconstruction import Made
 from sparsedp._utils.validation import check_finite, check_leaves, check_native, check_shape
 from sparsedp.autodiff.tape import cast, is_variable, isbox
 from sparsedp.errors import DerivativeError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
 
 __all__ = ["FINITE", "Packing", "flatten", "joined"]
 
 FINITE = "must be finite (dp.check.gradient(loss, x) shows where it comes from)"
 
 
-def flatten(tree):
-    """Tree of arrays -> its numbers as one vector of doubles, and the function from such a vector to a tree.
+def flatten(tree: Any) -> tuple[np.ndarray, Callable]:
+    """Return the numbers of a tree as one vector of doubles, and the function from such a vector to a tree.
 
-    For libraries that know flat vectors alone, such as SciPy's minimize with ``jac=True``.
+    For libraries that accept only flat vectors, such as SciPy's minimize with ``jac=True``.
 
     Parameters
     ----------
-    tree : any nesting of tuple, list and dict
-        Of arrays and numbers, floating or complex (a complex number takes two). What is not floating (int, bool, None,
-        str) is left out of the vector.
+    tree : any nesting of tuple, list, dict and dataclass
+        Of arrays and numbers, floating or complex (a complex number takes two). Other leaves (int, bool, None, str)
+        have no place in the vector.
 
     Returns
     -------
@@ -60,12 +65,13 @@ def flatten(tree):
     """
     tree = copied(tree)
     packing = Packing(tree, "tree")
+    shape = (packing.size,)
 
     def unflatten(vector):
-        check_shape("the vector of this tree", vector, (packing.size,), "; write one from dp.flatten of a tree like it")
+        check_shape("the vector of this tree", vector, shape, "; write one from dp.flatten of a tree like it")
         if not isbox(vector):
             return packing.unpack(np.asarray(vector, dtype=float))
-        return packing.tree(map(_traced, packing.split(vector), packing.values))
+        return packing.tree(map(_traced_leaf, packing.split(vector), packing.values))
 
     return packing.pack(tree), Made(unflatten, _unflatten, tree)
 
@@ -74,8 +80,8 @@ def _unflatten(tree):
     return flatten(tree)[1]
 
 
-def _traced(part, value):
-    """Part of a traced vector -> a leaf of the shape and dtype of a value."""
+def _traced_leaf(part, value):
+    """Return a part of a traced vector as a leaf of the shape and dtype of a value."""
     numbers = part[::2] + 1j * part[1::2] if np.iscomplexobj(value) else part
     return cast(anp.reshape(numbers, value.shape), value.dtype)
 
@@ -90,18 +96,19 @@ class Packing:
     ----------
     tree : tree of arrays
     root : str
-        What messages call it.
+        Name of the tree in messages.
 
     Attributes
     ----------
     values : list of arrays
         The floating leaves.
     complex : bool
-        Whether one of them is.
+        Whether one of them is complex.
     eps : float
         Rounding of the coarsest dtype.
     count, size : int
-        Of leaves, and of numbers in the vector.
+        Number of leaves, and of numbers in the vector.
+    structure : Structure
     form : tree
         Of the same structure, the number of each leaf in its place; other trees are paired with it.
 
@@ -119,96 +126,115 @@ class Packing:
     {'a': 5.0, 'n': 3, 'z': (6+7j)}
     """
 
-    def __init__(self, tree, root="x"):
+    def __init__(self, tree: Any, root: str = "x"):
         self.root = root
-        self._leaves, self._rebuild = taken_apart(tree)
-        self.count = len(self._leaves)
+        self.structure = Structure(tree, root)
+        self._leaves = leaves(tree)
+        self.count = self.structure.count
         check_native(root, *self._leaves)
         check_leaves(root, tree)
-        self.form = self._rebuild(range(self.count))
-        self._floating = list(map(is_variable, self._leaves))
+        self.form = self.structure.build(range(self.count))
+        self._floating = [is_variable(leaf) for leaf in self._leaves]
         self.values = [np.asarray(leaf) for leaf in compress(self._leaves, self._floating)]
         if not self.values:
             raise DerivativeError(f"floating values are needed, and {root} holds none; write np.asarray({root}, float)")
         self.complex = any(map(np.iscomplexobj, self.values))
         self.eps = max(float(np.finfo(x.dtype).eps) for x in self.values)
         ends = [0, *accumulate(joined([x]).size for x in self.values)]
-        self._parts, self.size = list(map(slice, ends, ends[1:])), ends[-1]
+        self.size = ends[-1]
+        self._parts = [slice(start, end) for start, end in zip(ends, ends[1:])]
 
     @cached_property
-    def names(self):
-        """Of the floating leaves, as one would write them: ``x['u'][0]``."""
+    def names(self) -> list[str]:
+        """Names of the floating leaves, as one would write them: ``x['u'][0]``."""
         return self.names_under(self.root)
 
-    def names_under(self, root):
+    def names_under(self, root: str) -> list[str]:
         """Return the names of the floating leaves of a tree of the same structure with another name."""
-        return list(compress(labels(self.form, root), self._floating))
+        return list(compress(self.structure.names_under(root), self._floating))
 
-    def floating(self, tree, name="tree", **options):
+    def floating(self, tree: Any, name: str = "tree", **options: Any) -> list:
         """Return the leaves of a tree of the same structure in the places of the floating ones, see `paired`."""
-        return list(compress(paired(tree, self.form, name, **options), self._floating))
+        return list(compress(self.structure.leaves_of(tree, name, **options), self._floating))
 
-    def pack(self, tree):
+    def pack(self, tree: Any) -> np.ndarray:
         """Return a tree of the same structure as a flat vector of doubles."""
         return joined(self.floating(tree))
 
-    def slopes(self, gradient):
-        """Gradient of the same structure -> its floating leaves, dL/dRe + i dL/dIm of complex ones.
+    def slopes(self, gradient: Any) -> list[np.ndarray]:
+        """Return the floating leaves of a gradient, dL/dRe + i dL/dIm for complex ones.
 
-        The tape gives dL/dRe - i dL/dIm there. Joined, they are the gradient with respect to the packed vector.
+        The tape gives dL/dRe - i dL/dIm there. Joined, the leaves are the gradient with respect to the packed vector.
+
+        Parameters
+        ----------
+        gradient : tree
+            Of the same structure.
+
+        Raises
+        ------
+        DerivativeError
+            If a leaf has another shape, or holds no numbers.
         """
         advice = f"; return a tree like {self.root}"
-        given = list(map(np.asarray, self.floating(gradient, "gradient", advice=advice, error=DerivativeError)))
-        for name, g, x in zip(self.names_under("gradient"), given, self.values):
+        derivatives = self.floating(gradient, "gradient", advice=advice, error=DerivativeError)
+        slopes = []
+        for name, derivative, x in zip(self.names_under("gradient"), derivatives, self.values):
+            g = np.asarray(derivative)
             if g.shape != x.shape:
                 raise DerivativeError(f"{name}: expected shape {x.shape}, got {g.shape}{advice}")
             if g.dtype.kind not in "biufc":
                 raise DerivativeError(f"{name}: expected numbers, got dtype {g.dtype}{advice}")
-        return [np.conj(g).astype(complex) if np.iscomplexobj(x) else g.real for g, x in zip(given, self.values)]
+            slopes.append(np.conj(g).astype(complex) if np.iscomplexobj(x) else g.real)
+        return slopes
 
-    def pack_gradient(self, gradient):
-        """Finite gradient of the same structure -> flat gradient with respect to the packed vector."""
+    def pack_gradient(self, gradient: Any) -> np.ndarray:
+        """Return a finite gradient of the same structure as the gradient with respect to the packed vector."""
         slopes = self.slopes(gradient)
         for name, g in zip(self.names, slopes):
             check_finite(f"the gradient of {name}", g, FINITE)
         return joined(slopes)
 
-    def traced(self, tree):
-        """The floating leaves of a tree that may be traced, as one traced vector."""
+    def traced(self, tree: Any) -> Any:
+        """Return the floating leaves of a tree that may be traced as one traced vector."""
         return anp.concatenate([anp.reshape(leaf, (-1,)) for leaf in self.floating(tree)])
 
-    def split(self, vector):
-        """Flat vector -> views of what belongs to each floating leaf."""
+    def split(self, vector: Any) -> list:
+        """Return the part of a flat vector that belongs to each floating leaf, as views."""
         return [vector[part] for part in self._parts]
 
-    def arrays(self, vector):
-        """Flat vector -> fresh arrays of the shapes and dtypes of the floating leaves; this rounds."""
-        pairs = zip(self.split(vector), self.values)
-        return [part.view(np.result_type(x.dtype, float)).astype(x.dtype).reshape(x.shape) for part, x in pairs]
+    def arrays(self, vector: np.ndarray) -> list[np.ndarray]:
+        """Return fresh arrays of the shapes and dtypes of the floating leaves; this rounds."""
+        arrays = []
+        for part, x in zip(self.split(vector), self.values):
+            numbers = part.view(np.result_type(x.dtype, float))
+            arrays.append(numbers.astype(x.dtype).reshape(x.shape))
+        return arrays
 
-    def tree(self, arrays):
-        """Arrays -> the tree with these floating leaves, numbers where the original has numbers."""
+    def tree(self, arrays: Any) -> Any:
+        """Return the tree with these floating leaves, numbers where the original has numbers."""
         values = iter(arrays)
         pairs = zip(self._leaves, self._floating)
-        return self._rebuild(_like(leaf, next(values)) if floating else leaf for leaf, floating in pairs)
+        return self.structure.build(_like(leaf, next(values)) if floating else leaf for leaf, floating in pairs)
 
-    def unpack(self, vector):
-        """Flat vector -> fresh tree; every leaf has the type, shape and dtype of its original."""
+    def unpack(self, vector: np.ndarray) -> Any:
+        """Return a flat vector as a fresh tree; every leaf has the type, shape and dtype of its original."""
         return self.tree(self.arrays(vector))
 
 
-def joined(arrays):
-    """Arrays -> one vector of doubles, complex numbers as pairs."""
+def joined(arrays: Sequence) -> np.ndarray:
+    """Return arrays as one vector of doubles, complex numbers as pairs."""
     return np.concatenate([_doubles(x) for x in arrays])
 
 
 def _doubles(array):
-    """An array of any precision as one vector of doubles."""
+    """Return an array of any precision as one vector of doubles."""
     kind = complex if np.iscomplexobj(array) else float
     return np.ravel(array).astype(kind).view(float)
 
 
 def _like(leaf, value):
+    """Return a value as a number of the type of a leaf, where the leaf is a number."""
     if isinstance(leaf, np.ndarray) or isbox(value):
         return value
     return np.asarray(value)[()] if isinstance(leaf, np.generic) else type(leaf)(value)

@@ -25,7 +25,7 @@ from autograd.numpy.numpy_vjps import match_complex, replace_zero, unbroadcast_f
 from autograd.tracer import Node, box_types, getval, isbox, new_box, notrace_primitives, trace_stack
 
 from sparsedp._utils.counters import active, count, note, thread, timed
-from sparsedp._utils.pytree import copied, leaves
+from sparsedp._utils.pytree import copied, is_branch, leaves
 from sparsedp._utils.reconstruction import Remade
 from sparsedp.autodiff.backend import ARRAY_KINDS, BOX, match_value
 from sparsedp.autodiff.fast_derivatives import (
@@ -200,7 +200,7 @@ class Recorder:
     def __init__(self, *witnesses: Callable):
         self.nodes: list[ReverseNode] = []
         self.witnesses = (*thread.witnesses, *witnesses)
-        self.bytes: int | None = None
+        self.bytes: Any = None
         self.ended = False
 
     def root(self) -> ReverseNode:
@@ -855,7 +855,7 @@ class Rule(Remade):
 def _run(rule, *args):
     """Call the function of a rule on plain values."""
     for arg in args:
-        if type(arg) is not np.ndarray and isinstance(arg, (tuple, list, dict)) and any(map(isbox, leaves(arg))):
+        if type(arg) is not np.ndarray and is_branch(arg) and any(map(isbox, leaves(arg))):
             raise DerivativeError(
                 f"{rule.name} got a traced value inside a {type(arg).__name__}; pass it as an argument"
             )

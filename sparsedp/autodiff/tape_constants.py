@@ -1,46 +1,56 @@
-"""Constants of a tape: what the backward pass needs from the caller, kept apart from the caller's arrays.
+"""Constants of a tape: what the backward pass needs of the caller's arrays, as they were at the call.
 
 A pullback runs later than its call, and the caller may have written into an array in between (`work[:] = c` in a
-loop). So every array that goes into a node of a tape without being traced is replaced by a read-only copy.
+loop). So every array in a node of a tape that is not traced is replaced by a read-only copy.
 
-A large array that many nodes use is copied once: the last copy of such a view of its owner is found again and compared
-bit by bit. That takes as long as a copy and saves the memory. Copies live as long as the tapes that hold them.
+A large array that many nodes use is copied once: the last copy of such a view is kept in a table and compared with the
+array bit by bit. That takes as long as a copy and saves the memory. Copies live as long as the tapes that hold them.
 """
 
+from __future__ import annotations
+
 from copy import copy
+from typing import TYPE_CHECKING, Any
 from weakref import WeakValueDictionary
 
 import numpy as np
 
+from sparsedp._utils.pytree import field_names
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
 __all__ = ["FIXED", "constant", "constant_args", "frozen", "is_fixed", "sparing"]
 
-SMALL = 2**16  # bytes up to which a copy of its own takes less time than a comparison with an older one
-CHUNK = 2**15  # entries that are compared at once: two pieces of them stay in the cache of a core
+SMALL = 2**16  # bytes up to which a copy takes less time than a comparison with an earlier one
+CHUNK = 2**15  # entries that are compared at once: two such parts stay in the cache of a core
 LONGEST = 8  # bytes of the longest integer, as which bits are compared
-FIXED = {float, int, bool, str, slice, type(None), type(Ellipsis), np.float64}
+FIXED = {float, int, bool, str, slice, type(None), type(Ellipsis), np.float64}  # types of immutable values
 
 # Functions whose pullbacks need no numbers of their constants, and those that call `constant_args`.
-sparing: set = set()
-# (id of the owner, shape, strides) of an array -> the last copy of it
+sparing: set[Callable] = set()
+# (id of the owner, shape, strides) of an array -> its last copy
 copies: WeakValueDictionary = WeakValueDictionary()
 
 
-def constant_args(args, nums):
-    """Arguments of a call -> the same, those not traced (not at the places `nums`) as constants."""
-    held = None
+def constant_args(args: Sequence, nums: Sequence[int]) -> Any:
+    """Return the arguments of a call, those that are not traced (not at the positions `nums`) as constants."""
+    constants: list | None = None
     for num, arg in enumerate(args):
-        if type(arg) not in FIXED and num not in nums:
-            value = constant(arg)
-            if value is not arg:
-                held = held or list(args)
-                held[num] = value
-    return args if held is None else tuple(held)
+        if type(arg) in FIXED or num in nums:
+            continue
+        value = constant(arg)
+        if value is not arg:
+            if constants is None:
+                constants = list(args)
+            constants[num] = value
+    return args if constants is None else tuple(constants)
 
 
-def constant(value):
-    """The same value in arrays that nobody writes into; also in tuples, lists and dicts.
+def constant(value: Any) -> Any:
+    """Return a value in read-only arrays; also inside tuples, lists, dicts and dataclasses.
 
-    What can change no more is handed back as it is. Other objects are the business of who made them.
+    Immutable arrays are returned as they are. Other objects must not be changed by their owner.
 
     Examples
     --------
@@ -50,32 +60,38 @@ def constant(value):
     >>> kept
     array([1., 2.])
     """
-    kind = type(value)
+    kind: Any = type(value)
     if isinstance(value, np.ndarray):
         return value if is_fixed(value) else _copied(value)
-    if kind is tuple and all(type(one) in FIXED for one in value):
+    if kind is tuple and all(type(entry) in FIXED for entry in value):
         return value
     if kind is tuple or kind is list:
         return kind(map(constant, value))
-    if isinstance(value, dict):  # it may have an order of its own, or a default
-        held = copy(value)
-        for name, one in value.items():  # not by update: that of a Counter adds
-            held[name] = constant(one)
-        return held
-    return kind(*map(constant, value)) if isinstance(value, tuple) and hasattr(kind, "_fields") else value
+    if isinstance(value, dict):
+        constants = copy(value)  # it may have an order of its own, or a default
+        for name, entry in value.items():  # not by update: that of a Counter adds
+            constants[name] = constant(entry)
+        return constants
+    if isinstance(value, tuple) and hasattr(kind, "_fields"):
+        return kind(*map(constant, value))
+    names = field_names(value)
+    if names is not None:
+        return kind(**{name: constant(getattr(value, name)) for name in names})
+    return value
 
 
-def is_fixed(array):
-    """Whether nobody can write into an array: a read-only view of one that is writeable does not count."""
-    while isinstance(array, np.ndarray):
-        if array.flags.writeable:
+def is_fixed(array: np.ndarray) -> bool:
+    """Whether an array is immutable. A read-only view of a writeable array is not."""
+    owner: Any = array
+    while isinstance(owner, np.ndarray):
+        if owner.flags.writeable:
             return False
-        array = array.base
-    return array is None or type(array) is bytes
+        owner = owner.base
+    return owner is None or type(owner) is bytes
 
 
-def frozen(value):
-    """Array -> a view nobody can write through; numbers as they are."""
+def frozen(value: Any) -> Any:
+    """Return an array as a read-only view; all else as it is."""
     if type(value) is not np.ndarray:
         return value
     view = value.view()
@@ -84,13 +100,15 @@ def frozen(value):
 
 
 def _copied(value):
+    """Return a read-only copy of an array, if possible one that exists."""
     if value.nbytes <= SMALL or value.dtype.kind not in "biufc" or value.real.itemsize > LONGEST:
         return _frozen_copy(value)
     owner = value if value.base is None else value.base
     view = id(owner), value.shape, value.strides
     earlier = copies.get(view)
     if earlier is None or not _same_bits(earlier, value):
-        earlier = copies[view] = _frozen_copy(value)
+        earlier = _frozen_copy(value)
+        copies[view] = earlier
     return earlier
 
 
@@ -107,6 +125,7 @@ def _same_bits(earlier, value):
     if value.dtype.kind == "c":
         return _same_bits(earlier.real, value.real) and _same_bits(earlier.imag, value.imag)
     bits = f"i{value.itemsize}"
-    earlier, value = earlier.view(bits), value.view(bits)
+    earlier = earlier.view(bits)
+    value = value.view(bits)
     rows = max(1, CHUNK * len(value) // value.size)
     return all((earlier[k : k + rows] == value[k : k + rows]).all() for k in range(0, len(value), rows))

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sparsedp._utils.pytree import branches_mapped, copied, flatten, keys, leaves, mapped, paired, subscript
+from sparsedp._utils.pytree import branches_mapped, child, copied, flatten, keys, leaves, mapped, paired, subscript
 from sparsedp._utils.validation import check_function, check_number, check_takes
 from sparsedp.autodiff.tape import cast, dtype_of, is_variable, isbox, plain
 from sparsedp.autodiff.tape_constants import frozen
@@ -230,7 +230,7 @@ def _stiff_terms(linear: Any, place: str) -> Any:
         return StiffTerm(op, coefficient, place)
     if keys(linear) is None:
         raise TypeError(f"{place} takes an Operator or a pair (Operator, coefficient), got {type(linear).__name__}")
-    return branches_mapped(lambda name: _stiff_terms(linear[name], place + subscript(linear, name)), linear)
+    return branches_mapped(lambda name: _stiff_terms(child(linear, name), place + subscript(linear, name)), linear)
 
 
 def _is_none(term: Any) -> bool:

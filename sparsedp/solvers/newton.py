@@ -262,7 +262,9 @@ class Equation:
         tree = self.unknowns.tree
         if keys(result) is None or keys(tree) is None or isinstance(result, dict) != isinstance(tree, dict):
             return leaves(result)
-        if not isinstance(result, dict) and len(result) != len(tree):
+        if isinstance(result, (tuple, list)) != isinstance(tree, (tuple, list)):
+            return leaves(result)
+        if isinstance(result, (tuple, list)) and len(result) != len(tree):
             return leaves(result)
         return paired(result, tree, "residual", f" of {self.name}", "; return a tree like x")
 

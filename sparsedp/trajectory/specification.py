@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp._utils.pytree import described, flatten, keys, labels, leaves, paired
+from sparsedp._utils.pytree import child, described, flatten, is_branch, keys, labels, leaves, paired
 from sparsedp._utils.validation import check_finite, check_leaves, check_native, hidden_leaves
 from sparsedp.autodiff.backend import array_types, as_field, is_distributed
 from sparsedp.autodiff.derivative import is_finite
@@ -112,7 +112,7 @@ class Layout:
                 if isbox(hidden):
                     raise DerivativeError(
                         f"{labels(tree, self.root)[place]} of rollout is a {type(leaf).__name__} with a traced value, "
-                        "which is not a tree; write a dict or a NamedTuple"
+                        "which is not a tree; write a dict, a NamedTuple or a plain dataclass"
                     )
 
     @cached_property
@@ -178,7 +178,7 @@ class Layout:
             If the form, a shape or a dtype differs.
         """
         variables: Any
-        if self.is_leaf and not isinstance(tree, (tuple, list, dict)):
+        if self.is_leaf and not is_branch(tree):
             variables = [tree]
             statics = self.statics
         elif self.is_flat and type(tree) is tuple and len(tree) == len(self.places):
@@ -379,7 +379,13 @@ def refuse_foreign_trace(origin: str) -> None:
 
 
 def _is_open(tree: Any) -> bool:
-    return isinstance(tree, (dict, list)) or (isinstance(tree, tuple) and any(map(_is_open, tree)))
+    if isinstance(tree, (dict, list)):
+        return True
+    names = keys(tree)
+    if names is None:
+        return False
+    is_frozen = isinstance(tree, tuple) or tree.__dataclass_params__.frozen
+    return not is_frozen or any(_is_open(child(tree, name)) for name in names)
 
 
 def _brief(value: Any) -> str:

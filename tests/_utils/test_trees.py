@@ -36,9 +36,12 @@ class Other(NamedTuple):
 
 @dataclass
 class Settings:
-    """A container that is no tree."""
+    """A dataclass that checks its fields: it is not a tree."""
 
     k: Any
+
+    def __post_init__(self):
+        assert self.k is None or self.k is not False
 
     def __getitem__(self, name):
         return getattr(self, name)
@@ -671,7 +674,7 @@ def test_whole_messages():
     with pytest.raises(
         TypeError,
         match="x is a mappingproxy, which is not a tree: its numbers would have no derivative; "
-        "write a dict or a NamedTuple",
+        "write a dict, a NamedTuple or a plain dataclass",
     ):
         dp.grad(lambda x: x["k"] ** 2)(MappingProxyType({"k": 2.0}))
     with pytest.raises(DerivativeError, match=r"gradient\['b'\]: expected numbers, got dtype object; return a tree"):
@@ -690,7 +693,7 @@ def test_containers_in_a_rollout(kind):
     with pytest.raises(
         DerivativeError,
         match=r"params\['c'\] of rollout is a .* with a traced value, which is not a tree; "
-        "write a dict or a NamedTuple",
+        "write a dict, a NamedTuple or a plain dataclass",
     ):
         dp.grad(lambda k: dp.rollout(step, 8.0, {"c": kind(k)}, 3))(0.5)
 
