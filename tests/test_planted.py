@@ -444,8 +444,8 @@ BUGS = {
     ),
     "a derivative of an exponential in the step": Bug(
         "integrators",
-        "found[k + 1] -= k * weight",
-        "found[k + 1] += k * weight",
+        "weights[k + 1] -= k * weight",
+        "weights[k + 1] += k * weight",
         "tests/integrators/test_integrators.py::test_gradient_jvp_and_second_order",
     ),
     "a coefficient of the field before": Bug(

@@ -1,9 +1,14 @@
 """Jacobians of a small function at many points, by reverse mode.
 
-A tape goes back once, with all cotangents side by side along a last axis; and tapes of the same calls go back together,
-side by side along the axis before it. What a small function takes is the time of Python, for each call, and that once.
-Where a call is not known here its cotangents go back one after the other, and its tape by itself.
+A tape is traversed once, with all cotangents side by side along a last axis; and tapes of the same calls are traversed
+together, side by side along the axis before it. The time of a small function is the overhead of Python for each call,
+which is then spent once. Where a call is not known here its cotangents are propagated one after the other, and its tape
+by itself.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 import autograd.numpy as anp
 import numpy as np
@@ -14,19 +19,40 @@ from sparsedp.autodiff.fast_derivatives import ARRAY, FLOAT, ITEM, REAL, Part, b
 from sparsedp.autodiff.tape import added, autograd_rules, called, dtype_of
 from sparsedp.operators.operator import Operator
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
 __all__ = ["jacobians_of"]
 
-# Functions entry by entry, and those that hand entries of one array on: copied, left out, or in another order.
+# Functions of each entry, and those that select entries of one array: copied, omitted, or in another order.
 ENTRYWISE = {
-    anp.add, anp.subtract, anp.multiply, anp.true_divide, anp.power, anp.negative, anp.abs, anp.sqrt, anp.square,
-    anp.exp, anp.log, anp.sin, anp.cos, anp.tan, anp.sinh, anp.cosh, anp.tanh, anp.maximum, anp.minimum, anp.where,
-}  # fmt: skip
-PLACES = ITEM, ARRAY  # their pullbacks hand on entries along the first axes: more axes at the end do not matter
+    anp.add,
+    anp.subtract,
+    anp.multiply,
+    anp.true_divide,
+    anp.power,
+    anp.negative,
+    anp.abs,
+    anp.sqrt,
+    anp.square,
+    anp.exp,
+    anp.log,
+    anp.sin,
+    anp.cos,
+    anp.tan,
+    anp.sinh,
+    anp.cosh,
+    anp.tanh,
+    anp.maximum,
+    anp.minimum,
+    anp.where,
+}
+PLACES = ITEM, ARRAY  # their pullbacks act on the first axes: more axes at the end do not matter
 SELECTIONS = {ITEM, anp.reshape, anp.ravel, anp.roll, anp.repeat, anp.transpose}
 
 
-def jacobians_of(fun, trees, moving):
-    """A function at many trees of floating values -> its values, and its derivatives in all leaves that move.
+def jacobians_of(fun: Callable, trees: Sequence, moving: Sequence[bool]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the values of a function at many trees of floating values, and its derivatives in the moving leaves.
 
     Parameters
     ----------
@@ -35,11 +61,11 @@ def jacobians_of(fun, trees, moving):
     trees : list of trees
         Of the same structure and shapes; plain.
     moving : list of bool
-        For each leaf.
+        For each leaf, whether it is differentiated.
 
     Returns
     -------
-    (array (trees, m), array (trees, m, numbers that move))
+    (array (trees, m), array (trees, m, differentiated numbers))
 
     Examples
     --------
@@ -47,60 +73,74 @@ def jacobians_of(fun, trees, moving):
     >>> rows.tolist()
     [[[5.0, 2.0], [1.0, 0.0]]]
     """
-    calls: dict = {}  # what `_batched` says of nodes whose own pullbacks do not take many cotangents
+    batched_calls: dict = {}  # of nodes whose own pullbacks do not take many cotangents: see `_batched`
 
-    def see(node, fun, *call):
-        if not (node.vjp in by_entry or node.held and fun in PLACES):
-            calls[node] = _batched(node, fun, *call)
+    def witness(node: Any, fun: Any, *call: Any) -> None:
+        if not (node.vjp in by_entry or (node.held and fun in PLACES)):
+            batched_calls[node] = _batched(node, fun, *call)
 
-    tapes, groups = [taped(fun, tree, moving, see) for tree in trees], []  # type: list, list
-    for number, tape in enumerate(tapes):
-        kinds = _kinds(tape, calls) if len(tapes) > 1 else None
-        group = next((group for known, group in groups if known == kinds), None)
-        if group is None:
-            groups.append((kinds, group := []))
-        group.append(number)
+    tapes = [taped(fun, tree, moving, witness) for tree in trees]
     values = np.array([np.concatenate([*map(np.ravel, tape.values)]) for tape in tapes])
     sizes = [np.size(leaf) for leaf, moves in zip(leaves(trees[0]), moving, strict=True) if moves]
     rows = np.zeros((*values.shape, sum(sizes)))
-    for _, group in groups:
-        found = _rows([tapes[number] for number in group], values.shape[1], calls)
-        for g, size, stop in zip(found, sizes, np.cumsum(sizes), strict=True):
+    m = values.shape[1]
+    for group in _groups(tapes, batched_calls):
+        derivatives = _rows([tapes[number] for number in group], m, batched_calls)
+        for g, size, stop in zip(derivatives, sizes, np.cumsum(sizes), strict=True):
             if g is not None:
-                rows[group, :, stop - size : stop] = np.moveaxis(g.reshape(size, len(group), values.shape[1]), 0, -1)
+                rows[group, :, stop - size : stop] = np.moveaxis(g.reshape(size, len(group), m), 0, -1)
     return values, rows
 
 
-def _kinds(tape, calls):
-    """What tapes have in common that go back together: the kinds of their calls, and of which results these are."""
+def _groups(tapes: list, batched_calls: dict) -> list[list[int]]:
+    """Return the numbers of tapes that are traversed together."""
+    if len(tapes) == 1:
+        return [[0]]
+    groups: list[tuple[list, list[int]]] = []
+    for number, tape in enumerate(tapes):
+        kinds = _kinds(tape, batched_calls)
+        for others, group in groups:
+            if others == kinds:
+                group.append(number)
+                break
+        else:
+            groups.append((kinds, [number]))
+    return [group for _, group in groups]
+
+
+def _kinds(tape: Any, batched_calls: dict) -> list:
+    """Return the kinds of the calls of a tape, and of which results these are: equal for tapes of one group."""
     places: dict = {node: place for place, node in enumerate((None, *tape.roots, *tape.nodes))}
-    found: list = [places[end] for end in tape.ends]
+    kinds: list = [places[end] for end in tape.ends]
     for node in tape.nodes:
-        if node not in calls:
+        if node not in batched_calls:
             kind = node.vjp, [getattr(x, "shape", x) for x in node.held]
         else:
-            kind = calls[node][0] if calls[node] else node
-        found.append((kind, [places[parent] for parent in node.parents]))
-    return found
+            batched = batched_calls[node]
+            kind = batched[0] if batched else node
+        kinds.append((kind, [places[parent] for parent in node.parents]))
+    return kinds
 
 
-def _rows(tapes, size, calls):
-    """For each root the derivatives of all numbers of the result, (*shape, tapes, size), or None."""
-    count, first = len(tapes), tapes[0]
-    sums: dict = {}
+def _rows(tapes: list, size: int, batched_calls: dict) -> list:
+    """Return for each root the derivatives of all numbers of the result, (*shape, tapes, size), or None."""
+    count = len(tapes)
+    first = tapes[0]
+    sums: dict = {}  # (sum so far, whether it may be written to)
 
-    def add(parent, g):
-        total, ours = sums.get(parent, (None, False))
+    def add(parent: Any, g: Any) -> None:
+        total, is_ours = sums.get(parent, (None, False))
         if type(g) is not Part:
             sums[parent] = (g, False) if total is None else (total + g, True)
             return
         part, index, shape = g
-        if not ours:  # a sum that was made here is written into
+        if not is_ours:
             total = np.zeros((*shape, count, size)) if total is None else np.array(total)
             sums[parent] = total, True
-        if index is Ellipsis or type(index) is tuple and Ellipsis in index:  # the last axes are others then
-            total, part = (np.moveaxis(x, (-2, -1), (0, 1)) for x in (total, part))
-            index = slice(None), slice(None), *(index if type(index) is tuple else (index,))
+        if index is Ellipsis or (type(index) is tuple and Ellipsis in index):  # it counts from the last axes
+            total = np.moveaxis(total, (-2, -1), (0, 1))
+            part = np.moveaxis(part, (-2, -1), (0, 1))
+            index = (slice(None), slice(None), *(index if type(index) is tuple else (index,)))
         total[index] += part
 
     units = np.split(np.eye(size), np.cumsum([*map(np.size, first.values)])[:-1])
@@ -108,54 +148,67 @@ def _rows(tapes, size, calls):
         if end is not None:
             add(end, np.repeat(unit.reshape(*np.shape(value), 1, size), count, -2))
     for nodes in zip(*(reversed(tape.nodes) for tape in tapes), strict=True):
-        node = nodes[0]
-        if node not in sums:
-            continue
-        g, _ = sums.pop(node)
-        if node not in calls:
-            backs = node.vjp(g, *_beside([node.held for node in nodes]))
-        elif calls[node]:
-            backs = calls[node][2](g, [calls[node][1] for node in nodes])
-        else:  # of one tape, one cotangent after the other
-            ones = g if type(g) is Several else np.ascontiguousarray(np.moveaxis(g[..., 0, :], -1, 0))
-            columns = zip(*(node.vjp(one, *node.held) for one in ones), strict=True)
-            backs = [_joined([added(None, back)[0] for back in column]) for column in columns]
-        for parent, back in zip(node.parents, backs, strict=True):
-            add(parent, back)
+        if nodes[0] in sums:
+            g, _ = sums.pop(nodes[0])
+            for parent, back in zip(nodes[0].parents, _pulled(nodes, g, batched_calls), strict=True):
+                add(parent, back)
     return [sums.get(root, (None,))[0] for root in first.roots if root is not None]
 
 
-class Several(list):
-    """Cotangents of a call with several results: they have no common shape, and stand one after the other."""
+def _pulled(nodes: Sequence, g: Any, batched_calls: dict) -> Any:
+    """Return the cotangents of the parents of calls of one kind, from those of their results."""
+    node = nodes[0]
+    if node not in batched_calls:
+        return node.vjp(g, *_side_by_side([node.held for node in nodes]))
+    if batched_calls[node]:
+        act = batched_calls[node][2]
+        return act(g, [batched_calls[node][1] for node in nodes])
+    # A call of one tape, one cotangent after the other.
+    cotangents = g if type(g) is Several else np.ascontiguousarray(np.moveaxis(g[..., 0, :], -1, 0))
+    columns = zip(*(node.vjp(one, *node.held) for one in cotangents), strict=True)
+    return [_joined([added(None, back)[0] for back in column]) for column in columns]
 
-    def __add__(self, other):
+
+class Several(list):
+    """Cotangents of a call with several results, one after the other: they have no common shape."""
+
+    def __add__(self, other: Any) -> Several:
+        """Return the sum, entry by entry."""
         return Several(added((one, False), two)[0] for one, two in zip(self, other, strict=True))
 
 
-def _joined(column):
-    """Cotangents of one tape, side by side."""
+def _joined(column: list) -> Any:
+    """Return cotangents of one tape, side by side."""
     return Several(column) if isinstance(column[0], (tuple, list)) else np.stack(column, -1)[..., None, :]
 
 
-def _beside(rows):
-    """What calls of a function hold, beside their cotangents."""
-    found: list = []
+def _side_by_side(rows: Sequence) -> list:
+    """Return the values that calls of a function hold, side by side."""
+    columns: list = []
     for column in zip(*rows, strict=True):
         x = column[0]
         if type(x) is not np.ndarray and column.count(x) == len(column):
-            found.append(x)  # as a power of 2 that the function names
+            columns.append(x)  # as the exponent of a power
         else:
-            found.append(np.stack(column, -1)[..., None])
-    return found
+            columns.append(np.stack(column, -1)[..., None])
+    return columns
 
 
 # ---- calls that take many cotangents ---------------------------------------------------------------------------------
 
 
-def _batched(node, fun, value, args, options, nums):
-    """A call -> (what it has in common with calls it may go back with, what it holds, act), or None.
+def _batched(node: Any, fun: Any, value: Any, args: Any, options: Any, nums: Any) -> tuple | None:
+    """Return the batched form of a call, or None.
 
-    ``act(g, rows)``: cotangents (*shape of the value, calls, many), what each call holds -> those of the arguments.
+    Returns
+    -------
+    kind : list
+        Equal for calls that can be traversed together.
+    held : sequence
+        The values of this call.
+    act : callable
+        ``act(g, rows)``: from cotangents (*shape of the value, calls, many) and the held values of each call, those of
+        the arguments.
     """
     traced = [args[num] for num in nums]
     if any(type(x) not in REAL or dtype_of(x) is not FLOAT for x in (value, *traced)):
@@ -170,7 +223,8 @@ def _batched(node, fun, value, args, options, nums):
     if fun is anp.concatenate_args and args[0] == 0:
         cuts = np.cumsum([0, *map(len, args[1:])]).tolist()
         return [fun, nums, cuts], (), lambda g, rows: [g[cuts[num - 1] : cuts[num]] for num in nums]
-    if isinstance(op := called(fun, args), Operator):
+    op = called(fun, args)
+    if isinstance(op, Operator):
         return [id(op)], (), lambda g, rows: [_transposed(op, g)]
     if fun in (anp.dot, anp.matmul) and [*map(np.ndim, args)] == [2, 1]:
         return [fun, nums, np.shape(args[0])], args, lambda g, rows: _product(nums, g, rows)
@@ -179,48 +233,51 @@ def _batched(node, fun, value, args, options, nums):
     return None
 
 
-def _entrywise(node, fun, value, args, nums, shapes):
-    """By the slope in each entry; what was spread is added up."""
+def _entrywise(node: Any, fun: Any, value: Any, args: Any, nums: Any, shapes: list) -> tuple:
+    """Multiply by the slope in each entry; broadcast arguments are summed."""
     shape = np.shape(value)
-    if all(known == shape for known in shapes):
+    if all(other == shape for other in shapes):
         slopes = node.vjp(np.ones(shape), *node.held)
     else:
         spread = [np.broadcast_to(x, shape) if num in nums else x for num, x in enumerate(args)]
         slopes = autograd_rules(fun)[0](nums, value, spread, {})(np.ones(shape))
 
-    def act(g, rows):
-        return [_summed(g * slope, known) for slope, known in zip(_beside(rows), shapes, strict=True)]
+    def act(g: Any, rows: Any) -> list:
+        pairs = zip(_side_by_side(rows), shapes, strict=True)
+        return [_summed(g * slope, other) for slope, other in pairs]
 
     return [fun, shape, *shapes], slopes, act
 
 
-def _summed(g, shape):
-    """What was spread from a shape, added up."""
-    before = (*[1] * (g.ndim - 2 - len(shape)), *shape)
-    axes = tuple(axis for axis, n in enumerate(before) if n != g.shape[axis])
+def _summed(g: np.ndarray, shape: tuple) -> np.ndarray:
+    """Sum the cotangent of an array that was broadcast from a shape."""
+    padded = (*[1] * (g.ndim - 2 - len(shape)), *shape)
+    axes = tuple(axis for axis, n in enumerate(padded) if n != g.shape[axis])
     return np.sum(g, axes).reshape(*shape, *g.shape[-2:])
 
 
-def _selection(fun, args, options, nums, shape):
-    """By the number of the entry that each one of the result is."""
+def _selection(fun: Any, args: Any, options: Any, nums: Any, shape: tuple) -> tuple:
+    """Add to the entries that were selected, by their numbers."""
     numbers = np.arange(int(np.prod(shape))).reshape(shape)
-    places = np.asarray(fun.fun(*(numbers if num in nums else arg for num, arg in enumerate(args)), **options))
+    arguments = [numbers if num in nums else arg for num, arg in enumerate(args)]
+    places = np.asarray(fun.fun(*arguments, **options))
 
-    def act(g, rows):
-        found = np.zeros((numbers.size, *g.shape[-2:]))
-        np.add.at(found, places, g)
-        return [found.reshape(*shape, *g.shape[-2:])]
+    def act(g: Any, rows: Any) -> list:
+        total = np.zeros((numbers.size, *g.shape[-2:]))
+        np.add.at(total, places, g)
+        return [total.reshape(*shape, *g.shape[-2:])]
 
     return [fun, places.shape, places.tobytes(), shape], (), act
 
 
-def _transposed(op, g):
+def _transposed(op: Operator, g: np.ndarray) -> np.ndarray:
+    """Apply the transpose of an operator to many cotangents."""
     if op.form == "explicit" and g.ndim == 2 + len(op.codomain.shape):
         return (op.matrix.T @ g.reshape(op.shape[0], -1)).reshape(*op.domain.shape, *g.shape[-2:])
     return np.moveaxis(op.T.apply(np.moveaxis(g, (-2, -1), (0, 1))), (0, 1), (-2, -1))
 
 
-def _product(nums, g, rows):
-    """Of a matrix and a vector."""
+def _product(nums: Any, g: np.ndarray, rows: Any) -> list:
+    """Return the cotangents of products of a matrix and a vector."""
     A, x = (np.stack(column, -1) for column in zip(*rows, strict=True))
     return [np.einsum("mkc,mcj->kcj", A, g) if num else g[:, None] * x[..., None] for num in nums]

@@ -1,10 +1,7 @@
-"""Runge-Kutta steps. An explicit one is a table of numbers; an implicit one a few stages, x of x = b + h f(x, t).
+"""Runge-Kutta steps: explicit ones by a table of numbers, implicit ones by a few stages x of x = b + h f(x, t).
 
 Where the rate is c L u and nothing else, an explicit step of order p in p stages is the Taylor polynomial of order p of
-exp(z L), z = h c, times u: one node on the tape, for Horner's rule on it takes two to three times as long.
-
-Sources: Heun, Z. Math. Phys. 45 (1900); Kutta, Z. Math. Phys. 46 (1901);
-Shu and Osher, J. Comput. Phys. 77 (1988), the strong-stability-preserving step of order 3.
+exp(z L), z = h c, times u: one node on the tape. Horner's rule would take two to three times as long.
 
 Implicit: backward Euler, Crank-Nicolson, TR-BDF2, imex. A linear problem, f = c L x + s(t), solves
 x = (1 - h c L)^-1 (b + h s); a nonlinear one finds the root.
@@ -12,17 +9,15 @@ x = (1 - h c L)^-1 (b + h s); a nonlinear one finds the root.
 Crank-Nicolson is x = 2 w - u with w = (1 - z/2 L)^-1 (u + h/4 (s_0 + s_1)): one solve, no product with L.
 TR-BDF2 takes Crank-Nicolson over g h, g = 2 - sqrt(2), then x = b + d h f(x) with d = g/2 and
 b = u + (y - u) / (g (2 - g)): both stages have the same factor 1 - d z L.
-Sources: Bank et al., IEEE Trans. Electron Devices 32 (1985); Hosea and Shampine, Appl. Numer. Math. 20 (1996).
 
 imex, for u' = c L u + N(u, t) + s(t), is ARS(2,2,2), order 2, with the L-stable implicit part d = 1 - 1/sqrt(2),
-e = 1 - 1/(2 d), z = c h. A source s(t) belongs to the operator, as the walls whose values it brings: it is implicit, at
-the time of each stage,
+e = 1 - 1/(2 d), z = c h. A source s(t) belongs to the operator, as the boundary values that it carries: it is implicit,
+at the time of each stage,
 
     x1 = u + h d N(u) + d (z L x1 + h s(t + d h)),
     x2 = u + h (e N(u) + (1 - e) N(x1)) + (1 - d) (z L x1 + h s(t + d h)) + d (z L x2 + h s(t + h)),
 
 two solves with one factor; z L x1 + h s is taken from the first equation, without a product.
-Source: Ascher, Ruuth, Spiteri, Appl. Numer. Math. 25 (1997).
 
 The linear solve of all of them is x of (1 - z L) x = b, differentiable in z and b. With S = (1 - z L)^-1 and x = S b,
 
@@ -31,14 +26,22 @@ The linear solve of all of them is x of (1 - z L) x = b, differentiable in z and
 The transposed solve is a rule of the same form with L^T: derivatives of every order follow. One set-up
 serves all stages, steps and adjoint solves of one z. For z = 0, x is b, and nothing is set up or solved.
 
-What L leaves as it is (the mean, where nothing flows through the walls) is split off before the solve and added
+The null space of L (the mean, where nothing flows through the walls) is separated before the solve and added
 after it: 1 - z L has the eigenvalue 1 there beside those of size z |L|, and would lose it to rounding.
+
+References
+----------
+K. Heun, Z. Math. Phys. 45 (1900); W. Kutta, Z. Math. Phys. 46 (1901); C.-W. Shu, S. Osher, J. Comput. Phys. 77 (1988),
+the strong-stability-preserving step of order 3; R. E. Bank et al., IEEE Trans. Electron Devices 32 (1985); M. E. Hosea,
+L. F. Shampine, Appl. Numer. Math. 20 (1996); U. M. Ascher, S. J. Ruuth, R. J. Spiteri, Appl. Numer. Math. 25 (1997).
 """
+
+from __future__ import annotations
 
 from functools import cached_property, lru_cache, partial, reduce
 from math import sqrt
 from operator import add
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import autograd.numpy as anp
 import numpy as np
@@ -58,6 +61,11 @@ from sparsedp.solvers.records import SolveLog
 from sparsedp.solvers.roots import implicit
 from sparsedp.solvers.system import System
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from sparsedp.integrators.problem import Problem
+
 __all__ = [
     "EXPLICIT",
     "IMPLICIT",
@@ -72,7 +80,7 @@ __all__ = [
 
 
 class Scheme:
-    """``scheme(u, params, t, h)``: the state after a step h of a problem.
+    """A time step: ``scheme(u, params, t, h)`` returns the state after a step h of a problem.
 
     Attributes
     ----------
@@ -87,18 +95,27 @@ class Scheme:
     dyadic = False
     info: Any = None
 
-    def __init__(self, problem, name, order):
-        self.problem, self.name, self.order = problem, name, order
+    def __init__(self, problem: Any, name: str, order: int) -> None:
+        self.problem = problem
+        self.name = name
+        self.order = order
 
 
 # ---- explicit --------------------------------------------------------------------------------------------------------
 
 
 class Table(NamedTuple):
-    """Nodes and weights of a Runge-Kutta step of order p in p stages.
+    """Weights of a Runge-Kutta step of order p in p stages.
 
-    stages: for each stage after the first, its weights of the earlier rates. weights: of the result.
-    order. reach: the length of the stable interval on the negative real axis.
+    Attributes
+    ----------
+    stages : tuple
+        For each stage after the first, its weights of the earlier rates.
+    weights : tuple
+        Of the result.
+    order : int
+    reach : float
+        Length of the stable interval on the negative real axis.
     """
 
     stages: tuple
@@ -118,43 +135,49 @@ EXPLICIT = {
 class Explicit(Scheme):
     """An explicit step of a problem whose state may be any tree."""
 
-    def __init__(self, problem, name):
+    def __init__(self, problem: Problem, name: str) -> None:
         self.table = EXPLICIT[name]
         super().__init__(problem, name, self.table.order)
 
-    def __call__(self, u, params, t, h, first=None):
-        """The state after a step; `first`: the rate at its start, where it is known."""
+    def __call__(self, u: Any, params: Any, t: Any, h: Any, first: Any = None) -> Any:
+        """Return the state after a step; `first`: the rate at its start, if it is known."""
         rates = [self.problem(u, params, t) if first is None else first]
         for row in self.table.stages:
-            rates.append(self.problem(_ahead(u, h, row, rates), params, later(t, sum(row) * h)))
-        return _ahead(u, h, self.table.weights, rates)
+            rates.append(self.problem(_advanced(u, h, row, rates), params, later(t, sum(row) * h)))
+        return _advanced(u, h, self.table.weights, rates)
 
 
-def _ahead(u, h, row, rates):
-    return combine(u, *((h * share, rate) for share, rate in zip(row, rates, strict=True) if share))
+def _advanced(u: Any, h: Any, weights: Sequence[float], rates: Sequence) -> Any:
+    return combine(u, *((h * weight, rate) for weight, rate in zip(weights, rates, strict=True) if weight))
 
 
 class Polynomial(Scheme):
-    """The same for u' = c L u: one node on the tape, whose way back is the polynomial of the transpose."""
+    """An explicit step of u' = c L u: one node on the tape, whose VJP is the polynomial of the transpose."""
 
-    def __init__(self, problem, name):
+    def __init__(self, problem: Problem, name: str) -> None:
         super().__init__(problem, name, EXPLICIT[name].order)
-        self._rule = lru_cache(None)(taylor)  # made once for each operator
+        self._rule = lru_cache(None)(taylor)  # one rule for each operator
 
-    def __call__(self, u, params, t, h):
+    def __call__(self, u: Any, params: Any, t: Any, h: Any) -> Any:
+        """Return the state after a step."""
         name = f"stepper({self.name})"
-        return self.problem.on_fields(
-            lambda L, z, leaf: 1.0 * leaf if L is None else self._rule(L, name, self.order)(z, leaf), h, params, u
-        )
+
+        def advanced(op: Operator | None, z: Any, leaf: Any) -> Any:
+            return 1.0 * leaf if op is None else self._rule(op, name, self.order)(z, leaf)
+
+        return self.problem.on_fields(advanced, h, params, u)
 
 
-def taylor(op, name, order, power=0):
-    """The rule (z, u) -> L^power T_order(z L) u; its derivative in z is the same with order - 1 and power + 1."""
+def taylor(op: Operator, name: str, order: int, power: int = 0) -> Rule:
+    """Return the rule of L^power T_order(z L) u in (z, u), with the Taylor polynomial T of the exponential.
+
+    Its derivative in z is the same rule with order - 1 and power + 1.
+    """
     other = name.removesuffix(".T") if name.endswith(".T") else f"{name}.T"
     transposed = partial(taylor, op.T, other, order, power)
     slope = partial(taylor, op, name, order - 1, power + 1)
 
-    def forward(z, u):
+    def forward(z: Any, u: Any) -> Any:
         z = float(z)  # a NumPy scalar would round float32
         total = u if order >= 0 else 0.0 * u
         for k in range(order, 0, -1):
@@ -168,24 +191,39 @@ def taylor(op, name, order, power=0):
     return family(name, forward, slope, transposed)
 
 
-def family(name, forward, slope, transposed):
-    """The Rule of (z, b), forward(z, b) = F(z) b: a linear map that depends on a number.
+def family(name: str, forward: Callable, slope: Callable[[], Rule], transposed: Callable[[], Rule]) -> Rule:
+    """Return the Rule of (z, b) for F(z) b, a linear map of b that depends on a number z.
 
-    `slope`, `transposed`: functions that give the Rules of F'(z) b and of F(z)^T b, of the same form. With y = F(z) b
+    With y = F(z) b
 
         dy = F(z) db + F'(z) b dz,     b_bar = F(z)^T g,     z_bar = g . F'(z) b.
+
+    Parameters
+    ----------
+    name : str
+    forward : callable
+        ``forward(z, b)``.
+    slope, transposed : callable
+        Return the Rules of F'(z) b and of F(z)^T b, of the same form.
     """
 
-    def vjp(nums, ans, *given):
-        def pull(g):
-            backs = (transposed()(given[0], g) if num else anp.sum(g * slope()(*given)) for num in nums)
-            return tuple(of_argument(back, given[num]) for num, back in zip(nums, backs, strict=True))
+    def vjp(nums: Sequence[int], ans: Any, z: Any, b: Any) -> Callable:
+        def pull(g: Any) -> tuple:
+            backs = []
+            for num in nums:
+                if num == 1:
+                    backs.append(of_argument(transposed()(z, g), b))
+                else:
+                    backs.append(of_argument(anp.sum(g * slope()(z, b)), z))
+            return tuple(backs)
 
         return pull
 
-    def jvp(nums, tangents, ans, *given):
-        pairs = zip(nums, tangents, strict=True)
-        return reduce(add, (rule(given[0], tangent) if num else tangent * slope()(*given) for num, tangent in pairs))
+    def jvp(nums: Sequence[int], tangents: Sequence, ans: Any, z: Any, b: Any) -> Any:
+        parts = []
+        for num, tangent in zip(nums, tangents, strict=True):
+            parts.append(rule(z, tangent) if num == 1 else tangent * slope()(z, b))
+        return reduce(add, parts)
 
     rule = Rule(name, forward, vjp, jvp)
     return rule
@@ -195,7 +233,7 @@ def family(name, forward, slope, transposed):
 
 
 class Resolvent:
-    """solve(z, b): x of (1 - z L) x = b, with z >= 0 a number and b a field on the domain of L.
+    """Solves (1 - z L) x = b, with z >= 0 a number and b a field on the domain of L.
 
     Parameters
     ----------
@@ -215,40 +253,51 @@ class Resolvent:
     info : SolveLog
     """
 
-    def __init__(self, op, name, settings, most=2, log=None):
-        from sparsedp.operators.masks_and_lift import identity  # explicit schemes do without
+    def __init__(self, op: Operator, name: str, settings: dict, most: int = 2, log: SolveLog | None = None) -> None:
+        from sparsedp.operators.masks_and_lift import identity  # not needed by explicit schemes
 
-        self.op, self.name, self.settings, self._one = op, name, settings, identity(op.domain)
-        self.info, self._inverse = log or SolveLog(), lru_cache(most)(self._set_up)
+        self.op = op
+        self.name = name
+        self.settings = settings
+        self.info = log or SolveLog()
+        self._one = identity(op.domain)
+        self._inverse = lru_cache(most)(self._set_up)
 
-    def __call__(self, z, b):
+    def __call__(self, z: Any, b: Any) -> Any:
+        """Return x."""
         return solve_rule(f"{self.name}.solve", self._solved, self._back, self._product, checked=True)(b, z)
 
-    def _solved(self, transposed, checked, b, z):
+    def _solved(self, transposed: bool, checked: bool, b: Any, z: Any) -> Any:
         if z == 0:
             note(f"{self.name}.solve", "skipped", "dt or coefficient 0, no solve and no set-up")
             return self._one.apply(b)  # whole numbers become floating ones
-        inv = self._inverse(float(z))
-        return (inv.T if transposed else inv if checked else inv.tangent).apply(b)
+        inverse = self._inverse(float(z))
+        if transposed:
+            return inverse.T.apply(b)
+        return inverse.apply(b) if checked else inverse.tangent.apply(b)
 
-    def _back(self, params, places, y, x):
+    def _back(self, params: Sequence, places: Any, y: Any, x: Any) -> list:
         return [of_argument(anp.sum(y * self.op(x)), params[0])]
 
-    def _product(self, transposed, x, z):
-        return x - z * (self.op.T if transposed else self.op)(x)
+    def _product(self, transposed: bool, x: Any, z: Any) -> Any:
+        op = self.op.T if transposed else self.op
+        return x - z * op(x)
 
-    def _set_up(self, z):
-        """The inverse of 1 - z L."""
-        inv, P = build(self._one - z * self.op, name=self.name, log=self.info, **self.settings), self._moving
-        self._check_sign(inv.structure.solver.system)
-        return inv if P is None else self._named(((P @ inv - self._one) @ P + self._one).structure)
+    def _set_up(self, z: float) -> Operator:
+        """Return the inverse of 1 - z L."""
+        inverse = build(self._one - z * self.op, name=self.name, log=self.info, **self.settings)
+        self._check_sign(inverse.structure.solver.system)
+        P = self._projection
+        if P is None:
+            return inverse
+        return self._named(((P @ inverse - self._one) @ P + self._one).structure)
 
-    def _check_sign(self, system):
-        """Refuse an L under which something grows as fast as 1 / z or faster: a step would turn its sign."""
+    def _check_sign(self, system: Any) -> None:
+        """Refuse an L under which a field grows as fast as 1 / z or faster: a step would change its sign."""
         if system.complex or not system.symmetric:
             return
         x = system.masked(np.random.default_rng(system.seed).standard_normal(system.local_size))
-        for _ in range(8):  # towards what changes fastest
+        for _ in range(8):  # towards the field that changes fastest
             change = x - system.masked(system.applied(x))  # z L x
             if system.total(x @ (system.weights * (x - change))) < 0:
                 raise UnstableStepError(
@@ -257,12 +306,12 @@ class Resolvent:
                 )
             x = change / (system.largest(change) or 1.0)
 
-    def _named(self, structure):
+    def _named(self, structure: Any) -> Operator:
         return Operator(structure, self.op.domain, self.op.domain, self.name)
 
     @cached_property
-    def _moving(self):
-        """Projection from what L leaves as it is; None where that is nothing, or L unsymmetric."""
+    def _projection(self) -> Operator | None:
+        """Return the projection along the null space of L; None where there is none, or L is unsymmetric."""
         system = self.op.backend.implementation(System)(self.op, self.settings["rtol"], None)
         if not self.op.structure.has_entries or system.complex or system.weights is None:
             return None
@@ -278,35 +327,35 @@ C = 1 / (G * (2 - G))
 E = 1 - 1 / (2 * D)
 
 
-def backward_euler(stages, u, params, t, h):
+def backward_euler(stages: Stages, u: Any, params: Any, t: Any, h: Any) -> Any:
     """Order 1, L-stable."""
     return stages.solve(u, u, params, later(t, h), h)
 
 
-def crank_nicolson(stages, u, params, t, h):
-    """Order 2, A-stable: what is stiff keeps its size and changes its sign (it rings)."""
+def crank_nicolson(stages: Stages, u: Any, params: Any, t: Any, h: Any) -> Any:
+    """Order 2, A-stable: stiff components keep their size and change their sign (they ring)."""
     return stages.trapezium(u, params, t, h)
 
 
-def tr_bdf2(stages, u, params, t, h):
+def tr_bdf2(stages: Stages, u: Any, params: Any, t: Any, h: Any) -> Any:
     """Order 2, L-stable."""
     y = stages.trapezium(u, params, t, G * h)
     return stages.solve(y, combine(u, (C, combine(y, (-1.0, u)))), params, later(t, h), D * h)
 
 
-def imex(stages, u, params, t, h):
+def imex(stages: Stages, u: Any, params: Any, t: Any, h: Any) -> Any:
     """Order 2: the rate explicit, operator and source implicit (L-stable)."""
 
-    def ahead(*pairs):
-        """u and the multiples of rates, where there is a rate."""
+    def advanced(*pairs: tuple) -> Any:
+        """Return u plus the multiples of rates, where there is a rate."""
         return combine(u, *(pair for pair in pairs if pair[1] is not None))
 
     first = stages.problem.rate_value(u, params, t)
-    b = ahead((D * h, first))
+    b = advanced((D * h, first))
     x = stages.solve(u, b, params, later(t, D * h), D * h)
     second = stages.problem.rate_value(x, params, later(t, D * h))
     moved = combine(x, (-1.0, b))  # d (z L x + h s)
-    b = ahead((E * h, first), ((1 - E) * h, second), ((1 - D) / D, moved))
+    b = advanced((E * h, first), ((1 - E) * h, second), ((1 - D) / D, moved))
     return stages.solve(x, b, params, later(t, h), D * h)
 
 
@@ -321,11 +370,15 @@ IMPLICIT = {
 class Stages(Scheme):
     """An implicit step by its stages, solve and trapezium."""
 
-    def __init__(self, problem, name):
+    solve: Callable
+    trapezium: Callable
+
+    def __init__(self, problem: Problem, name: str) -> None:
         self.advance, order = IMPLICIT[name]
         super().__init__(problem, name, order)
 
-    def __call__(self, u, params, t, h):
+    def __call__(self, u: Any, params: Any, t: Any, h: Any) -> Any:
+        """Return the state after a step."""
         return self.advance(self, u, params, t, h)
 
 
@@ -343,25 +396,29 @@ class Linear(Stages):
 
     dyadic = True
 
-    def __init__(self, problem, name, settings, most):
+    def __init__(self, problem: Problem, name: str, settings: dict, most: int) -> None:
         super().__init__(problem, name)
-        self.info, most, name = SolveLog(), most * len(problem.stiff), f"stepper({name})"
-        self.resolvents = {op: Resolvent(op, name, settings, most, self.info) for op in problem.operators}
+        self.info = SolveLog()
+        self.resolvents = {}
+        for op in problem.operators:
+            self.resolvents[op] = Resolvent(op, f"stepper({name})", settings, most * len(problem.stiff), self.info)
 
-    def _resolved(self, h, params, b, *shares):
-        """(1 - h c L)^-1 (b + the sum of factor * s(t) over pairs (factor, t)), field by field."""
+    def _resolved(self, h: Any, params: Any, b: Any, *shares: tuple) -> Any:
+        """Return (1 - h c L)^-1 (b + the sum of factor * s(t) over pairs (factor, t)), field by field."""
         if self.problem.source is not None:
             b = combine(b, *((factor, self.problem.source_value(params, t)) for factor, t in shares))
-        return self.problem.on_fields(
-            lambda L, z, leaf: leaf if L is None else self.resolvents[L](z, leaf), h, params, b
-        )
 
-    def solve(self, guess, b, params, t, h):
-        """x of x = b + h (c L x + s(t))."""
+        def solved(op: Operator | None, z: Any, leaf: Any) -> Any:
+            return leaf if op is None else self.resolvents[op](z, leaf)
+
+        return self.problem.on_fields(solved, h, params, b)
+
+    def solve(self, guess: Any, b: Any, params: Any, t: Any, h: Any) -> Any:
+        """Return x of x = b + h (c L x + s(t))."""
         return self._resolved(h, params, b, (h, t))
 
-    def trapezium(self, u, params, t, h):
-        """x of x = u + h/2 (f(u, t) + f(x, t + h))."""
+    def trapezium(self, u: Any, params: Any, t: Any, h: Any) -> Any:
+        """Return x of x = u + h/2 (f(u, t) + f(x, t + h))."""
         w = self._resolved(0.5 * h, params, u, *((0.25 * h, at) for at in (t, later(t, h))))
         return combine(w, (1.0, w), (-1.0, u))
 
@@ -380,49 +437,52 @@ class Nonlinear(Stages):
         As `Resolvent` takes them.
     """
 
-    def __init__(self, problem, name, jacobian, settings):
+    def __init__(self, problem: Problem, name: str, jacobian: Callable | None, settings: dict) -> None:
         super().__init__(problem, name)
-        given = (settings | settings["options"]).items()
-        newton = {word: value for word, value in given if word != "options" and value is not None}
+        options = (settings | settings["options"]).items()
+        options = {word: value for word, value in options if word != "options" and value is not None}
 
-        def residual(x, b, h, params, t):
+        def residual(x: Any, b: Any, h: Any, params: Any, t: Any) -> Any:
             return combine(x, (-1.0, b), (-h, problem(x, params, t)))
 
         residual.__name__ = name
-        self.root = implicit(residual, jacobian and shifted(jacobian, problem.timed), **newton)
+        derivative = None if jacobian is None else residual_jacobian(jacobian, bool(problem.timed))
+        self.root = implicit(residual, derivative, **options)
         self.info = self.root.info
 
-    def __call__(self, u, params, t, h):
+    def __call__(self, u: Any, params: Any, t: Any, h: Any) -> Any:
+        """Return the state after a step."""
         # The stages share a Jacobian while that is good enough; none outlives the step.
         with self.root.series():
             return super().__call__(u, params, t, h)
 
-    def solve(self, guess, b, params, t, h):
-        """x of x = b + h f(x, t)."""
+    def solve(self, guess: Any, b: Any, params: Any, t: Any, h: Any) -> Any:
+        """Return x of x = b + h f(x, t)."""
         try:
             return self.root(untraced(guess), b, h, params, t)
         except ConvergenceError as error:  # often there is no root: a quadratic rate may leave none for a large dt
             error.args = f"{error}; take a smaller dt, or give stepper a tolerance", *error.args[1:]
             raise
 
-    def trapezium(self, u, params, t, h):
-        """x of x = u + h/2 (f(u, t) + f(x, t + h))."""
+    def trapezium(self, u: Any, params: Any, t: Any, h: Any) -> Any:
+        """Return x of x = u + h/2 (f(u, t) + f(x, t + h))."""
         b = combine(u, (0.5 * h, self.problem(u, params, t)))
         return self.solve(u, b, params, later(t, h), 0.5 * h)
 
 
-def shifted(jacobian, timed):
-    """df/du -> the derivative 1 - h df/du of a stage's residual."""
+def residual_jacobian(jacobian: Callable, timed: bool) -> Callable:
+    """Return the derivative 1 - h df/du of a stage's residual, from the user's df/du."""
 
-    def of_residual(x, b, h, params, t):
+    def of_residual(x: Any, b: Any, h: Any, params: Any, t: Any) -> Any:
         if type(params) is Sided:
             x, t = params.side.inside(x, params.params, t)
-        J = as_matrix(jacobian(*(x, unsided(params), t)[: 2 + timed]))
+        arguments = (x, unsided(params), t) if timed else (x, unsided(params))
+        J = as_matrix(jacobian(*arguments))
         return sp.eye_array(J.shape[0]) - h * J
 
     return of_residual
 
 
-def as_matrix(J):
-    """A jacobian that was given, as a sparse matrix."""
+def as_matrix(J: Any) -> Any:
+    """Return a user's Jacobian as a sparse matrix."""
     return (J if isinstance(J, Operator) else from_matrix(J)).matrix

@@ -57,7 +57,7 @@ def run_forward(
             return run_forward(runner, plan, outputs, stored, progress)
         if is_taped:
             if i < 2:  # the first two tapes tell the memory of a step
-                size = recorder.bytes + len(start.tape[1]) * NODE_BYTES - runner.specification.state.nbytes
+                size = (recorder.bytes or 0) + len(start.tape[1]) * NODE_BYTES - runner.specification.state.nbytes
                 tape_bytes = max(size, 0)
             room -= tape_bytes
             if i == 0 and room < 0:

@@ -237,7 +237,7 @@ def test_refusals():
         step((np.ones(3), np.ones(3)))
     with pytest.raises(ValueError, match="sponge on x needs 0 to 4 cells, got 5"):
         dp.sponge(dp.Grid(4), 5, 1.0)
-    with pytest.raises(ValueError, match="speed of sponge must be > 0, got 0; give that of the fastest waves"):
+    with pytest.raises(ValueError, match="speed of sponge must be > 0, got 0; give the speed of the fastest waves"):
         dp.sponge(dp.Grid(4), 2, 0)
 
 
