@@ -218,6 +218,7 @@ def choose_method(system: System, solves: str) -> Choice:
         dimension = grid.dim
     engine = _transforms(system, dimension)
     if engine is not None:
+        system.splitting = None  # transforms solve for all unknowns
         kind = "a sum of 1-D factors" if structure.separable else "a function of a sum of 1-D factors"
         reason = f"{system.unknowns} unknowns in {dimension}-D, {kind}: transforms solve it exactly"
         return Choice("separable", reason, engine)

@@ -317,6 +317,18 @@ def test_the_choice_and_its_reason(make, method, reason):
     assert inv.method == method and reason in inv.reason and inv.reason in str(inv)
 
 
+@pytest.mark.parametrize("shape", [(31, 33), (32, 33), (11, 10, 12)])
+def test_multiples_of_the_identity(shape, rng):
+    """They are triangular, and sums of 1-D factors too."""
+    cells = dp.Grid(shape).cells
+    b = rng.standard_normal(shape)
+    for op in (dp.identity(cells), 4.0 * dp.identity(cells), dp.identity(cells) + 0.0 * dp.laplacian(cells.grid)):
+        inv = dp.inverse(op)
+        scale = op(np.ones(shape)).flat[0]
+        assert inv(b) == pytest.approx(b / scale, rel=1e-14)
+        assert inv.T(b) == pytest.approx(b / scale, rel=1e-14)
+
+
 @EVERY
 def test_vjp_run_twice_gives_identical_bits(method, rng):
     inv = dp.inverse(PROBLEMS["wind"](), method)
