@@ -137,9 +137,10 @@ class SparseReference:
     def _stage(self, u: Any, lower: Any, upper: Any, inflow: Any) -> Any:
         """Return u + dt du/dt for Courant numbers on the lower and the upper sides."""
         maps = self._maps
+        values = anp.concatenate([u, inflow])
         p_lower, m_lower = _by_direction(lower)
         p_upper, m_upper = _by_direction(upper)
-        values = anp.concatenate([u, inflow])
+        leaves = self._leaves(lower, upper, p_lower, m_upper)
         below, above = (beyond(values) for beyond in maps.beyond)
         enters = p_lower * below - m_upper * above
         if self.scheme.limiter is not None:
@@ -147,7 +148,6 @@ class SparseReference:
             ahead, behind = self._slopes(self.scheme.limiter, at_points - below, above - at_points)
             enters = enters + p_lower * maps.slope[0](ahead) + m_upper * maps.slope[1](behind)
             enters = enters - p_upper * ahead - m_lower * behind
-        leaves = self._leaves(lower, upper, p_lower, m_upper)
         return (1.0 - maps.total(leaves)) * u + maps.total(enters)
 
     def _slopes(self, limiter: Callable, a: Any, b: Any) -> tuple[Any, Any]:
