@@ -198,9 +198,15 @@ def side_of(axes, a, piece, upper, tile):
     walls = wall != ROUND
     step = (2 * upper - 1) * stride
     closed = at_end and walls
-    if at_end:
-        step *= 0 if walls else 1 - n
-    speed = axes[a, SPEED] + first + block * axes[a, EXTRA] + upper * axes[a, ON_SIDES] * (stride if walls else step)
+    if at_end and walls:
+        step = 0
+    elif at_end:
+        step *= 1 - n
+    if walls:
+        to_next_side = stride
+    else:
+        to_next_side = step
+    speed = axes[a, SPEED] + first + block * axes[a, EXTRA] + upper * axes[a, ON_SIDES] * to_next_side
     wall_value = wall + (block - line) * stride + first - begin
     column = axes[a, COLUMN] + axes[a, VARIES] * position
     shown = 1.0 - (closed and wall >= 0)
@@ -357,7 +363,10 @@ def stage(
                 ratio = dt
             else:
                 ratio = dt * table[OWN, axes[a, COLUMN]]
-            for piece in range(3 if a == len(axes) - 1 else 1):
+            pieces = 1
+            if a == len(axes) - 1:
+                pieces = 3
+            for piece in range(pieces):
                 below = side_of(axes, a, piece, int64(0), tile)  # int64: compiled for one type
                 above = side_of(axes, a, piece, int64(1), tile)
                 b = below.begin
@@ -378,11 +387,17 @@ def stage(
                     high = -ratio * speed[h + j]
                     leaves[j] += max(low, 0.0) + max(high, 0.0) - flux * (low + high)
                     enters[j] += max(low, 0.0) * (below.shown * u[i + j]) + max(high, 0.0) * (above.shown * u[k + j])
-                for upper in range(2 if slopes.size or below.shown * above.shown == 0.0 else 0):
+                sides = 0
+                if slopes.size or below.shown * above.shown == 0.0:
+                    sides = 2
+                for upper in range(sides):
                     if upper:
-                        (_, _, i, _, wall, _, inner, shown), m, sign = (above, h, -ratio)
+                        _, _, i, _, wall, _, inner, shown = above
+                        m = h
+                        sign = -ratio
                     else:
-                        (_, _, i, _, wall, _, inner, shown), m, sign = (below, m, ratio)
+                        _, _, i, _, wall, _, inner, shown = below
+                        sign = ratio
                     if not shown:
                         for j in range(b, e):
                             enters[j] += max(sign * speed[m + j], 0.0) * inflow[wall + j]
@@ -453,7 +468,10 @@ def vjp(
                 ratio = dt
             else:
                 ratio = dt * table[OWN, axes[a, COLUMN]]
-            for piece in range(3 if a == len(axes) - 1 else 1):
+            pieces = 1
+            if a == len(axes) - 1:
+                pieces = 3
+            for piece in range(pieces):
                 below = side_of(axes, a, piece, int64(0), tile)
                 above = side_of(axes, a, piece, int64(1), tile)
                 b = below.begin
@@ -495,9 +513,11 @@ def vjp(
                         field[j] += more - less
                 for upper in range(2):
                     if upper:
-                        (_, _, _, m, wall, _, inner, shown), sign = (above, -1.0)
+                        _, _, _, m, wall, _, inner, shown = above
+                        sign = -1.0
                     else:
-                        (_, _, _, m, wall, _, inner, shown), sign = (below, 1.0)
+                        _, _, _, m, wall, _, inner, shown = below
+                        sign = 1.0
                     if upper:
                         x = y
                         i = k
@@ -549,7 +569,10 @@ def slope_vjp(
     for part in range(start, stop):
         tile = _, _, _, c, _ = tile_of(axes, part)
         for a in range(len(axes)):
-            for number in range(6 if a == len(axes) - 1 else 2):
+            sides = 2
+            if a == len(axes) - 1:
+                sides = 6
+            for number in range(sides):
                 upper = number % 2
                 sign = 1.0 - 2.0 * (number % 2)
                 b, e, i, _, wall, _, inner, shown = side_of(axes, a, number // 2, upper, tile)
@@ -577,7 +600,10 @@ def _slopes(u, inflow, free, table, axes, slopes, partials, start, stop):
     for part in range(start, stop):
         tile = _, _, _, c, size = tile_of(axes, part)
         for a in range(len(axes)):
-            for number in range(6 if a == len(axes) - 1 else 2):
+            sides = 2
+            if a == len(axes) - 1:
+                sides = 6
+            for number in range(sides):
                 upper = number % 2
                 sign = 1.0 - 2.0 * (number % 2)
                 side = side_of(axes, a, number // 2, upper, tile)

@@ -136,7 +136,10 @@ def interpolate(
                         value[j] += a[j] * one + b[j] * two
                         if slopes:
                             slope[j] += c[j] * one + d[j] * two
-                for m in range(1, 3 if 0 < i < 3 and 0 < k < 3 else 1):
+                corner_end = 1
+                if 0 < i < 3 and 0 < k < 3:  # samples of the cell itself
+                    corner_end = 3
+                for m in range(1, corner_end):
                     line = near[m:]
                     for j in range(least.size):
                         sample = line[np.uint64(first[j])]

@@ -55,28 +55,43 @@ def kronecker_sum(
         line = cells[row]
         result = totals[row]
         # Where there is no neighbour, the cell itself is read, times 0.
-        below1 = cells[row + (k - 1) % n1 - k if a != 0.0 else row]
-        above1 = cells[row + (k + 1) % n1 - k if b != 0.0 else row]
-        below0 = cells[(row - n1) % rows if c != 0.0 else row]
-        above0 = cells[(row + n1) % rows if d != 0.0 else row]
+        row_below1 = row
+        row_above1 = row
+        row_below0 = row
+        row_above0 = row
+        if a != 0.0:
+            row_below1 = row + (k - 1) % n1 - k
+        if b != 0.0:
+            row_above1 = row + (k + 1) % n1 - k
+        if c != 0.0:
+            row_below0 = (row - n1) % rows
+        if d != 0.0:
+            row_above0 = (row + n1) % rows
+        below1 = cells[row_below1]
+        above1 = cells[row_above1]
+        below0 = cells[row_below0]
+        above0 = cells[row_above0]
         # For uniform cells three numbers replace three rows that would fill the cache; in 2-D there is nothing to read
-        # along axis 0. Three loops without a branch inside, because the compiler vectorises only those.
+        # along axis 0. Three loops, because the compiler vectorises loops without a branch.
         one = min(1, last)
         low = lower[one]
         mid = weight + centre[one]
         high = upper[one]
-        for j in range(1, last if uniform and n0 == 1 else 1):
-            total = mid * line[j] + (low * line[j - 1] + high * line[j + 1])
-            result[j] = total + (a * below1[j] + b * above1[j])
-        for j in range(1, last if uniform and n0 > 1 else 1):
-            total = mid * line[j] + (low * line[j - 1] + high * line[j + 1])
-            total += c * below0[j] + d * above0[j]
-            result[j] = total + (a * below1[j] + b * above1[j])
-        for j in range(1, 1 if uniform else last):
-            total = (weight + centre[j]) * line[j] + (lower[j] * line[j - 1] + upper[j] * line[j + 1])
-            if n0 > 1:
+        if uniform and n0 == 1:
+            for j in range(1, last):
+                total = mid * line[j] + (low * line[j - 1] + high * line[j + 1])
+                result[j] = total + (a * below1[j] + b * above1[j])
+        elif uniform:
+            for j in range(1, last):
+                total = mid * line[j] + (low * line[j - 1] + high * line[j + 1])
                 total += c * below0[j] + d * above0[j]
-            result[j] = total + (a * below1[j] + b * above1[j])
+                result[j] = total + (a * below1[j] + b * above1[j])
+        else:
+            for j in range(1, last):
+                total = (weight + centre[j]) * line[j] + (lower[j] * line[j - 1] + upper[j] * line[j + 1])
+                if n0 > 1:
+                    total += c * below0[j] + d * above0[j]
+                result[j] = total + (a * below1[j] + b * above1[j])
         for j in (0, last):
             total = (weight + centre[j]) * line[j] + (a * below1[j] + b * above1[j]) + (c * below0[j] + d * above0[j])
             total += lower[j] * line[(j - 1) % n] if lower[j] != 0.0 else 0.0
@@ -217,7 +232,15 @@ def through_faces(
         for j in range(n):
             result[j] = to_above[j] * carried[j] + to_below[j] * next_ones[j]
         for side in range(4):  # across rows: the face below and above in axis 1, then in axis 0
-            upper, (count, stride, line) = side % 2, (n1, 1, lines1) if side < 2 else (n0, n1, lines0)
+            upper = side % 2
+            if side < 2:
+                count = n1
+                stride = 1
+                line = lines1
+            else:
+                count = n0
+                stride = n1
+                line = lines0
             if count == 1:
                 continue
             place = row // stride % count
@@ -226,8 +249,14 @@ def through_faces(
             below_f = line[0, f]
             above_f = line[1, f]
             # Beyond a wall there is no cell: the cell itself is read, times 0.
-            low = cells[row + ((f - 1) % count - place) * stride if below_f != 0.0 else row]
-            high = cells[row + (f % count - place) * stride if above_f != 0.0 else row]
+            row_low = row
+            row_high = row
+            if below_f != 0.0:
+                row_low = row + ((f - 1) % count - place) * stride
+            if above_f != 0.0:
+                row_high = row + (f % count - place) * stride
+            low = cells[row_low]
+            high = cells[row_high]
             if side < 2:
                 faces = k1[i, f % k1.shape[1]]
             else:
