@@ -1,12 +1,15 @@
 """Differences on the staggered grid: gradient, divergence, flux, laplacian, curl, upwind."""
 
+from __future__ import annotations
+
 from functools import reduce
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.grid.boundary_conditions import check_condition, neumann, resolve
-from sparsedp.grid.grid import check_grid
+from sparsedp.grid.grid import Grid, check_grid
 from sparsedp.grid.space import Space
 from sparsedp.operators.masks_and_lift import check_solid, region_of, solid_faces
 from sparsedp.operators.operator import Operator
@@ -14,21 +17,26 @@ from sparsedp.operators.stencils import along, differences, kronecker_operator, 
 from sparsedp.operators.structure.base import Matrix
 from sparsedp.operators.structure.lazy import Mask, compose, total
 
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
 __all__ = ["curl", "divergence", "flux", "gradient", "laplacian", "upwind"]
 
 
-def gradient(grid, boundary=neumann, solid=None, solid_boundary=neumann):
-    """Cells -> faces: the slope (u[i] - u[i - 1]) / d[i] on every face.
+def gradient(
+    grid: Grid, boundary: Any = neumann, solid: ArrayLike | None = None, solid_boundary: Any = neumann
+) -> Operator:
+    """Return the gradient from cells to faces: the slope (u[i] - u[i - 1]) / d[i] on every face.
 
     Parameters
     ----------
     grid : Grid
     boundary : condition, or dict of conditions
-        Enters on the wall faces with value 0; other values enter through `lift`.
+        Applied on the wall faces with value 0; `lift` adds other values.
     solid : bool array, shape `grid.shape`, optional
         Cells that are not part of the domain. A face between two solid cells gets 0.
     solid_boundary : condition
-        Holds with value 0 on every face between a solid and an open cell.
+        Applied with value 0 on every face between a solid and an open cell.
 
     Returns
     -------
@@ -60,21 +68,22 @@ def gradient(grid, boundary=neumann, solid=None, solid_boundary=neumann):
     """
     sides = resolve(grid, boundary)
     check_condition("solid_boundary", solid_boundary)
-    slope = to_faces(grid, "gradient", lambda grid, axis: slopes(grid, axis, sides[axis]))
+    slope = to_faces("gradient", grid, [slopes(grid, axis, sides[axis]) for axis in range(grid.dim)])
     if solid is None:
         return slope
-    # The faces of solid cells are closed; there a slope from one side unless the condition is neumann.
+    # The faces of solid cells are closed; unless the condition is neumann, the slope there is one-sided.
     below, above = solid_faces(grid, check_solid(grid, solid))
     structure = compose(Mask(~(below | above)), slope.structure)
     if solid_boundary.a:
         for upper, faces in ((True, below & ~above), (False, above & ~below)):
-            side = to_faces(grid, "gradient", one_sided, upper, solid_boundary)
+            factors = [one_sided(grid, axis, upper, solid_boundary) for axis in range(grid.dim)]
+            side = to_faces("gradient", grid, factors)
             structure = total(structure, compose(Mask(faces), side.structure))
     return Operator(structure, grid.cells, grid.faces, "gradient")
 
 
-def divergence(grid):
-    """Faces -> cells: the net outflow per volume, sum over axes of (v[i + 1] - v[i]) / h[i].
+def divergence(grid: Grid) -> Operator:
+    """Return the divergence from faces to cells: the net outflow per volume, sum of (v[i + 1] - v[i]) / h[i].
 
     Parameters
     ----------
@@ -106,8 +115,8 @@ def divergence(grid):
     return kronecker_operator(grid.faces, grid.cells, blocks, "divergence")
 
 
-def flux(grid, cells):
-    """Faces -> number: what flows out of a box through its sides, per time.
+def flux(grid: Grid, cells: Any) -> Operator:
+    """Return the outflow through the sides of a box per time, from a face field to a number.
 
     Parameters
     ----------
@@ -149,8 +158,10 @@ def flux(grid, cells):
     return Operator(Matrix(sp.csr_array(row[None])), grid.faces, Space(()), "flux")
 
 
-def laplacian(grid, boundary=neumann, solid=None, solid_boundary=neumann):
-    """Cells -> cells: divergence(grid) @ gradient(grid, boundary, solid, solid_boundary).
+def laplacian(
+    grid: Grid, boundary: Any = neumann, solid: ArrayLike | None = None, solid_boundary: Any = neumann
+) -> Operator:
+    """Return the Laplacian on cells, divergence(grid) @ gradient(grid, boundary, solid, solid_boundary).
 
     Parameters
     ----------
@@ -172,8 +183,8 @@ def laplacian(grid, boundary=neumann, solid=None, solid_boundary=neumann):
     Notes
     -----
     Order 2 inside; next to a wall the truncation error is of order 1 (neumann) or 0 (dirichlet),
-    yet solutions are of order 2. The values in solid cells do not matter; what it gives there is the
-    flux into the solid, and solves leave these cells out.
+    yet solutions are of order 2. The values in solid cells do not matter; the result there is the
+    flux into the solid, and solves skip these cells.
 
     Examples
     --------
@@ -187,8 +198,8 @@ def laplacian(grid, boundary=neumann, solid=None, solid_boundary=neumann):
     return Operator(product.structure, grid.cells, grid.cells, "laplacian")
 
 
-def curl(grid):
-    """Nodes -> faces in 2-D (stream function), edges -> faces in 3-D; its divergence is 0 exactly.
+def curl(grid: Grid) -> Operator:
+    """Return the curl from nodes (a stream function, 2-D) or edges (3-D) to faces; its divergence is exactly 0.
 
     Parameters
     ----------
@@ -199,7 +210,7 @@ def curl(grid):
     -------
     Operator
         in: nodes or edges [unit]; out: faces [unit / length]. In 2-D v_x = d psi/dy, v_y = -d psi/dx, with psi of
-        the shape ``grid.nodes.shape``: one node more than cells along an axis, as many along a periodic one.
+        the shape ``grid.nodes.shape``: n + 1 nodes along an axis of n cells, n along a periodic one.
 
     Raises
     ------
@@ -228,8 +239,8 @@ def curl(grid):
     return kronecker_operator(grid.edges, grid.faces, blocks, "curl")
 
 
-def upwind(grid, axis=0, direction=1, boundary=neumann):
-    """Cells -> cells: the one-sided slope on the side that the wind comes from.
+def upwind(grid: Grid, axis: int | str = 0, direction: int = 1, boundary: Any = neumann) -> Operator:
+    """Return the one-sided slope on cells, on the side that the wind comes from.
 
     Parameters
     ----------
@@ -238,7 +249,7 @@ def upwind(grid, axis=0, direction=1, boundary=neumann):
     direction : 1 or -1
         Sign of the velocity: 1 takes (u[i] - u[i - 1]) / d, -1 takes (u[i + 1] - u[i]) / d.
     boundary : condition, or dict of conditions
-        Says what the slope on a wall face is. Values on the walls enter by `lift`, see its example.
+        Defines the slope on wall faces. Values on the walls are added by `lift`: see its example.
 
     Returns
     -------
@@ -269,7 +280,7 @@ def upwind(grid, axis=0, direction=1, boundary=neumann):
     array([-0.125, -0.25 , -1.   ])
     """
     check_grid("upwind", grid)
-    axis = grid.axis(axis)
+    number = grid.axis(axis)
     if np.ndim(direction) > 0:
         raise ValueError(
             f"upwind needs direction 1 or -1, got an array of shape {np.shape(direction)}; for a wind w write "
@@ -277,6 +288,6 @@ def upwind(grid, axis=0, direction=1, boundary=neumann):
         )
     if direction not in (1, -1):
         raise ValueError(f"upwind needs direction 1 or -1, got {direction!r}")
-    sides = resolve(grid, boundary)[axis]
-    factor = pick(grid, axis, direction == -1) @ slopes(grid, axis, sides)
-    return kronecker_operator(grid.cells, grid.cells, {(0, 0): along(axis, grid.dim, factor)}, "upwind")
+    sides = resolve(grid, boundary)[number]
+    factor = pick(grid, number, direction == -1) @ slopes(grid, number, sides)
+    return kronecker_operator(grid.cells, grid.cells, {(0, 0): along(number, grid.dim, factor)}, "upwind")

@@ -1,4 +1,4 @@
-"""The harmonic average of a coefficient: nonlinear, so a rule and not an Operator.
+"""The harmonic average of a coefficient: nonlinear, therefore a differentiable rule and not an Operator.
 
 On the face between cells l and r, with the shares w_l = h_l / (h_l + h_r), w_r = 1 - w_l:
 
@@ -8,6 +8,10 @@ This is the flux-exact conductivity of two layers in series (Patankar, Numerical
 Fluid Flow, 1980). Where both are 0 the ratios are taken as 1, their value on k_l = k_r.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
+
 import autograd.numpy as anp
 import numpy as np
 
@@ -16,14 +20,14 @@ from sparsedp._utils.validation import check_finite, check_kind, check_native, c
 from sparsedp.autodiff.backend import as_field
 from sparsedp.autodiff.derivative import entrywise
 from sparsedp.autodiff.tape import plain
-from sparsedp.grid.grid import check_grid
+from sparsedp.grid.grid import Grid, check_grid
 from sparsedp.operators.stencils import cell_beside, to_faces
 
 __all__ = ["harmonic_average"]
 
 
-def harmonic_average(grid):
-    """Grid -> function from a cell coefficient to its harmonic average on faces, differentiable.
+def harmonic_average(grid: Grid) -> Callable:
+    """Return the function from a cell coefficient to its harmonic average on faces, differentiable.
 
     Parameters
     ----------
@@ -49,10 +53,12 @@ def harmonic_average(grid):
     --------
     >>> from sparsedp import Grid
     >>> harmonic_average(Grid(2))(np.array([1.0, 3.0]))
-    as_field([1. , 1.5, 3. ])
+    array([1. , 1.5, 3. ])
     """
     check_grid("harmonic_average", grid)
-    below, above = to_faces(grid, "cell below", cell_beside, False), to_faces(grid, "cell above", cell_beside, True)
+    axes = range(grid.dim)
+    below = to_faces("cell below", grid, [cell_beside(grid, axis, False) for axis in axes])
+    above = to_faces("cell above", grid, [cell_beside(grid, axis, True) for axis in axes])
     pair = _pair_rule(grid.join(*(_lower_share(grid, axis) for axis in range(grid.dim))))
 
     def average(k):
@@ -69,13 +75,16 @@ def harmonic_average(grid):
 
 
 def _lower_share(grid, axis):
-    """The module's w_l of the faces across an axis, as it broadcasts."""
-    low, high = (cell_beside(grid, axis, upper).matrix @ grid.widths[axis] for upper in (False, True))
-    return (low / (low + high)).reshape([-1 if a == axis else 1 for a in range(grid.dim)])
+    """Return w_l of the module on the faces across an axis, in a shape that broadcasts."""
+    low = cell_beside(grid, axis, False).matrix @ grid.widths[axis]
+    high = cell_beside(grid, axis, True).matrix @ grid.widths[axis]
+    shape = [1] * grid.dim
+    shape[axis] = -1
+    return (low / (low + high)).reshape(shape)
 
 
 def _pair_rule(share):
-    """The rule of the module's formula, for fixed shares of the lower cell."""
+    """Return the differentiable rule of the formula of the module, for fixed shares of the lower cell."""
 
     def ratios(low, high):
         total = share * high + (1 - share) * low

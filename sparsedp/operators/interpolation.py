@@ -1,16 +1,25 @@
 """Linear interpolation between cell centres along one axis. Used by sample and prolong."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from sparsedp._utils.validation import EPS, number_beside
 
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from sparsedp.grid.grid import Grid
+
 __all__ = ["linear_weights"]
 
 
-def linear_weights(grid, axis, x):
-    """Coordinates along an axis -> (lower cell, upper cell, weight of the upper one).
+def linear_weights(grid: Grid, axis: int, x: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Return the cells between which coordinates along an axis are, and the weight of the upper one.
 
-    Between a wall and the first centre the line through the two nearest centres goes on, so linear
+    Between a wall and the first centre the line through the two nearest centres is continued, so linear
     fields are reproduced up to the wall. An axis of one cell is constant.
 
     Parameters
@@ -20,14 +29,23 @@ def linear_weights(grid, axis, x):
     x : array, shape (m,) [length]
         Finite.
 
+    Returns
+    -------
+    lower, upper : int arrays, shape (m,)
+    weight : array, shape (m,)
+        Of the upper cell.
+
     Raises
     ------
     ValueError
         If a coordinate lies outside a bounded axis.
     """
-    n, start, extent, periodic = grid.shape[axis], grid.origin[axis], grid.size[axis], grid.periodic[axis]
-    slack = 8 * EPS * (abs(start) + extent)
-    outside = (x < start - slack) | (x > start + extent + slack)
+    n = grid.shape[axis]
+    start = grid.origin[axis]
+    extent = grid.size[axis]
+    periodic = grid.periodic[axis]
+    rounding = 8 * EPS * (abs(start) + extent)
+    outside = (x < start - rounding) | (x > start + extent + rounding)
     if not periodic and np.any(outside):
         name = grid.axes[axis]
         got = number_beside(x[outside][0], start, start + extent)

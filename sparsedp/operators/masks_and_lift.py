@@ -1,23 +1,30 @@
 """Walls, obstacles and pointwise factors: lift, mask, interior, identity, diagonal."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 
 from sparsedp._utils.validation import check_finite, check_kind, check_on, check_plain, check_type
 from sparsedp.autodiff.tape import isbox
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.grid.boundary_conditions import resolve
-from sparsedp.grid.grid import check_grid
+from sparsedp.grid.grid import Grid, check_grid
 from sparsedp.grid.space import Space
 from sparsedp.operators.operator import Operator
 from sparsedp.operators.stencils import along, kronecker_operator, wall_slopes
 from sparsedp.operators.structure.kronecker import Kronecker
 from sparsedp.operators.structure.lazy import Diagonal, Mask
 
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
 __all__ = ["diagonal", "identity", "interior", "lift", "mask"]
 
 
-def lift(grid, boundary):
-    """Boundary values -> faces: what inhomogeneous values add to the gradient, G(u) + B(values).
+def lift(grid: Grid, boundary: Any) -> Operator:
+    """Return the part B of a gradient on faces that depends on the boundary values: G(u) + B(values).
 
     Parameters
     ----------
@@ -49,7 +56,7 @@ def lift(grid, boundary):
     >>> lift(Grid(3), dirichlet)(np.array([1.0, 5.0]))
     array([-2.,  0.,  0., 10.])
 
-    With `upwind`, whose slope in a cell is that of its face on the side of the wind, the wall value enters through
+    With `upwind`, whose slope in a cell is taken from its face on the side of the wind, the wall value is added through
     these faces. Here du/dx = 1 with u = 2 at the lower end:
 
     >>> from sparsedp import inverse, neumann, upwind
@@ -69,8 +76,8 @@ def lift(grid, boundary):
     return kronecker_operator(walls, grid.faces, blocks, "lift")
 
 
-def mask(space, keep):
-    """Space -> the same space: the field where `keep` is true, exactly 0 elsewhere.
+def mask(space: Space, keep: ArrayLike) -> Operator:
+    """Return the operator that keeps a field where `keep` is true, and is exactly 0 elsewhere.
 
     Parameters
     ----------
@@ -98,8 +105,8 @@ def mask(space, keep):
     return Operator(Mask(_boolean(keep, space, "keep")), space, space, "mask")
 
 
-def interior(grid, solid=None):
-    """Faces -> faces: 0 on walls and on faces that touch a solid cell, unchanged elsewhere.
+def interior(grid: Grid, solid: ArrayLike | None = None) -> Operator:
+    """Return the operator on faces that is 0 on walls and on faces of solid cells, and the identity elsewhere.
 
     Parameters
     ----------
@@ -126,8 +133,8 @@ def interior(grid, solid=None):
     return Operator(Mask(below & above), grid.faces, grid.faces, "interior")
 
 
-def identity(space):
-    """Space -> the same space: a fresh copy of the field.
+def identity(space: Space) -> Operator:
+    """Return the identity on a space; its result is a new array.
 
     Parameters
     ----------
@@ -153,8 +160,8 @@ def identity(space):
     return Operator(Kronecker.identity(parts), space, space, "identity")
 
 
-def diagonal(space, values):
-    """Space -> the same space: pointwise multiplication by constant values.
+def diagonal(space: Space, values: ArrayLike) -> Operator:
+    """Return pointwise multiplication by constant values.
 
     Parameters
     ----------
@@ -200,15 +207,19 @@ def diagonal(space, values):
 
 
 def _check_space(space, name):
+    """Raise TypeError if an argument is not a Space."""
     check_type(name, space, Space, "a Space", "grid.cells or grid.faces")
 
 
-def check_solid(grid, solid):
-    """Solid argument -> boolean array of the shape of the grid, False everywhere for None."""
-    return np.zeros(grid.shape, bool) if solid is None else _boolean(solid, grid.cells, "solid")
+def check_solid(grid: Grid, solid: ArrayLike | None) -> NDArray:
+    """Return the argument `solid` as a boolean array of the shape of the grid; None is False everywhere."""
+    if solid is None:
+        return np.zeros(grid.shape, bool)
+    return _boolean(solid, grid.cells, "solid")
 
 
 def _boolean(flags, space, name):
+    """Return a boolean array on a space."""
     if isbox(flags):
         raise DerivativeError(f"{name} needs a constant boolean array, got a traced one; take it from plain numbers")
     flags = np.asarray(flags)
@@ -217,8 +228,8 @@ def _boolean(flags, space, name):
     return flags
 
 
-def region_of(grid, cells):
-    """A box of cells as slices, one for each axis, or a boolean array -> boolean array of the shape of the grid."""
+def region_of(grid: Grid, cells: Any) -> NDArray:
+    """Return a set of cells, given as one slice for each axis or as a boolean array, as a boolean array."""
     if not isinstance(cells, (slice, tuple)):
         return _boolean(cells, grid.cells, "cells")
     box = cells if isinstance(cells, tuple) else (cells,)
@@ -226,23 +237,33 @@ def region_of(grid, cells):
         raise ValueError(
             f"a box on {grid} needs one slice of cells for each axis, got {cells}; write (slice(4, 8), slice(2, 6))"
         )
-    found = np.zeros(grid.shape, dtype=bool)
-    found[box] = True
-    return found
+    region = np.zeros(grid.shape, dtype=bool)
+    region[box] = True
+    return region
 
 
 def _is_run(side):
-    """Whether it is a slice of neighbours, between whole numbers."""
-    whole = lambda end: end is None or hasattr(end, "__index__")
-    return isinstance(side, slice) and side.step in (None, 1) and whole(side.start) and whole(side.stop)
+    """Return whether an entry is a slice of consecutive cells, between integers."""
+    if not isinstance(side, slice) or side.step not in (None, 1):
+        return False
+    return all(end is None or hasattr(end, "__index__") for end in (side.start, side.stop))
 
 
-def solid_faces(grid, solid):
-    """Cell mask, of a solid or of what is none -> two flat face masks: the cell below the face is in it, that above is.
+def solid_faces(grid: Grid, solid: NDArray) -> tuple[NDArray, NDArray]:
+    """Return for each face whether the cell below, and whether the cell above, is in a set of cells.
 
-    Beyond a wall there is no cell.
+    Parameters
+    ----------
+    grid : Grid
+    solid : bool array, shape `grid.shape`
+
+    Returns
+    -------
+    below, above : bool arrays, shape (faces.size,)
+        False beyond a wall, where there is no cell.
     """
-    below, above = [], []
+    below = []
+    above = []
     for axis in range(grid.dim):
         if grid.periodic[axis]:
             below.append(np.roll(solid, 1, axis).ravel())

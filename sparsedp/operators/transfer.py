@@ -1,6 +1,9 @@
-"""From one place to another: average, sample, restrict, prolong, component."""
+"""Operators between places of a grid: average, sample, restrict, prolong, component."""
+
+from __future__ import annotations
 
 from itertools import product
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -17,17 +20,22 @@ from sparsedp.operators.structure.base import Matrix
 from sparsedp.operators.structure.factor import Factor
 from sparsedp.operators.structure.kronecker import Term
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import ArrayLike
+
 __all__ = ["average", "component", "prolong", "restrict", "sample"]
 
 
-def average(grid, boundary=neumann):
-    """Cells -> faces: linear interpolation between the two cells of a face.
+def average(grid: Grid, boundary: Any = neumann) -> Operator:
+    """Return linear interpolation from cells to faces, between the two cells of a face.
 
     Parameters
     ----------
     grid : Grid
     boundary : condition, or dict of conditions
-        At a wall: the value that the condition with value 0 implies (neumann: that of the cell).
+        At a wall: the value that the condition with value 0 implies (neumann: the value of the cell).
 
     Returns
     -------
@@ -37,7 +45,7 @@ def average(grid, boundary=neumann):
     Raises
     ------
     TypeError
-        If `grid` is no Grid, or a condition none that is known.
+        If `grid` is no Grid, or a condition is no Condition.
     ValueError
         If `boundary` names an axis that is periodic or that the grid lacks.
 
@@ -47,17 +55,17 @@ def average(grid, boundary=neumann):
     array([1. , 1.5, 3. , 4. ])
     """
     sides = resolve(grid, boundary)
-    return to_faces(grid, "average", lambda grid, axis: means(grid, axis, sides[axis]))
+    return to_faces("average", grid, [means(grid, axis, sides[axis]) for axis in range(grid.dim)])
 
 
-def sample(grid, points):
-    """Cells -> values at points, by linear interpolation between cell centres.
+def sample(grid: Grid, points: ArrayLike) -> Operator:
+    """Return the values of a cell field at points, by linear interpolation between cell centres.
 
     Parameters
     ----------
     grid : Grid
     points : array, shape (m, dim) [length]
-        One point for each row; in 1-D shape (m,) will do. Points must lie in the box; a periodic
+        One point for each row; in 1-D also of shape (m,). Points must lie in the box; a periodic
         axis takes any coordinate.
 
     Returns
@@ -80,36 +88,43 @@ def sample(grid, points):
     array([1.  , 1.75])
     """
     check_grid("sample", grid)
-    given = real_numbers(points, "points", "points=[[0.5, 1.0]]").astype(float)
-    points = given
-    if points.ndim == 1 and grid.dim == 1:
-        points = points[:, None]
-    if points.ndim != 2 or points.shape[1] != grid.dim:
-        advice = f"; write [{given.tolist()}] for one point" if given.shape == (grid.dim,) else ""
-        raise ShapeError(f"sample needs points of shape (m, {grid.dim}), got an array of shape {points.shape}{advice}")
+    values = real_numbers(points, "points", "points=[[0.5, 1.0]]").astype(float)
+    places = values
+    if values.ndim == 1 and grid.dim == 1:
+        places = values[:, None]
+    if places.ndim != 2 or places.shape[1] != grid.dim:
+        advice = ""
+        if values.shape == (grid.dim,):
+            advice = f"; write [{values.tolist()}] for one point"
+        raise ShapeError(f"sample needs points of shape (m, {grid.dim}), got an array of shape {places.shape}{advice}")
     if not grid.cells.size:
         raise ShapeError(f"sample needs a grid with cells, got {grid}")
-    check_finite("points", given, "need finite coordinates")
-    lines = [linear_weights(grid, axis, points[:, axis]) for axis in range(grid.dim)]
-    columns, values = [], []
-    for corner in product(*(((lower, 1 - weight), (upper, weight)) for lower, upper, weight in lines)):
-        cells, weights = zip(*corner)
+    check_finite("points", values, "need finite coordinates")
+    ends = []  # for each axis, the two cells around each point with their weights
+    for axis in range(grid.dim):
+        lower, upper, weight = linear_weights(grid, axis, places[:, axis])
+        ends.append(((lower, 1 - weight), (upper, weight)))
+    columns = []
+    entries = []
+    for corner in product(*ends):
+        cells = tuple(cell for cell, _ in corner)
         columns.append(np.ravel_multi_index(cells, grid.shape))
-        values.append(np.prod(weights, axis=0))
-    rows = np.broadcast_to(np.arange(len(points)), np.shape(values))
-    matrix = sp.coo_array((np.ravel(values), (np.ravel(rows), np.ravel(columns))), (len(points), grid.cells.size))
-    return Operator(Matrix(matrix), grid.cells, Space(len(points)), "sample")
+        entries.append(np.prod([weight for _, weight in corner], axis=0))
+    count = len(places)
+    rows = np.broadcast_to(np.arange(count), np.shape(entries))
+    matrix = sp.coo_array((np.ravel(entries), (np.ravel(rows), np.ravel(columns))), (count, grid.cells.size))
+    return Operator(Matrix(matrix), grid.cells, Space(count), "sample")
 
 
-def restrict(grid, factor):
-    """Cells -> cells of a coarser grid: the mean over each block, weighted by volume.
+def restrict(grid: Grid, factor: int | Sequence[int]) -> Operator:
+    """Return the mean over blocks of cells, weighted by volume, from cells to cells of a coarser grid.
 
     Parameters
     ----------
     grid : Grid
         The fine grid.
     factor : int or tuple of int
-        How many cells of each axis become one; must divide the shape.
+        Number of cells along each axis that form one coarse cell; must divide the shape.
 
     Returns
     -------
@@ -136,18 +151,18 @@ def restrict(grid, factor):
     return kronecker_operator(grid.cells, coarse.cells, {(0, 0): (Term(1.0, tuple(lines)),)}, "restrict")
 
 
-def prolong(grid, factor, interpolation="constant"):
-    """Cells of a coarser grid -> cells: the way back of `restrict`.
+def prolong(grid: Grid, factor: int | Sequence[int], interpolation: str = "constant") -> Operator:
+    """Return interpolation from cells of a coarser grid to cells, the counterpart of `restrict`.
 
     Parameters
     ----------
     grid : Grid
         The fine grid.
     factor : int or tuple of int
-        How many cells of each axis become one; must divide the shape.
+        Number of cells along each axis that form one coarse cell; must divide the shape.
     interpolation : "constant" or "linear"
-        constant: each block takes the coarse value; restrict @ prolong is the identity, and the
-        integral is conserved. linear: order 2, linear fields exact.
+        constant: each block has the coarse value; restrict @ prolong is the identity, and the
+        integral is conserved. linear: order 2, exact for linear fields.
 
     Returns
     -------
@@ -184,9 +199,10 @@ def prolong(grid, factor, interpolation="constant"):
 
 
 def _coarse(grid, factor):
+    """Return a coarser grid, and the number of cells of each axis that form one of its cells."""
     factors = per_axis(factor, grid.shape, "factor")
-    whole = all(is_whole(f, 1) and np.asarray(f).dtype.kind in "iu" for f in factors)
-    if not whole or any(n % f for n, f in zip(grid.shape, factors, strict=True)):
+    are_positive_integers = all(is_whole(f, 1) and np.asarray(f).dtype.kind in "iu" for f in factors)
+    if not are_positive_integers or any(n % f for n, f in zip(grid.shape, factors, strict=True)):
         raise ShapeError(f"a factor must be a whole number >= 1 that divides {grid.shape}, got {factor}")
     spacing = [h.reshape(-1, f).sum(axis=1) for h, f in zip(grid.widths, factors, strict=True)]
     shape = tuple(n // f for n, f in zip(grid.shape, factors, strict=True))
@@ -194,8 +210,8 @@ def _coarse(grid, factor):
     return grid.backend.place(coarse), factors
 
 
-def component(grid, axis):
-    """Faces -> one component of the face field, in its own shape. Its transpose puts it back among zeros.
+def component(grid: Grid, axis: int | str) -> Operator:
+    """Return one component of a face field in its own shape; the transpose sets the other components to 0.
 
     Parameters
     ----------
@@ -220,6 +236,6 @@ def component(grid, axis):
     array([1., 2., 0., 0.])
     """
     check_grid("component", grid)
-    axis = grid.axis(axis)
-    own = grid.faces.component(axis)
-    return kronecker_operator(grid.faces, own, {(0, axis): along(axis, grid.dim, None)}, "component")
+    number = grid.axis(axis)
+    blocks = {(0, number): along(number, grid.dim, None)}
+    return kronecker_operator(grid.faces, grid.faces.component(number), blocks, "component")
