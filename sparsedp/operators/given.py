@@ -1,6 +1,10 @@
-"""Operators that the user brings: a matrix, a LinearOperator, or two functions."""
+"""Operators from a matrix, a LinearOperator, or two functions."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -19,17 +23,20 @@ from sparsedp.operators.operator import Operator
 from sparsedp.operators.structure.base import Matrix
 from sparsedp.operators.structure.lazy import Functions
 
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, DTypeLike
+
 __all__ = ["check_operator", "from_functions", "from_linear_operator", "from_matrix"]
 
 
-def check_operator(name, op):
-    """Refuse what is no Operator."""
+def check_operator(name: str, op: Any) -> None:
+    """Raise TypeError if an argument is not an Operator, or a function does not support where its fields are stored."""
     check_type(name, op, Operator, "an Operator", "dp.from_matrix(...) first")
     op.backend.check(name)
 
 
-def from_matrix(matrix, domain=None, codomain=None, name="matrix"):
-    """Matrix -> Operator in explicit form.
+def from_matrix(matrix: ArrayLike, domain: Any = None, codomain: Any = None, name: str = "matrix") -> Operator:
+    """Return an Operator in explicit form from its matrix.
 
     Parameters
     ----------
@@ -62,7 +69,7 @@ def from_matrix(matrix, domain=None, codomain=None, name="matrix"):
     array([1., 2.])
     """
     check_plain(name, matrix)
-    entries = matrix if sp.issparse(matrix) else _rows(name, matrix)
+    entries: Any = matrix if sp.issparse(matrix) else _rows(name, matrix)
     if entries.ndim != 2:
         raise ShapeError(
             f"{name} needs a 2-D matrix, got an array of shape {entries.shape}; write matrix[None] for a row"
@@ -71,25 +78,25 @@ def from_matrix(matrix, domain=None, codomain=None, name="matrix"):
     if is_other_precision(entries.dtype):
         entries = entries.astype(complex if entries.dtype.kind == "c" else float)
     structure = Matrix(sp.csr_array(entries, copy=True))
-    rows, columns = structure.matrix.indptr, structure.matrix.indices
-    check_finite(
-        name,
-        structure.matrix.data,
-        "needs finite entries",
-        lambda n: (int(np.searchsorted(rows, n, side="right")) - 1, int(columns[n])),
-    )
+
+    def row_and_column(number):
+        row = np.searchsorted(structure.matrix.indptr, number, side="right") - 1
+        return int(row), int(structure.matrix.indices[number])
+
+    check_finite(name, structure.matrix.data, "needs finite entries", row_and_column)
     return Operator(structure, _space(domain, structure.shape[1]), _space(codomain, structure.shape[0]), name)
 
 
 def _rows(name, matrix):
+    """Return nested lists as an array."""
     try:
         return np.asarray(matrix)
     except ValueError:
         raise ShapeError(f"{name} needs rows of one length, got a list of different ones; fill them with 0") from None
 
 
-def from_linear_operator(linop, domain=None, codomain=None, name="operator"):
-    """scipy.sparse.linalg.LinearOperator -> Operator.
+def from_linear_operator(linop: Any, domain: Any = None, codomain: Any = None, name: str = "operator") -> Operator:
+    """Return an Operator from a scipy.sparse.linalg.LinearOperator.
 
     Parameters
     ----------
@@ -123,38 +130,47 @@ def from_linear_operator(linop, domain=None, codomain=None, name="operator"):
         instead = "from_matrix" if hasattr(linop, "shape") else "from_functions"
         raise TypeError(f"from_linear_operator takes a LinearOperator, got {type(linop).__name__}; write dp.{instead}")
     rows, columns = linop.shape
-
-    forward, backward = partial(_product, linop), partial(_transposed_product, linop, name)
+    forward = partial(_product, linop)
+    backward = partial(_transposed_product, linop, name)
     structure = Functions(forward, backward, (columns,), (rows,), _kind(getattr(linop, "dtype", None)))
     return Operator(structure, _space(domain, columns), _space(codomain, rows), name)
 
 
 def _product(linop, x):
+    """Return A x."""
     return np.asarray(linop.matvec(x.reshape(-1)))
 
 
 def _transposed_product(linop, name, g):
+    """Return A^T g, from SciPy's product with the conjugate transpose."""
     try:
         return np.conj(np.asarray(linop.rmatvec(np.conj(g.reshape(-1)))))
     except (NotImplementedError, TypeError, AttributeError):
         raise DerivativeError(f"{name} has no transpose: its LinearOperator lacks rmatvec; give it one") from None
 
 
-def from_functions(forward, transpose, domain, codomain, name="operator", dtype=float):
-    """Two functions, the product and the transposed product -> Operator.
+def from_functions(
+    forward: Callable,
+    transpose: Callable | None,
+    domain: Any,
+    codomain: Any,
+    name: str = "operator",
+    dtype: DTypeLike = float,
+) -> Operator:
+    """Return an Operator from two functions, the product and the transposed product.
 
     Parameters
     ----------
     forward : callable
-        ``forward(u)``: array of shape `domain.shape` -> array of shape `codomain.shape`, linear.
+        ``forward(u)``, linear: takes an array of shape `domain.shape`, returns an array of shape `codomain.shape`.
     transpose : callable or None
         ``transpose(g)``, the plain transpose: sum(g * forward(u)) == sum(transpose(g) * u).
-        None when it is not known; then only `op(u)` works.
+        None if it is not known; then only `op(u)` works.
     domain, codomain : Space, int or tuple of int
     name : str
     dtype : float or complex
-        complex when the functions make complex values from real fields, or real ones from complex fields, as a real FFT
-        and its inverse do. The real parts of the two sums are equal then, for all complex g.
+        complex if the functions return complex values for real fields, or real ones for complex fields, as a real FFT
+        and its inverse do. Then the real parts of the two sums are equal, for all complex g.
 
     Returns
     -------
@@ -181,16 +197,21 @@ def from_functions(forward, transpose, domain, codomain, name="operator", dtype=
     check_function("from_functions", forward, "from_functions(f, t, 3, 2)")
     if transpose is not None:
         check_function("from_functions, as transpose,", transpose, "None for a missing one")
-    domain, codomain = _space(domain, None), _space(codomain, None)
+    domain = _space(domain, None)
+    codomain = _space(codomain, None)
     structure = Functions(forward, transpose, domain.shape, codomain.shape, _kind(dtype))
     return Operator(structure, domain, codomain, name)
 
 
-def _space(given, size):
-    if isinstance(given, Space):
-        return given
-    return Space(size if given is None else given)
+def _space(space, size):
+    """Return an argument `domain` or `codomain` as a Space; None is a flat space of this size."""
+    if isinstance(space, Space):
+        return space
+    return Space(size if space is None else space)
 
 
 def _kind(dtype):
-    return complex if dtype is not None and np.dtype(dtype).kind == "c" else float
+    """Return complex for complex dtypes, else float."""
+    if dtype is not None and np.dtype(dtype).kind == "c":
+        return complex
+    return float

@@ -1,9 +1,12 @@
 """Operator: a constant linear map between two spaces that knows its transpose."""
 
+from __future__ import annotations
+
 import weakref
 from functools import cached_property
 from math import prod
 from numbers import Number
+from typing import Any, NoReturn
 
 import numpy as np
 from scipy.sparse import issparse
@@ -24,27 +27,27 @@ from sparsedp.operators.structure.lazy import Diagonal, compose, times, total
 
 __all__ = ["Operator"]
 
-# Most unknowns for which one sparse product costs less than stencil passes, for each pass: see benchmarks/apply.py.
+# Up to this number of unknowns for each pass, one sparse product costs less than stencil passes: benchmarks/apply.py.
 EXPLICIT_BELOW_COMPILED = 4608
 EXPLICIT_BELOW_PLAIN = 262144
 AS_OPERATOR = "dp.from_matrix(M, A.domain, A.codomain)"  # a sparse matrix M beside an operator A
-SPY_BELOW = 20_000  # rows and columns of a matrix that a notebook draws: that takes 0.1 s
+SPY_BELOW = 20_000  # rows and columns of a matrix that a notebook draws, in 0.1 s
 
 
 class Operator(Frozen, Remade):
     """A constant linear map from fields on `domain` to fields on `codomain`. Frozen.
 
-    Make one with a builder (`gradient`, `from_matrix`, ...), combine with ``@ + - *``, apply with
-    ``op(u)``. The VJP of ``op(u)`` is ``op.T(g)``.
+    Builders such as `gradient` and `from_matrix` return operators; ``@ + - *`` combine them, ``op(u)`` applies one. The
+    VJP of ``op(u)`` is ``op.T(g)``.
 
     Parameters
     ----------
     structure : Structure
-        How it acts on flat arrays.
+        The linear map of flat arrays.
     domain, codomain : Space
     name : str
     form : "explicit" or "matrix-free", optional
-        Default: by a fixed rule, from the size, the structure and whether numba is installed.
+        Default: by a fixed rule, from the size, the structure and the presence of numba.
 
     Raises
     ------
@@ -60,7 +63,7 @@ class Operator(Frozen, Remade):
     array([2., 4., 6.])
     """
 
-    structure: Structure
+    structure: Any
     domain: Space
     codomain: Space
     name: str
@@ -78,9 +81,10 @@ class Operator(Frozen, Remade):
         "solve": "inv(b), with inv = dp.inverse(op)",
     }
     _transposed = None
-    _origin = staticmethod(lambda: None)  # what it was turned from, while that is there
 
-    def __init__(self, structure, domain, codomain, name, form=None):
+    def __init__(
+        self, structure: Structure, domain: Space, codomain: Space, name: str, form: str | None = None
+    ) -> None:
         if structure.shape != (codomain.size, domain.size):
             raise ShapeError(f"{name} maps {domain} to {codomain}, but its matrix has shape {structure.shape}")
         super().__init__(
@@ -92,32 +96,39 @@ class Operator(Frozen, Remade):
             backend=codomain.backend if domain.backend is NUMPY else domain.backend,
         )
 
-    def recipe(self):
-        """The call that makes it again: see _utils/reconstruction.py."""
-        given = self.structure, self.domain, self.codomain, self.name, self.form
+    def recipe(self) -> tuple:
+        """Return the call that builds an equal object, for pickling and copying."""
+        arguments = self.structure, self.domain, self.codomain, self.name, self.form
         if self.form == "matrix-free" or "_origin" not in self.__dict__ or isinstance(self.structure, Matrix):
-            return Operator, given
-        return _with_matrix, (self._matrix_structure, *given)  # turned from that of its origin, which stays behind
+            return Operator, arguments
+        # The matrix of a transpose has the bits of the matrix of its origin, which is not pickled.
+        return _with_matrix, (self._matrix_structure, *arguments)
 
     # ------------------------------------------------------------ application
 
-    def __call__(self, u):
-        """Apply to a field of the shape of the domain, or to a batch of them; differentiable; the result is fresh.
+    def _origin(self):
+        """Return the operator whose transpose this is, while it exists; else None. Replaced by a weak reference."""
+        return None
+
+    def __call__(self, u: Any) -> Any:
+        """Apply to a field of the shape of the domain, or to a batch of them. Differentiable; the result is new.
 
         Leading axes are a batch: from (50, *domain.shape) to (50, *codomain.shape).
         """
         try:
-            return apply_operator(self, u) if active or isbox(u) else self.apply(u)
+            if active or isbox(u):
+                return apply_operator(self, u)
+            return self.apply(u)
         except Exception as error:
             raise shortened(error)  # noqa: B904 SPARSEDP_TRACEBACK=full keeps all frames
 
-    def apply(self, u, out=None):
+    def apply(self, u: Any, out: np.ndarray | None = None) -> Any:
         """Apply to a plain array, without the tape.
 
         Parameters
         ----------
         u : array, shape (..., *`domain.shape`)
-            Leading axes are a batch: one field for each of their entries.
+            Leading axes are a batch of fields.
         out : array, shape (..., *`codomain.shape`), optional
             Reused for the result: contiguous, of the dtype of the result, no overlap with `u`.
 
@@ -136,9 +147,10 @@ class Operator(Frozen, Remade):
         """
         return self.backend.apply(self, u, out)
 
-    def apply_array(self, u, out=None):
+    def apply_array(self, u: Any, out: np.ndarray | None = None) -> np.ndarray:
         """Apply to a NumPy array: see `apply`."""
-        u, shape = field_array(self, u, batch=True), self.codomain.shape
+        u = field_array(self, u, batch=True)
+        shape = self.codomain.shape
         dtype = result_dtype(self.structure, u.dtype)
         lead = u.shape[: u.ndim - len(self.domain.shape)]
         if out is None:
@@ -146,8 +158,8 @@ class Operator(Frozen, Remade):
         else:
             check_out(self, out, u, dtype, lead + shape)
         if lead:
-            many = prod(lead)
-            for field, result in zip(u.reshape(many, self.shape[1]), out.reshape(many, self.shape[0])):
+            count = prod(lead)
+            for field, result in zip(u.reshape(count, self.shape[1]), out.reshape(count, self.shape[0])):
                 self._acting.apply(field, result)
         else:
             self._acting.apply(u.reshape(-1), out.reshape(-1))
@@ -155,50 +167,59 @@ class Operator(Frozen, Remade):
 
     @cached_property
     def _acting(self):
-        """The structure that does the work in this form."""
-        return self._matrix_structure if self.form == "explicit" else self.structure
+        """The structure that is applied in this form."""
+        if self.form == "explicit":
+            return self._matrix_structure
+        return self.structure
 
     @cached_property
     def _matrix_structure(self):
+        """The entries as a Matrix."""
         if isinstance(self.structure, Matrix):
             return self.structure
         origin = self._origin()
-        # Turned entry by entry, so that the two matrices hold the same bits.
-        return origin._matrix_structure.transpose() if origin is not None else assembled(self.structure, self.name)
+        if origin is not None:  # transposed entry by entry, so that the two matrices hold the same bits
+            return origin._matrix_structure.transpose()
+        return assembled(self.structure, self.name)
 
     # ------------------------------------------------------------ transpose and algebra
 
     @property
-    def T(self):
+    def T(self) -> Operator:
         """The plain transpose (for complex entries too), from codomain to domain."""
         return self._origin() or self._transposed or self._make_transpose()
 
     def _make_transpose(self):
-        name = self.name[:-2] if self.name.endswith(".T") else f"{_bracket(self.name)}.T"
-        turned = self._acting_as(self.structure.transpose(), self.codomain, self.domain, name)
-        if self.tangent is self:  # else the way back is the twin that checks nothing, as derivatives need it
-            # Weak: a cycle would keep large matrices alive until the collector runs.
-            vars(turned)["_origin"] = weakref.ref(self)
-        vars(self)["_transposed"] = turned
-        return turned
+        """Return the transpose, and keep it."""
+        if self.name.endswith(".T"):
+            name = self.name[:-2]
+        else:
+            name = f"{_bracket(self.name)}.T"
+        transposed = self._acting_as(self.structure.transpose(), self.codomain, self.domain, name)
+        if self.tangent is self:  # otherwise the transpose of the transpose is the operator without checks
+            # Weak: a cycle would keep large matrices alive until the garbage collector runs.
+            transposed.__dict__["_origin"] = weakref.ref(self)
+        self.__dict__["_transposed"] = transposed
+        return transposed
 
     @property
-    def tangent(self):
-        """The operator that carries tangents: this one, without checks of primal data."""
+    def tangent(self) -> Operator:
+        """The operator for tangents: this one, without checks of primal data."""
         return self._unchecked or self
 
     @cached_property
     def _unchecked(self):
+        """The operator without checks; None if it has none."""
         structure = self.structure.tangent()
         if structure is self.structure:
-            return None  # an operator that refers to itself would never be freed
+            return None  # not the operator itself: the reference cycle would be freed late
         return self._acting_as(structure, self.domain, self.codomain, self.name)
 
     def _acting_as(self, structure, domain, codomain, name):
-        """An operator of the same kind and form."""
+        """Return an operator of the same class and form."""
         return Operator(structure, domain, codomain, name, self.form)
 
-    def __matmul__(self, other):
+    def __matmul__(self, other: Any) -> Any:
         if isinstance(other, Operator):
             return self._compose(other)
         if isbox(other) or isinstance(other, np.ndarray):
@@ -210,6 +231,7 @@ class Operator(Frozen, Remade):
         return NotImplemented
 
     def _compose(self, other):
+        """Return the product with another operator."""
         if not fits(self.domain, other.codomain):
             raise ShapeError(f"{self.name} takes {self.domain}, but {other.name} gives {other.codomain}")
         name = f"{_bracket(self.name)} @ {_bracket(other.name)}"
@@ -220,7 +242,7 @@ class Operator(Frozen, Remade):
         """The same map on flat arrays."""
         return Operator(self._acting, Space(self.domain.size), Space(self.codomain.size), self.name, self.form)
 
-    def __add__(self, other):
+    def __add__(self, other: Any) -> Operator:
         if isinstance(other, Number):
             raise TypeError(f"a number cannot be added to {self.name}; write {self.name} + c * dp.identity(space)")
         if issparse(other):
@@ -233,58 +255,63 @@ class Operator(Frozen, Remade):
         structure = total(self.structure, other.structure)
         return Operator(structure, self.domain, self.codomain, f"{self.name} + {other.name}")
 
-    __radd__ = __add__  # for its advice: no sum of an operator and something else is defined
+    __radd__ = __add__  # raises with advice: only sums of operators are defined
 
-    def __sub__(self, other):
-        return self + other * -1.0 if isinstance(other, (Operator, Number)) or issparse(other) else NotImplemented
+    def __sub__(self, other: Any) -> Operator:
+        if isinstance(other, (Operator, Number)) or issparse(other):
+            return self + other * -1.0
+        return NotImplemented
 
-    def __rsub__(self, other):
-        return self + other  # refused with advice
+    def __rsub__(self, other: Any) -> Operator:
+        return self + other  # raises with advice
 
-    def __pow__(self, exponent):
+    def __pow__(self, exponent: Any) -> NoReturn:
         raise TypeError(f"{self.name} ** {exponent!r} is not defined; write A @ A, or dp.matrix_power(A, exponent)(u)")
 
-    def __neg__(self):
+    def __neg__(self) -> Operator:
         return self * -1.0
 
     def _refuse_traced_factor(self):
+        """Raise the error of a traced number that scales an operator."""
         raise DerivativeError(
             f"a traced number cannot scale an operator; write nu * {self.name}(u), and to solve a system with it "
             "dp.implicit(residual)"
         )
 
-    def __mul__(self, factor):
+    def __mul__(self, factor: Any) -> Operator:
         if isbox(factor):
             self._refuse_traced_factor()
         if isinstance(factor, Operator):
             raise TypeError(f"{self.name} * {factor.name} is not defined; write A @ B to compose operators")
         if not _is_scalar(factor):
             return NotImplemented
-        number = complex(factor)  # NumPy takes no whole number beyond 64 bits
-        check_finite(f"a factor of {self.name}", number if np.iscomplexobj(factor) else number.real)
+        number: Any = complex(factor)  # NumPy has no integers of more than 64 bits
         label = "-" if number == -1 else f"{factor:g} * "
-        structure = times(self.structure, number if np.iscomplexobj(factor) else number.real)
+        if not np.iscomplexobj(factor):
+            number = number.real
+        check_finite(f"a factor of {self.name}", number)
+        structure = times(self.structure, number)
         return Operator(structure, self.domain, self.codomain, f"{label}{_bracket(self.name)}")
 
     __rmul__ = __mul__
 
-    def __truediv__(self, number):
+    def __truediv__(self, number: Any) -> Operator:
         if isbox(number):
-            return self * number  # refused
+            return self * number  # raises with advice
         if not _is_scalar(number):
             return NotImplemented
-        if not 0 < abs(number) < np.inf:  # NumPy takes no whole number beyond 64 bits
+        if not 0 < abs(number) < np.inf:
             raise NonFiniteError(f"{self.name} can be divided by a finite number other than 0 only, got {number}")
         if np.iscomplexobj(number):
             return self * (1.0 / number)
-        share, exponent = np.frexp(float(number))  # 1 / 1e308 has lost digits, 2^-1024 has not
-        half = int(exponent) // 2  # 2^-exponent of a subnormal number is infinite
+        share, exponent = np.frexp(float(number))  # 1 / 1e308 is subnormal and loses digits, a power of two does not
+        half = int(exponent) // 2  # in two steps, as 2^-exponent of a subnormal number is infinite
         structure = times(times(self.structure, 1.0 / float(share)), 2.0**-half)
         structure = times(structure, 2.0 ** (half - int(exponent)))
         return Operator(structure, self.domain, self.codomain, f"{_bracket(self.name)} / {number:g}")
 
-    def __array_ufunc__(self, ufunc, method, *inputs, **options):
-        """Let NumPy numbers scale an operator, and name the mistake when anything else is tried."""
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Operator:
+        """Let NumPy numbers scale an operator; raise TypeError with advice for any other NumPy function."""
         if any(map(isbox, inputs)):
             self._refuse_traced_factor()
         if method == "__call__" and ufunc is np.multiply and np.shape(inputs[0]) == ():
@@ -293,93 +320,103 @@ class Operator(Frozen, Remade):
             raise TypeError(f"{self.name} stands on the left of @; for x @ A write {self.name}.T @ x")
         raise TypeError(f"numpy.{ufunc.__name__} does not take an operator; write {self.name}(u) for a field u")
 
-    def __array__(self, *args, **options):
+    def __array__(self, *args: Any, **options: Any) -> NoReturn:
         raise TypeError(f"{self.name} is no array; write op.matrix, op.to_scipy() or {self.name}(u)")
 
-    # ------------------------------------------------------------ forms and borders
+    # ------------------------------------------------------------ forms and exchange with SciPy
 
     @property
-    def shape(self):
+    def shape(self) -> tuple[int, int]:
         """(codomain.size, domain.size)."""
         return self.structure.shape
 
     @property
-    def dtype(self):
-        """float64, or complex128 when the entries are complex."""
+    def dtype(self) -> np.dtype:
+        """float64, or complex128 if the entries are complex."""
         return self.structure.dtype
 
     @property
-    def matrix(self):
-        """The entries as a csr_array with 32-bit indices: in the matrix-free form assembled when first asked for."""
+    def matrix(self) -> Any:
+        """The entries as a csr_array with 32-bit indices; in the matrix-free form assembled at the first access."""
         return self._matrix_structure.matrix
 
     @property
-    def separable(self):
+    def separable(self) -> bool:
         """Whether it is a Kronecker sum: one 1-D factor for each axis."""
         return self.structure.separable
 
-    def explicit(self):
-        """The same operator, applied through its matrix."""
+    def explicit(self) -> Operator:
+        """Return the same operator, applied by its matrix."""
         return self._in_form("explicit")
 
-    def matrix_free(self):
-        """The same operator, applied without a matrix. One that was given as a matrix stays as it is."""
-        return self if isinstance(self.structure, Matrix) else self._in_form("matrix-free")
+    def matrix_free(self) -> Operator:
+        """Return the same operator, applied without a matrix; an operator that is defined by a matrix is unchanged."""
+        if isinstance(self.structure, Matrix):
+            return self
+        return self._in_form("matrix-free")
 
     def _in_form(self, form):
-        return self if form == self.form else Operator(self.structure, self.domain, self.codomain, self.name, form)
+        """Return the same operator in a form."""
+        if form == self.form:
+            return self
+        return Operator(self.structure, self.domain, self.codomain, self.name, form)
 
-    def matvec(self, x):
-        """Flat product A x, as SciPy calls it."""
+    def matvec(self, x: Any) -> Any:
+        """Return the flat product A x, for SciPy."""
         return self @ np.asarray(x).reshape(-1)
 
-    def rmatvec(self, y):
-        """Flat product A^H y: conjugated, as SciPy wants it (`.T` is not)."""
+    def rmatvec(self, y: Any) -> Any:
+        """Return the flat product A^H y with the conjugate transpose, for SciPy (`.T` does not conjugate)."""
         return np.conj(self.T @ np.conj(np.asarray(y).reshape(-1)))
 
-    def to_scipy(self):
-        """The operator as a scipy.sparse.linalg.LinearOperator on flat arrays."""
+    def to_scipy(self) -> Any:
+        """Return the operator as a scipy.sparse.linalg.LinearOperator on flat arrays."""
         from scipy.sparse.linalg import LinearOperator
 
         return LinearOperator(self.shape, matvec=self.matvec, rmatvec=self.rmatvec, dtype=self.dtype)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"<{self.name}: {self.domain} -> {self.codomain}, {self.form}>"
 
     def _repr_html_(self):
-        """For a notebook: what it is, and where the entries of a small one are."""
-        small = self.backend.whole_fields and self.structure.has_entries and max(self.shape) <= SPY_BELOW
-        matrix = self._acting.explicit() if small else None
-        entries = {
-            "from": self.domain,
-            "to": self.codomain,
-            "acts": self.form,
-            "dtype": self.dtype,
-            "entries": None if matrix is None else f"{matrix.nnz} of {self.shape[0]} x {self.shape[1]}",
-            "where": None if matrix is None or not matrix.nnz else spy(matrix),
-        }
+        """Return HTML for a notebook: the spaces, the form, and a picture of the entries of a small operator."""
+        entries: dict[str, Any] = {"from": self.domain, "to": self.codomain, "acts": self.form, "dtype": self.dtype}
+        if self.backend.whole_fields and self.structure.has_entries and max(self.shape) <= SPY_BELOW:
+            matrix = self._acting.explicit()
+            entries["entries"] = f"{matrix.nnz} of {self.shape[0]} x {self.shape[1]}"
+            if matrix.nnz:
+                entries["where"] = spy(matrix)
         return facts(self.name, entries)
 
 
-def _with_matrix(matrix, *given):
-    op = Operator(*given)
+def _with_matrix(matrix, *arguments):
+    """Return an Operator whose matrix is known."""
+    op = Operator(*arguments)
     op.__dict__["_matrix_structure"] = matrix
     return op
 
 
 def _chosen_form(structure):
-    """A fixed rule, never a timing: the same program gives the same bits everywhere."""
+    """Return the form by a fixed rule, not by timings: the same program gives the same bits everywhere."""
     if isinstance(structure, Matrix):
         return "explicit"
     if isinstance(structure, Diagonal) or not structure.has_entries:
         return "matrix-free"
-    limit = EXPLICIT_BELOW_COMPILED * structure.passes if kernels.compiled() else EXPLICIT_BELOW_PLAIN
-    return "explicit" if max(structure.shape) <= limit else "matrix-free"
+    limit = EXPLICIT_BELOW_PLAIN
+    if kernels.compiled():
+        limit = EXPLICIT_BELOW_COMPILED * structure.passes
+    if max(structure.shape) <= limit:
+        return "explicit"
+    return "matrix-free"
 
 
 def _is_scalar(value):
+    """Return whether a value is one number."""
     return isinstance(value, Number) or (isinstance(value, np.ndarray) and value.shape == ())
 
 
 def _bracket(name):
-    return f"({name})" if " + " in name or " - " in name else name
+    """Return the name of an operator for products: a sum in parentheses."""
+    if " + " in name or " - " in name:
+        return f"({name})"
+    return name
