@@ -342,7 +342,6 @@ NOT_ANNOTATED = {
     "optimize",
     "parallel",
     "report",
-    "solvers",
     "trajectory",
 }
 

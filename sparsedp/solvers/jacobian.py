@@ -254,9 +254,13 @@ class Jacobians:
         else:
             key = (op.matrix.indptr, op.matrix.indices, op.matrix.data)
         solver = self._matrices.find(key)
-        if not solver and op.shape[0] <= DENSE_UP_TO and self.settings["method"] in ("auto", "direct"):
+        if solver is not None:
+            return solver
+        if op.shape[0] <= DENSE_UP_TO and self.settings["method"] in ("auto", "direct"):
             solver = build_dense(op, self.settings["rtol"], self.settings["nullspace"], self.settings["name"])
-        return self._matrices.put(key, solver or self._build(op, near))
+        if solver is None:
+            solver = self._build(op, near)
+        return self._matrices.put(key, solver)
 
     def _build(self, op, near):
         return build(op, **self.settings, solves="few", near=near, all_rows=False).solver

@@ -145,6 +145,15 @@ def test_a_residual_that_is_linear_is_set_up_once():
     assert root.info.forward.iterations == 1
 
 
+def test_two_alternating_linear_residuals_are_set_up_once_each():
+    op = dp.laplacian(dp.Grid(100, size=1.0), dp.dirichlet)
+    root = implicit(lambda u, k: k * op(u) - 1.0)
+    with recording() as calls:
+        for k in (1.0, 2.0, 1.0, 2.0, 1.0, 2.0):
+            root(np.zeros(100), k)
+    assert calls[f"{root.name}.jacobian", "setup"] == 2
+
+
 def test_the_adjoint_uses_the_jacobian_at_the_root_not_the_last_one(monkeypatch):
     """With a loose tolerance the last Jacobian of the forward solve is visibly another one."""
     problem = PROBLEMS["advection 1-D"]()
