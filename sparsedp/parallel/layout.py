@@ -126,9 +126,9 @@ class Layout(Partition, Backend):
 
     def minimize(self, *given):
         """`minimize` of unknowns on ranks."""
-        from sparsedp.parallel.search import minimized
+        from sparsedp.parallel.minimize import minimize_on_ranks
 
-        return minimized(self.comm, *given)
+        return minimize_on_ranks(self.comm, *given)
 
     def attempt(self, act, *args):
         """Return ``act(*args)``; if it fails on one rank it fails on all."""
