@@ -27,8 +27,8 @@ FAULTS = {
     ),
     "a set-up that is kept though the data changed": Bug(
         "solvers",
-        "if len(entry[0]) == len(key) and all(map(_same, entry[0], key)):",
-        "if len(entry[0]) == len(key):",
+        "if len(entry_key) == len(key) and all(map(_are_equal, entry_key, key)):",
+        "if len(entry_key) == len(key):",
         "",
     ),
     "a JVP of a solve without the share of the coefficients": Bug(

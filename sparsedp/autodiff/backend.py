@@ -20,6 +20,7 @@ a public call           `collectively`: all processes run it, or all raise
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from numbers import Number
 from typing import Any
@@ -124,16 +125,16 @@ class Backend:
 NUMPY = Backend()
 
 
-class ArrayKind:
+class ArrayKind(ABC):
     """What the tape and public calls ask of fields that are not NumPy arrays.
 
     The type of such a field has the methods ``gather()`` (the whole field as a NumPy array), ``fingerprint()`` (an int
     of all bits, the same on all processes), ``astype(dtype)`` and an attribute ``backend``.
     """
 
+    @abstractmethod
     def formulas(self, fun: Callable, value: Any, args: tuple, nums: tuple) -> tuple | None:
         """Return the VJP and JVP of a call ``value = fun(*args)`` for arguments `nums`; None: use autograd's."""
-        raise TypeError(f"no derivative of {fun}")
 
     def match(self, derivative: Any, value: Any) -> Any:
         """Return a derivative in the form (number, array or field) of the value that it belongs to."""

@@ -314,6 +314,11 @@ class Grid(Value, Uncached):
             f"{self} has axes 0 to {self.dim - 1}, got {axis!r}; write a number or a name of {', '.join(self.axes)}"
         )
 
+    @property
+    def layout(self) -> Any:
+        """How fields are distributed over processes, with the communicator as ``layout.comm``; None on one process."""
+        return None if self.backend is NUMPY else self.backend
+
     @cached_property
     def _key(self):
         return self.shape, self.periodic, self.origin, tuple(widths.tobytes() for widths in self.widths), self.backend

@@ -281,7 +281,8 @@ def test_refused_arguments():
     with pytest.raises(ValueError, match="the viscosity of flow_step must be >= 0, got -1"):
         dp.flow_step(grid, 0.1, lambda nu: nu).start(rest, -1.0)
     with pytest.raises(
-        dp.errors.ShapeError, match="flow_step takes a dict of v, p and a as its state; write state = step.start"
+        dp.errors.ShapeError,
+        match=r"flow_step takes a dict of v, p and a as its state; write state = step.start\(v, params\)",
     ):
         dp.flow_step(grid, 0.1)({"v": rest})
     with pytest.raises(FINITE, match="dt of flow_step must be finite, got nan"):

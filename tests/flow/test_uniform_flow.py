@@ -453,8 +453,8 @@ REFUSED = [
     Case(
         act=lambda: dp.flow_step(ROOM, 0.1, boundary=SIDES, walls=EVERYWHERE),
         error=ValueError,
-        match="walls that meet at an inflow are summed; write "
-        r"walls=lambda params: values, with values on face_lift\(grid, boundary\).domain",
+        match="walls of flow_step got an array in which the velocities of walls that meet at an inflow are summed; "
+        r"write walls=lambda params: values, with values on face_lift\(grid, boundary\).domain",
     ),
     Case(
         act=lambda: dp.flow_step(SQUARE, 0.1, inflow=ONES),

@@ -11,6 +11,7 @@ import pytest
 import sparsedp as dp
 from sparsedp.autodiff.derivative import value_and_grad
 from sparsedp.solvers import direct
+from sparsedp.solvers.engine import EmptySystem
 from sparsedp.solvers.nullspace import find_null_space
 from sparsedp.solvers.system import System
 
@@ -335,3 +336,11 @@ def test_factors_that_do_not_fit_into_memory(monkeypatch):
     with pytest.raises(FAILED, match=r"write method='krylov', preconditioner='shifted_laplace'"):
         dp.inverse(1j * dp.laplacian(BOX, dp.dirichlet), "direct")
     assert caught.value.info.status == "setup_failed"
+
+
+def test_an_engine_says_what_it_does_not_define():
+    engine = EmptySystem()
+    with pytest.raises(TypeError, match="EmptySystem defines no solve"):
+        engine.solve(np.zeros(0), 0.0, False)
+    with pytest.raises(TypeError, match="EmptySystem defines no unroll"):
+        engine.unroll(np.zeros(0), 0.0, False)
