@@ -1,24 +1,30 @@
-"""Where a derivative is wrong: the entries with the largest gaps, in grid coordinates where a grid is known.
+"""Find where a derivative is wrong: the entries with the largest gaps, in grid coordinates where a grid is known.
 
 The gap along a direction d is e . d with the error e of the derivative, so it is linear in d. With random weights on
 the entries of a block it is about as large as the part of e in the block. Bisection along one axis after the other
 finds an entry with a large gap in about log2(n) measurements.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from math import inf
+from math import inf, isnan
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sparsedp._utils.counters import recording
-from sparsedp.check.evaluations import REFUSALS, UNCHANGED, Line
+from sparsedp.check.direction_evidence import DirectionEvidence
+from sparsedp.check.evaluations import REFUSALS, UNCHANGED, Evaluations, Line
+from sparsedp.check.point import Point
 from sparsedp.grid.grid import node_axes
 
 __all__ = [
+    "DEFAULT_STEP",
     "MOST_ENTRIES",
     "EntryGap",
-    "DEFAULT_STEP",
     "gaps_along_entries",
     "largest_gaps",
     "listed",
@@ -28,10 +34,12 @@ __all__ = [
 ]
 
 MOST_ENTRIES = 3  # that are named
-NEGLIGIBLE = 0.05  # a part of a gap below this share is none
-REMAINDER = 0.01  # of the largest gap found: no further entry is sought where all others are below
+NEGLIGIBLE_SHARE = 0.05  # a part of a gap below this share is none
+REMAINDER_SHARE = 0.01  # of the largest gap: no further entry is sought where all others are below
 DEFAULT_STEP = 2.0**-11  # where no step of the sweep has shown a derivative
-CLEAR = 4.0  # a gap has to be this many times the noise of its measurement
+CLEAR_OF_NOISE = 4.0  # a gap has to be this many times the noise of its measurement
+
+Block = tuple[slice, ...]
 
 
 class EntryGap(NamedTuple):
@@ -42,22 +50,32 @@ class EntryGap(NamedTuple):
     leaf : int
     block : tuple of slice
     gap : float
-        Right derivative less the given one, in units of the leaf; NaN where the block is no single entry.
+        Right derivative less the one under test, in units of the leaf; NaN where the block is no single entry.
     region : tuple of slice or None
         A larger block that holds the whole gap of the leaf, such as all cells at one wall.
     """
 
     leaf: int
-    block: tuple
+    block: Block
     gap: float
-    region: Any = None
+    region: Block | None = None
+
+    @property
+    def rank(self) -> float:
+        """Key that sorts the largest gap first, and unknown ones last."""
+        return inf if isnan(self.gap) else -abs(self.gap)
 
 
 class _NotMeasured(Exception):
     """The loss has no value that is needed."""
 
 
-def largest_gaps(gap_along, shapes, most=MOST_ENTRIES, noise=0.0):
+def largest_gaps(
+    gap_along: Callable[[Sequence[NDArray[Any]]], float],
+    shapes: Sequence[tuple[int, ...]],
+    most: int = MOST_ENTRIES,
+    noise: float = 0.0,
+) -> list[EntryGap]:
     """Find entries with large gaps.
 
     Parameters
@@ -76,100 +94,135 @@ def largest_gaps(gap_along, shapes, most=MOST_ENTRIES, noise=0.0):
         The largest gap first.
     """
     search = _Search(gap_along, shapes, noise)
-    found: list[EntryGap] = []
+    entries: list[EntryGap] = []
     with suppress(_NotMeasured):
-        total = search.total()
-        while len(found) < most and abs(total) > max(REMAINDER * search.largest, noise):
+        while len(entries) < most:
+            total = search.total()
+            if not abs(total) > max(REMAINDER_SHARE * search.largest, noise):
+                break
             entry = search.next(total)
             if entry is None:
                 break
-            found.append(entry)
-            total = search.total() if len(found) < most else 0.0
-    return sorted(found, key=lambda one: -abs(one.gap) if one.gap == one.gap else inf)
+            entries.append(entry)
+    return sorted(entries, key=lambda entry: entry.rank)
+
+
+class _Bisection(NamedTuple):
+    """The end of a bisection.
+
+    Attributes
+    ----------
+    low, high : int
+        The range that is left.
+    gap : float
+        Between them.
+    beside : float
+        Root of the sum of squares of the gaps of all other halves.
+    """
+
+    low: int
+    high: int
+    gap: float
+    beside: float
 
 
 class _Search:
     """Bisection for entries with large gaps; entries that were found are excluded from later searches."""
 
-    def __init__(self, gap_along, shapes, noise):
+    def __init__(
+        self,
+        gap_along: Callable[[Sequence[NDArray[Any]]], float],
+        shapes: Sequence[tuple[int, ...]],
+        noise: float,
+    ) -> None:
         rng = np.random.default_rng(0)
-        self.gap_along, self.shapes, self.noise = gap_along, shapes, noise
-        self.weights = [np.array(rng.choice([-1.0, 1.0], s) * rng.uniform(0.5, 1.5, s)) for s in shapes]
+        self.gap_along = gap_along
+        self.shapes = shapes
+        self.noise = noise
         self.largest = 0.0
+        self.weights = []
+        for shape in shapes:
+            signs = rng.choice([-1.0, 1.0], shape)
+            self.weights.append(np.array(signs * rng.uniform(0.5, 1.5, shape)))
 
-    def total(self):
-        """Gap of all entries that have not been found yet."""
+    def total(self) -> float:
+        """Return the gap of all entries that have not been found yet."""
         return self.gap_along(self.weights)
 
-    def block_gap(self, leaf, block):
-        """Gap of a block of one leaf."""
+    def block_gap(self, leaf: int, block: Block) -> float:
+        """Return the gap of a block of one leaf."""
         weights = [np.zeros(shape) for shape in self.shapes]
         weights[leaf][block] = self.weights[leaf][block]
         return self.gap_along(weights)
 
-    def leaves_gap(self, low, high):
-        """Gap of some leaves."""
-        return self.gap_along(
-            [weight if low <= leaf < high else np.zeros_like(weight) for leaf, weight in enumerate(self.weights)]
-        )
+    def leaves_gap(self, low: int, high: int) -> float:
+        """Return the gap of some leaves."""
+        weights = [np.zeros(shape) for shape in self.shapes]
+        weights[low:high] = self.weights[low:high]
+        return self.gap_along(weights)
 
-    def next(self, total):
+    def next(self, total: float) -> EntryGap | None:
         """Find one entry, given the gap of all entries not found yet, and exclude it from later searches.
 
         Return None where noise leads to an entry that was found before.
         """
-        leaf, _, gap, _ = self._bisect(len(self.shapes), self.leaves_gap, total)
+        leaf, _, gap_of_leaf, _ = self._bisect(len(self.shapes), self.leaves_gap, total)
+        gap = gap_of_leaf
         block = [slice(None)] * len(self.shapes[leaf])
-        of_leaf, certain = gap, []  # axes along which the gap lies at one place
+        certain_axes = []  # along which the gap lies at one place
         for axis, length in enumerate(self.shapes[leaf]):
 
-            def part(low, high, axis=axis):
+            def gap_between(low: int, high: int, axis: int = axis) -> float:
                 return self.block_gap(leaf, (*block[:axis], slice(low, high), *block[axis + 1 :]))
 
-            low, high, gap, beside = self._bisect(length, part, gap)
+            low, high, gap, beside = self._bisect(length, gap_between, gap)
             block[axis] = slice(low, high)
-            if beside <= NEGLIGIBLE * abs(gap):
-                certain.append(axis)
+            if beside <= NEGLIGIBLE_SHARE * abs(gap):
+                certain_axes.append(axis)
         self.largest = max(self.largest, abs(gap))
-        region = self._region(leaf, block, certain, of_leaf)
+        region = self._region(leaf, block, certain_axes, gap_of_leaf)
         weight = self.weights[leaf][tuple(block)]
         if not np.any(weight):
             return None
-        single = np.size(weight) == 1
-        value = gap / float(np.reshape(weight, -1)[0]) if single else np.nan
+        value = np.nan
+        if np.size(weight) == 1:
+            value = gap / float(np.reshape(weight, -1)[0])
         self.weights[leaf][tuple(block) if region is None else region] = 0.0
         return EntryGap(leaf, tuple(block), value, region)
 
-    def _region(self, leaf, block, certain, of_leaf):
-        """The block of all entries that share the place along the certain axes, if it holds the whole gap."""
-        if not 0 < len(certain) < len(block):
+    def _region(self, leaf: int, block: list[slice], certain_axes: list[int], gap_of_leaf: float) -> Block | None:
+        """Return the block of all entries with the same place along the certain axes, if it holds the whole gap."""
+        if not 0 < len(certain_axes) < len(block):
             return None
-        region = tuple(part if axis in certain else slice(None) for axis, part in enumerate(block))
+        region = tuple(part if axis in certain_axes else slice(None) for axis, part in enumerate(block))
         gap = self.block_gap(leaf, region)
-        return region if abs(of_leaf - gap) <= NEGLIGIBLE * abs(of_leaf) else None
+        return region if abs(gap_of_leaf - gap) <= NEGLIGIBLE_SHARE * abs(gap_of_leaf) else None
 
-    def _bisect(self, length, gap_of, gap):
-        """Halve a range again and again, and keep the half with the larger gap.
-
-        Returns
-        -------
-        (low, high, gap between them, root of the sum of squares of the gaps of all other halves)
-        """
-        low, high, beside = 0, length, 0.0
+    def _bisect(self, length: int, gap_between: Callable[[int, int], float], gap: float) -> _Bisection:
+        """Halve a range again and again, and keep the half with the larger gap."""
+        low = 0
+        high = length
+        beside = 0.0
         while high - low > 1 and abs(gap) > self.noise:
             middle = (low + high) // 2
-            first = gap_of(low, middle)
+            first = gap_between(low, middle)
             second = gap - first
             if abs(first) >= abs(second):
-                high, gap, other = middle, first, second
+                high = middle
+                gap = first
+                other = second
             else:
-                low, gap, other = middle, second, first
+                low = middle
+                gap = second
+                other = first
             beside = float(np.hypot(beside, other))
-        return low, high, gap, beside
+        return _Bisection(low, high, gap, beside)
 
 
-def gaps_along_entries(evaluations, judged, most=MOST_ENTRIES):
-    """Entries where differences and gradient are far apart, by the judgement of the worst direction.
+def gaps_along_entries(
+    evaluations: Evaluations, directions: Sequence[DirectionEvidence], most: int = MOST_ENTRIES
+) -> list[EntryGap]:
+    """Find entries where differences and gradient are far apart, with the step of the worst direction.
 
     Returns
     -------
@@ -177,17 +230,20 @@ def gaps_along_entries(evaluations, judged, most=MOST_ENTRIES):
         Gaps are those of derivatives of the loss; empty where nothing can be told.
     """
     point = evaluations.point
-    wrong = [one for one in judged if one.word in ("disagrees", "outside")]
+    wrong = [direction for direction in directions if direction.word in ("disagrees", "outside")]
     if point.entries < 2 or not wrong:
         return []
-    worst = max(wrong, key=lambda one: one.share if one.share == one.share else 0.0)
+    worst = max(wrong, key=lambda direction: 0.0 if isnan(direction.share) else direction.share)
     step = worst.step if worst.step > 0 else DEFAULT_STEP
     jitter = worst.jitter if worst.jitter > 0 else 0.0
-    noise = CLEAR * max(2.0, jitter) * evaluations.eps * abs(evaluations.base) / step
+    noise = CLEAR_OF_NOISE * max(2.0, jitter) * evaluations.eps * abs(evaluations.base) / step
 
-    def gap_along(weights):
-        parts = [w * (1 + 1j) if np.iscomplexobj(x) else w for w, x in zip(weights, point.values, strict=True)]
-        direction = point.units * np.concatenate([np.ravel(part).view(float) for part in parts])
+    def gap_along(weights: Sequence[NDArray[Any]]) -> float:
+        parts = []
+        for weight, x in zip(weights, point.values, strict=True):
+            part = weight * (1 + 1j) if np.iscomplexobj(x) else weight
+            parts.append(np.ravel(part).view(float))
+        direction = point.units * np.concatenate(parts)
         if not np.any(direction):
             return 0.0
         level = Line("entries", direction, evaluations).level(step)
@@ -195,16 +251,16 @@ def gaps_along_entries(evaluations, judged, most=MOST_ENTRIES):
             raise _NotMeasured(level.note)
         return level.difference - level.slope
 
-    found = largest_gaps(gap_along, [x.shape for x in point.values], most, noise)
+    entries = largest_gaps(gap_along, [x.shape for x in point.values], most, noise)
     units = [float(part[0]) if part.size else 1.0 for part in point.split(point.units)]
-    return [one._replace(gap=one.gap / units[one.leaf]) for one in found]
+    return [entry._replace(gap=entry.gap / units[entry.leaf]) for entry in entries]
 
 
 # ------------------------------------------------------------ in words
 
 
-def spaces_of(function, x):
-    """Spaces on a grid of the Operators that a function applies at a point."""
+def spaces_of(function: Callable[[Any], Any], x: Any) -> list[Any]:
+    """Return the spaces on a grid of the Operators that a function applies at a point."""
     spaces: dict[str, Any] = {}
     with suppress(*REFUSALS), recording() as calls, np.errstate(all="ignore"):
         function(x)
@@ -217,43 +273,52 @@ def spaces_of(function, x):
     return list(spaces.values())
 
 
-def listed(found, point, gradient, spaces, source="the gradient"):
-    """Sentences about gaps: the entries with both derivatives, and the region that holds all of a gap.
+def listed(
+    entries: Sequence[EntryGap],
+    point: Point,
+    gradient: NDArray[Any] | None,
+    spaces: Sequence[Any],
+    source: str = "the gradient",
+) -> list[str]:
+    """Return sentences about gaps: the entries with both derivatives, and the region that holds all of a gap.
 
     Parameters
     ----------
-    found : list of EntryGap
+    entries : list of EntryGap
     point : Point
     gradient : vector or None
-        That was given at the point.
+        The gradient under test at the point.
     spaces : list of Space
     source : str
-        What gave it.
+        Its name.
     """
     slopes = [None] * len(point.values) if gradient is None else point.split(gradient)
     sentences = []
-    for one in found:
-        name, x, slope = point.names[one.leaf], point.values[one.leaf], slopes[one.leaf]
-        words = f"{name}{subscript(one.block, x.shape)}{where(one.block, x.shape, spaces)}"
-        if one.gap == one.gap and slope is not None and not np.iscomplexobj(x):
-            given = float(np.reshape(slope, x.shape)[one.block].reshape(-1)[0])
-            digits = _digits(one.gap, given)
-            words += f": {given + one.gap:.{digits}g} by differences, {given:.{digits}g} by {source}"
-        if one.region is not None:
-            place = where(one.region, x.shape, spaces)
-            words += f" (all of the gap in {name} lies in {name}{subscript(one.region, x.shape)}{place})"
+    for entry in entries:
+        name = point.names[entry.leaf]
+        x = point.values[entry.leaf]
+        slope = slopes[entry.leaf]
+        words = f"{name}{subscript(entry.block, x.shape)}{where(entry.block, x.shape, spaces)}"
+        if not isnan(entry.gap) and slope is not None and not np.iscomplexobj(x):
+            derivative = float(np.reshape(slope, x.shape)[entry.block].reshape(-1)[0])
+            digits = _digits(entry.gap, derivative)
+            by_differences = derivative + entry.gap
+            words += f": {by_differences:.{digits}g} by differences, {derivative:.{digits}g} by {source}"
+        if entry.region is not None:
+            region = f"{name}{subscript(entry.region, x.shape)}{where(entry.region, x.shape, spaces)}"
+            words += f" (all of the gap in {name} lies in {region})"
         sentences.append(words)
     return sentences
 
 
-def _digits(gap, given):
-    """Digits in which two numbers differ, and two more."""
-    share = abs(gap) / (abs(given) or abs(gap) or 1.0)
+def _digits(gap: float, derivative: float) -> int:
+    """Return the number of digits that shows a gap, and two more."""
+    share = abs(gap) / (abs(derivative) or abs(gap) or 1.0)
     return int(np.clip(3 - np.floor(np.log10(share or 1.0)), 4, 16))
 
 
-def subscript(index, shape):
-    """A block as one would write it."""
+def subscript(index: Block, shape: tuple[int, ...]) -> str:
+    """Return a block as a subscript."""
     parts = []
     for part, length in zip(index, shape, strict=True):
         low, high, _ = part.indices(length)
@@ -266,8 +331,8 @@ def subscript(index, shape):
     return f"[{', '.join(parts)}]" if parts else ""
 
 
-def where(index, shape, spaces):
-    """A block of a field on the grid of one of some spaces, in words: at which walls, or at which coordinates."""
+def where(index: Block, shape: tuple[int, ...], spaces: Sequence[Any]) -> str:
+    """Return in words at which walls or coordinates a block of a field on the grid of one of some spaces lies."""
     for space in spaces:
         dim = len(space.shape)
         if dim and shape[len(shape) - dim :] == space.shape:
@@ -276,7 +341,7 @@ def where(index, shape, spaces):
     return ""
 
 
-def _place(space, block):
+def _place(space: Any, block: Block) -> str:
     """Return in words where a block of a field on a space lies; empty if it cannot be said."""
     grid = space.grid
     prefix = ""
