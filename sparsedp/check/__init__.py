@@ -1,4 +1,4 @@
-"""The side room of checks: is the transpose the transpose, are two forms one operator, is a gradient right?
+"""Checks of operators and gradients, beside the core.
 
 Nothing else in the package imports it. Every check returns a value with `.verdict` (agrees, disagrees,
 inconclusive), is true only when it agrees, and prints its table.

@@ -40,7 +40,7 @@ def gradient(
     rng: int | np.random.Generator | None = None,
     quick: bool = False,
 ) -> Audit:
-    """Audit the gradient of a loss at x: does it agree with what the loss does?
+    """Audit the gradient of a loss at x: compare it with differences of the loss and with other derivatives.
 
     Parameters
     ----------
@@ -50,26 +50,26 @@ def gradient(
         At least one floating leaf, real or complex, float32 or float64. Never modified.
     gradient : callable or tree, optional
         ``gradient(x)``, or its value, with the structure of `x`. Default: reverse mode through the tape. For a
-        complex leaf it is dL/dRe - i dL/dIm, as the tape has it.
+        complex leaf it is dL/dRe - i dL/dIm, as on the tape.
     steps : sequence of float, optional
         Step sizes in units of x (the root mean square of each leaf), at least eight. Default: ten over
-        eight decades, and more on a line where they leave the derivative open.
+        eight decades, and more on a line where they leave the derivative undecided.
     directions : int
-        Random directions. Structured ones come on top: each leaf alone, constant, the gradient itself,
+        Number of random directions. Structured ones are added: each leaf alone, constant, the gradient itself,
         its largest entry.
     rng : None, int or numpy Generator
         Source of the directions; default: a fixed seed.
     quick : bool
-        One random direction and the gradient itself, for a loss that takes minutes. What was not looked at stands
-        in the reason, also where it agrees: other random directions, single leaves and entries, complex steps, the
-        Hessian product.
+        One random direction and the gradient itself, for a loss that takes minutes. The reason lists what was not
+        examined, also where the gradient agrees: other random directions, single leaves and entries, complex steps,
+        the Hessian product.
 
     Returns
     -------
     Audit
         `.verdict` is "agrees" (with `.digits`), "disagrees" or "inconclusive" (with `.reason`); true only
         for "agrees", so that ``assert dp.check.gradient(loss, x)`` works. `.rows` are the numbers,
-        `.lines` the judgement of each direction, str() the table, `.to_dict()` plain data.
+        `.lines` the result for each direction, str() the table, `.to_dict()` plain data.
 
     Raises
     ------
@@ -82,30 +82,31 @@ def gradient(
 
     Notes
     -----
-    Gates, along every direction. The gap between differences and gradient: at most 1e-8 of the derivative,
-    or the error bar of the sweep where that is larger (1e-6 behind a solve that the ledger shows, or in
-    measured noise of 1e-10). Taylor: f(x + t d) - f of order 1 +- 0.05 in t, with the gradient taken off
-    of order 1.95 or more on every pair of steps, at least three steps that stand 100 times above the noise;
-    with one or two, or with a lower order, the verdict is inconclusive, however small the gap. Two cases
-    have no order, and the gap alone judges them: the remainder is noise on all steps (a linear loss: order
-    2 is "exact"), and a slope so small that the loss bends before it climbs (near a minimum,
-    or in the kernel of a Laplacian: no order 1).
-    Forward against reverse mode: 1e-10, and 1e-6 behind a solve or in noise.
+    Conditions for agreement along every direction. The gap between differences and gradient is at most 1e-8 of the
+    derivative, or the error bar of the sweep where that is larger (1e-6 behind a solve, or in measured noise of
+    1e-10). Taylor remainders: f(x + t d) - f has order 1 +- 0.05 in t; with the gradient subtracted, the order is
+    1.95 or more on every pair of steps, from at least three steps at which the remainder is 100 times the noise. With
+    one or two, or with a lower order, the verdict is inconclusive, however small the gap. Two cases have no order,
+    and the gap alone decides: the remainder is noise on all steps (a linear loss: order 2 is "exact"), and a slope so
+    small that the loss bends before it climbs (near a minimum, or in the kernel of a Laplacian: no order 1).
+    Forward and reverse mode differ by at most 1e-10, and 1e-6 behind a solve or in noise. All thresholds are in
+    `sparsedp.check.audit_thresholds`.
 
     Noise is measured by a table of differences of neighbouring values. Where it is more than rounding, agreement
     needs six digits; with fewer the verdict is inconclusive and says how many there are. A ripple (a part of the loss
-    that is small, with a derivative that is not) is inconclusive too: where fine steps see another derivative than
+    that is small, with a derivative that is not) is inconclusive too: where fine steps show another derivative than
     coarse ones, or the gradient itself varies within steps that the noise hides. A ripple below the rounding of the
-    loss that the gradient does not know either leaves no trace: no difference can see it.
+    loss that the gradient does not contain either cannot be detected. A loss that is 0 to rounding, with a gradient
+    that is rounding, is inconclusive.
 
-    The Hessian product along the first direction is judged by the third Taylor remainder, of order 2.9 or more:
-    `.hessian` and a note say how. It does not touch the verdict, which is about the gradient.
+    The Hessian product along the first direction is examined by the third Taylor remainder, of order 2.9 or more:
+    `.hessian` and a note give the result. The verdict, which is about the gradient, does not depend on it.
 
-    Cost: two evaluations of the loss for each step and direction (a hundred or two in all, about 60 of a quick
-    audit), and a few gradients. A terminal shows how many are to come on standard error, with a bar if tqdm is there.
-    Where the verdict is "disagrees" the entries with the largest gaps are found by bisection, with about 2 log2(n) more
-    evaluations for each of three (one of a quick audit), and the calls on the tape are looked at one by one for the
-    culprit: seconds for most losses, minutes where a loss takes a thousand implicit steps.
+    Cost: two evaluations of the loss for each step and direction (100 to 200 in all, about 60 in a quick audit), and
+    a few gradients. On a terminal, standard error shows how many evaluations are expected, with a bar if tqdm is
+    installed. Where the verdict is "disagrees", the entries with the largest gaps are found by bisection, with about
+    2 log2(n) more evaluations for each of three (one in a quick audit), and the calls on the tape are examined one by
+    one for the culprit: seconds for most losses, minutes where a loss takes a thousand implicit steps.
 
     A `stepper` with a `tolerance` is differentiable to that tolerance, not to rounding: its gradient differs from that
     of the value it returns by a few tolerances. Where the gap is at most ten tolerances, and no other call is at
@@ -113,10 +114,10 @@ def gradient(
 
     Detection limits, as shares of the gradient. An error in all entries: 1e-8 or less where the loss is smooth, 1e-6
     behind an iterative solve or in noise, ten tolerances of time steps with error control where no call is at fault,
-    1e-4 in single precision. A single wrong entry of n counts by its share of the derivative along the directions
-    looked at, its own among them where it is the largest.
+    1e-4 in single precision. A single wrong entry of n counts by its share of the derivative along the examined
+    directions, which include its own where it is the largest.
 
-    Everything is relative: a loss times 1e-200 or 1e200 is judged the same. A loss that refuses a trial
+    Everything is relative: a loss times 1e-200 or 1e200 has the same verdict. A loss that refuses a trial
     point (unstable step, no convergence, not finite, a ValueError) makes that step unusable. At a kink
     central differences prove nothing, and the verdict is inconclusive.
 
@@ -164,7 +165,7 @@ class _Auditor:
     ----------
     evaluations : Evaluations
     is_taped : bool
-        Whether the gradient is that of the tape.
+        Whether the tape gives the gradient.
     count : int
         Number of random directions.
     rng : Generator
@@ -303,13 +304,13 @@ class Audit(Result):
     culprit : str or None
         Name of the first operator, rule or function of autograd on the tape whose VJP or JVP is at
         fault, when the verdict is "disagrees"; a note says what is wrong with it. None when each is right:
-        then a value bypasses the tape, or the gradient was given.
+        then a value bypasses the tape, or `gradient` was an argument.
     gaps : tuple of str
         Entries of x where gradient and differences are farthest apart, when the verdict is "disagrees": both
         derivatives, the place where the loss uses Operators on a grid, and the region that holds the whole gap.
     hessian : "agrees", "disagrees", "inconclusive" or None
-        What the third Taylor remainder says of a Hessian product along the first direction; it does not touch the
-        verdict on the gradient. None where there is no product: no second derivatives, or a gradient that was given.
+        Result of the third Taylor remainder for a Hessian product along the first direction; the verdict on the
+        gradient does not depend on it. None where there is no product: no second derivatives, or a `gradient` argument.
     lines : tuple of DirectionResult
         One for each direction: word, difference, slope, gap, bar, scale, step, rates, digits, note, bend.
     value : float

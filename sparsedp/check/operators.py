@@ -1,4 +1,4 @@
-"""Checks of operators: is the transpose the transpose, are two forms one operator, are its derivatives right?
+"""Checks of operators: their transposes, forms and derivatives.
 
 Figures are in units of rounding times the size of the operator; each check is a function of random fields, and a row.
 """
@@ -232,32 +232,32 @@ Array = NDArray[Any]
 
 
 def _linearity(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
-    """A (3/4 u - v) = 3/4 A u - A v."""
+    """Compare A (3/4 u - v) with 3/4 A u - A v."""
     apply = probe.op.apply
     return apply(0.75 * u - v), 0.75 * apply(u) - apply(v), probe.bound(u) + probe.bound(v)
 
 
 def _jvp(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
-    """The JVP along v is A v."""
+    """Compare the JVP along v with A v."""
     _, tangent = pushforward(probe.op, u, v)
     return tangent, probe.op.apply(v), probe.bound(v)
 
 
 def _vjp(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
-    """The VJP of g is A^T g."""
+    """Compare the VJP of g with A^T g."""
     _, pull = pullback(probe.op, u)
     return pull(g), probe.transposed(g, u.dtype.kind != "c"), probe.bound(g, True)
 
 
 def _dot_test(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
-    """<A u, g> = <u, A^T g>."""
+    """Compare <A u, g> with <u, A^T g>."""
     left = probe.product(probe.op.apply(u), g)
     right = probe.product(u, probe.op.T.apply(g))
     return left, right, probe.size * norm(u) * norm(g)
 
 
 def _second_order(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
-    """The Hessian product of |A u|^2 / 2 along v is A^T A v."""
+    """Compare the Hessian product of |A u|^2 / 2 along v with A^T A v."""
 
     def half_square(x: Any) -> Any:
         return anp.sum(anp.real(probe.op(x) ** 2)) / 2
@@ -272,12 +272,12 @@ def _scaled_results(op: Any, u: Array) -> Array:
 
 
 def _scaling(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
-    """The same digits for a field times 2^+-900."""
+    """Compare the result with that for a field times 2^+-900, scaled back."""
     return _scaled_results(probe.op, u), probe.op.apply(u), probe.bound(u)
 
 
 def _scaling_transposed(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
-    """The same digits for a cotangent times 2^+-900."""
+    """Compare the result with that for a cotangent times 2^+-900, scaled back."""
     return _scaled_results(probe.op.T, g), probe.op.T.apply(g), probe.bound(g, True)
 
 
@@ -289,23 +289,23 @@ def _results_of_two_applications(op: Any, u: Array) -> Sides:
 
 
 def _same_bits(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
-    """Two applications have the same bits, and do not modify their argument."""
+    """Compare two applications, and their argument before and after."""
     return _results_of_two_applications(probe.op, u)
 
 
 def _same_bits_transposed(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
-    """The same for the transpose."""
+    """Compare two applications of the transpose."""
     return _results_of_two_applications(probe.op.T, g)
 
 
 def _forms_agree(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
-    """All forms give the product with the matrix."""
+    """Compare all forms with the product with the matrix."""
     products = np.stack([form @ u.ravel() for form in probe.forms])
     return probe.matrix @ u.ravel(), products, probe.bound(u)
 
 
 def _transposed_forms_agree(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
-    """All forms of the transpose give the product with the transposed matrix."""
+    """Compare all forms of the transpose with the product with the transposed matrix."""
     products = np.stack([form @ g.ravel() for form in probe.transposed_forms])
     return probe.matrix.T @ g.ravel(), products, probe.bound(g, True)
 
@@ -406,7 +406,7 @@ def twin(op: Operator, seeds: int = 3, rng: Rng = None) -> Summary:
     -------
     Summary
         The difference of the two products, entry by entry, in units of eps |A| |u| (for products of
-        operators |A| |B| |u|), each <= 10. Beside the transposed products stands that of the matrix which the
+        operators |A| |B| |u|), each <= 10. The transposed products are also compared with the matrix that the
         transpose assembles by itself.
 
     Notes

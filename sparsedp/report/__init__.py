@@ -1,6 +1,6 @@
 """Instruments beside the core: pictures, certificates, measurements, and the demo.
 
-explain.py           explain: what one gradient computes, and the work that was skipped
+explain.py           explain: the work of one gradient, and the work that was skipped
 certificate.py       certify: the error that solves leave, from recorded solves
 work_precision.py    work_precision: error against run time
 stress_table.py      stress: one word for each extreme case

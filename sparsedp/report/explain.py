@@ -1,4 +1,4 @@
-"""explain: what one run of a loss and its gradient computed, and what it skipped. Counted, not estimated."""
+"""explain: the work of one run of a loss and its gradient, and the work it skipped. Counted, not estimated."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class _ForwardPass:
 
 
 def explain(loss: Callable[[Any], Any], x: Any, gradient: bool = True) -> Plan:
-    """Count what one run of a loss and its gradient calls, and what it skips.
+    """Count the calls of one run of a loss and its gradient, and list the work that it skips.
 
     Parameters
     ----------

@@ -191,7 +191,7 @@ CHAPTERS = (
         "certificate: not computed",
         certify,
     ),
-    Chapter("plan", "What one gradient computes", "plan: not computed", explain),
+    Chapter("plan", "Work of one gradient", "plan: not computed", explain),
     Chapter(
         "stress",
         "Stiff and extreme cases",

@@ -74,7 +74,7 @@ def stress(
     direction does not agree, all evidence is gathered and weighed as by `check.gradient`, with its detection limits.
     refused correctly: a typed error. degraded: a finite answer with a gap, shown as the figure; numbers that
     overflow far outside any stated range; a foreign error. FAILED: within the scene's own values or stated ranges
-    a number that is not finite, without an error; another gradient than that of the differences; NaN in, finite
+    a number that is not finite, without an error; a gradient that differs from the differences; NaN in, finite
     out; an answer that changes by more than 1e-5 when x changes by rounding; a step that grows where the
     physics does not (its fastest mode flips its sign from step to step, or its growth falls with the step).
 

@@ -132,7 +132,7 @@ def work_precision(
     -----
     Every run is warm: it is repeated until its time has settled, and one that does not settle has the status
     not_warm and no time. Set-up: the time of problem(...) and of the first set-ups of solvers. Backward: the time
-    of value and gradient less that of the value. Peak bytes: what Python's allocator saw in one run. A run that
+    of value and gradient less the time of the value. Peak bytes: what Python's allocator saw in one run. A run that
     fails keeps its row, with the status of its solve or the name of its error.
 
     Examples

@@ -120,7 +120,7 @@ def test_the_report(scene, tmp_path, capsys):
     assert (
         "of 1 %: direct (cells=16, method=direct), " in page and "no method reaches a gradient error of 0.1 %" in page
     )
-    places = "## Which method for which error?", "fastest at", "## What one gradient computes", "left out: multigrid"
+    places = "## Which method for which error?", "fastest at", "## Work of one gradient", "left out: multigrid"
     assert sorted(places, key=page.index) == list(places)  # each sentence stands under its question
     assert "[audit.md](audit.md)" in page and "[point_load.csv](point_load.csv)" in page
     table = (out / "point_load.md").read_text(encoding="utf-8")
