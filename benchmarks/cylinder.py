@@ -33,14 +33,14 @@ def coefficients(cells):
     """Times, drag and lift coefficients."""
     grid, x, y = channel(cells)
     dt, steps = 0.02 / cells, round(END * cells / 0.02)
-    rub = NU * dp.brinkman(grid)(np.hypot(x - 0.2, y - 0.2) - D / 2)
-    step = dp.flow_step(grid, dt, NU, boundary=SIDES, unstable="allow", friction=rub)  # Courant numbers up to 0.75
+    friction = NU * dp.brinkman(grid)(np.hypot(x - 0.2, y - 0.2) - D / 2)
+    step = dp.flow_step(grid, dt, NU, boundary=SIDES, unstable="allow", friction=friction)  # Courant numbers up to 0.75
     state, found = step.start(grid.join(1.0, 0.0) * 6 * y * (HEIGHT - y) / HEIGHT**2), []
     older = state["v"]
     for number in range(steps):
         before, state = state, step(state)
         ahead = state["v"] + dt * step.pressure_gradient(state["p"] - before["p"])  # before the pressure is corrected
-        taken = grid.faces.volumes * rub * (ahead - 0.5 * (before["v"] - older))
+        taken = grid.faces.volumes * friction * (ahead - 0.5 * (before["v"] - older))
         older = before["v"]
         found.append([number * dt, *(SCALE * np.sum(part) for part in grid.split(taken))])
     return np.array(found).T

@@ -75,8 +75,8 @@ def flow(grid):
         grid, 0.01, 0.1, force=lambda v, s, p: mean(s["heat"]), friction=lambda p: p, scalars={"heat": heat}
     )
 
-    def run(v, u, rub):
-        end = step(step(step.start(v, rub, {"heat": u}), rub), rub)
+    def run(v, u, drag):
+        end = step(step(step.start(v, drag, {"heat": u}), drag), drag)
         return anp.concatenate([end["v"], anp.ravel(end["s"]["heat"])])
 
     return run

@@ -98,7 +98,7 @@ def transport(
         For upwind and van_leer. flux: du/dt = -div(v u), conserves the sum of u times volume. advective: du/dt =
         -v . grad u, preserves constants. Default: flux for a velocity on faces, advective for one on cells.
     backtrace : "euler" or "midpoint"
-        For semi_lagrangian and maccormack: whether departure points are found along the velocity at the point itself or
+        For semi_lagrangian and maccormack: whether departure points lie along the velocity at the point itself or
         along the velocity half way.
     clamp : bool
         For maccormack: whether to clamp to the least and greatest sample of the cell around the departure point.

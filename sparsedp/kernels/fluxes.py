@@ -404,9 +404,9 @@ def stage(
                     if slopes.size:
                         for j in range(b, e):
                             into = sign * speed[m + j]
-                            own = slopes[a, upper % slopes_per_axis, c + j]
+                            mine = slopes[a, upper % slopes_per_axis, c + j]
                             theirs = inner * slopes[a, (1 - upper) % slopes_per_axis, i + j]
-                            enters[j] += (1.0 - 2.0 * upper) * (max(into, 0.0) * theirs + max(-into, 0.0) * own)
+                            enters[j] += (1.0 - 2.0 * upper) * (max(into, 0.0) * theirs + max(-into, 0.0) * mine)
         for j in range(size):
             weight = 1.0 - leaves[j]
             new = keep * u0[c + j] + (1.0 - keep) * (weight * u[c + j] + enters[j])
@@ -593,7 +593,7 @@ def slope_vjp(
 def _slopes(u, inflow, free, table, axes, slopes, partials, start, stop):
     """Set the slopes given by `limiter` and, if `partials` is not empty, their derivatives."""
     memory = np.empty((2, LINE))
-    found = np.empty((6, LINE))
+    limited = np.empty((6, LINE))  # behind, ahead, and the derivatives of both in a and b
     lines = np.ones(3 * LINE)
     slopes_per_axis = slopes.shape[1]
     all_open = free[:, :0]
@@ -617,17 +617,17 @@ def _slopes(u, inflow, free, table, axes, slopes, partials, start, stop):
             if partials.size:
                 for j in range(size):
                     results = limiter(memory[0, j], memory[1, j], lines[j], lines[ONE + j])
-                    found[1, j], found[0, j], found[4, j], found[5, j], found[2, j], found[3, j] = results
+                    limited[1, j], limited[0, j], limited[4, j], limited[5, j], limited[2, j], limited[3, j] = results
             else:
                 for j in range(size):
-                    found[1, j], found[0, j] = limiter(memory[0, j], memory[1, j], lines[j], lines[ONE + j])[:2]
+                    limited[1, j], limited[0, j] = limiter(memory[0, j], memory[1, j], lines[j], lines[ONE + j])[:2]
             for k in range(2 - slopes_per_axis, 2):  # behind, ahead
                 for j in range(size):
-                    slopes[a, k % slopes_per_axis, c + j] = found[k, j]
+                    slopes[a, k % slopes_per_axis, c + j] = limited[k, j]
                 if partials.size:
                     for j in range(size):
-                        partials[a, k % slopes_per_axis, 0, c + j] = found[2 + 2 * k, j]
-                        partials[a, k % slopes_per_axis, 1, c + j] = found[3 + 2 * k, j]
+                        partials[a, k % slopes_per_axis, 0, c + j] = limited[2 + 2 * k, j]
+                        partials[a, k % slopes_per_axis, 1, c + j] = limited[3 + 2 * k, j]
 
 
 def slope_loop(name: str, function: Callable[..., tuple[Any, ...]], **options: Any) -> Kernel:

@@ -223,8 +223,8 @@ def test_forces_and_viscosities(rng, convective):
     v = rng.standard_normal(grid.faces.size)
     held = np.arange(grid.faces.size)
     friction = lambda p: p * held
-    for f, nu, rub in ((force, viscosity, friction), tuple(map(reusing, (force, viscosity, friction)))):
-        step = dp.flow_step(grid, 1e-3, viscosity=nu, force=f, convective=convective, friction=rub)
+    for f, nu, drag in ((force, viscosity, friction), tuple(map(reusing, (force, viscosity, friction)))):
+        step = dp.flow_step(grid, 1e-3, viscosity=nu, force=f, convective=convective, friction=drag)
         run = lambda v, p, step=step: dp.rollout(step, step.start(v, p), p, 3)["v"]
         found = run(v, 0.5), *dp.value_and_grad(lambda p, run=run: anp.sum(run(v, p) ** 2))(0.5)
         if f is force:

@@ -17,8 +17,8 @@ def scene(shape=(8, 6), **given):
     grid = dp.Grid(shape, size=(1.0, 0.75), **given)
     x, y = (grid.join(*(grid.face_centres(axis)[a] for axis in (0, 1))) for a in (0, 1))
     distance = np.hypot(x - 0.4, y - 0.4)
-    rub = dp.brinkman(grid)
-    return grid, distance, lambda radius: 0.05 * rub(distance - radius)
+    drag = dp.brinkman(grid)
+    return grid, distance, lambda radius: 0.05 * drag(distance - radius)
 
 
 def twin(grid, dt, v, f, n):

@@ -127,9 +127,9 @@ def test_scalars_and_friction_preserve_a_uniform_flow():
     grid = flow.grid
     sides = dict.fromkeys(flow.grid.axes, dp.dirichlet)
     heat = {"diffusivity": 0.01, "boundary": sides, "values": np.ones(18)}
-    rub = dp.brinkman(grid)(np.full(grid.faces.size, 1e3))
+    friction = dp.brinkman(grid)(np.full(grid.faces.size, 1e3))
     step = dp.flow_step(
-        grid, 0.02, 0.01, boundary=flow.sides, walls=lambda p: flow.walls, scalars={"heat": heat}, friction=rub
+        grid, 0.02, 0.01, boundary=flow.sides, walls=lambda p: flow.walls, scalars={"heat": heat}, friction=friction
     )
     end = dp.rollout(step, step.start(flow.v, None, {"heat": np.ones(grid.shape)}), None, 3)
     np.testing.assert_allclose(end["v"], flow.v, rtol=0, atol=1e-12)
@@ -203,10 +203,10 @@ def cylinder(angle, cells=10, far=8.0):
     sides = {"x": (dp.inflow, dp.outflow), "y": (dp.inflow, dp.outflow) if angle else (dp.free_slip, dp.free_slip)}
     walls = dp.face_lift(grid, sides).domain.join(*(along[::-1] if angle else [0.0]))
     x, y = (grid.join(*(grid.face_centres(c)[a] for c in (0, 1))) for a in (0, 1))
-    rub = dp.brinkman(grid)(np.hypot(x, y) - 0.5)
+    friction = dp.brinkman(grid)(np.hypot(x, y) - 0.5)
     nu = 1 / 40
-    state = steady_flow(grid, sides, grid.join(*along), walls, nu, rub)
-    on = [part.sum() for part in grid.split(grid.faces.volumes * nu * rub * state["v"])]
+    state = steady_flow(grid, sides, grid.join(*along), walls, nu, friction)
+    on = [part.sum() for part in grid.split(grid.faces.volumes * nu * friction * state["v"])]
     around = dp.forces(grid, boundary=sides, cells=np.hypot(*grid.centres()) < 0.9)(state["v"], state["p"], nu, walls)
     turned = np.array([along, [-along[1], along[0]]])
     return 2 * turned @ on, 2 * turned @ around[:2]

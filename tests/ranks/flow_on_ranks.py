@@ -148,13 +148,13 @@ def flows():
     hot = {"diffusivity": 0.01, "boundary": {"x": dp.dirichlet}, "source": lambda s, p: p * s["heat"] - s["dye"]}
     scalars = {"heat": hot | {"values": np.linspace(0.5, 1.0, 44)}, "dye": {}}
     push = lambda v, s, p: p * anp.mean(s["heat"]) * v
-    rub = lambda p: p * np.arange(262.0)
+    drag = lambda p: p * np.arange(262.0)
     cases = [
         (box, {"viscosity": 0.01, "implicit": True, "solid": BLOCK[:12, :10]}),
         (box, {"viscosity": 0.01, "boundary": x, "convective": False, "walls": np.linspace(0, 1, 262)}),
         (box, {"viscosity": 0.01, "scalars": scalars, "force": push}),
         (box, {"scalars": scalars, "solid": mild > 0, "implicit": True, "viscosity": 0.1}),
-        (box, {"viscosity": lambda p: 0.01 * p, "friction": rub}),
+        (box, {"viscosity": lambda p: 0.01 * p, "friction": drag}),
         (room, {"viscosity": 0.001, "friction": 0.5 + np.zeros(room.faces.size)}),
     ]
     for plain, options in cases:
