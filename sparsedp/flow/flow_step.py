@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sparsedp._utils.calls import public
+from sparsedp._utils.calls import deprecated_attribute, public
 from sparsedp._utils.pytree import copied, mapped
 from sparsedp._utils.reconstruction import Remade
 from sparsedp._utils.validation import (
@@ -282,6 +282,8 @@ class FlowStep(Remade):
         Tangential velocities of walls.
     scalars : dict of Scalar
     """
+
+    slope = deprecated_attribute("slope", "pressure_gradient", "0.5")
 
     def __init__(self, settings: FlowSettings) -> None:
         grid = settings.grid

@@ -344,3 +344,9 @@ def test_sources_have_the_shape_of_their_field():
         with pytest.raises(error, match=message):
             step.start(np.zeros(grid.faces.shape), None, {"heat": heat})
     assert np.all(heat == 1.0)
+
+
+def test_deprecated_name_of_the_pressure_gradient():
+    step = dp.flow_step(dp.Grid((2, 2)), 0.1)
+    with pytest.warns(DeprecationWarning, match="FlowStep.slope is deprecated .* write FlowStep.pressure_gradient"):
+        assert step.slope is step.pressure_gradient
