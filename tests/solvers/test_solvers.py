@@ -1,4 +1,4 @@
-"""The adjoint contract: what every solve promises, whatever the method."""
+"""The solve contract, which every method meets."""
 
 import re
 
@@ -68,7 +68,7 @@ def test_solution_and_adjoint_against_dense_algebra(problem, method, rng):
 @EVERY
 @pytest.mark.parametrize("problem", ALL)
 def test_the_adjoint_is_the_transpose(problem, method, rng):
-    """Also where the operator is singular: inv = P A+ P, so that inv.T = P^T A+^T P^T."""
+    """Singular operators too: inv = P A+ P, so that inv.T = P^T A+^T P^T."""
     takes(problem, method)
     op = ALL[problem]()
     inv = dp.inverse(op, method, nullspace="project")
@@ -120,7 +120,7 @@ def test_solutions_beyond_the_range_of_floats_are_refused():
 
 
 class Scripted(Engine):
-    """An engine that says it is done, with an error of its own."""
+    """An engine that reports success, with an error that the test sets."""
 
     method = "scripted"
 

@@ -1,4 +1,4 @@
-"""Every message of the solvers, printed once. A message says what was given and what to write instead."""
+"""Messages of the solvers: what was given, and what to write instead."""
 
 import re
 from collections.abc import Callable

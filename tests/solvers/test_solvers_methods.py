@@ -71,7 +71,7 @@ def test_builds_are_deterministic_and_leave_the_random_state():
 
 
 def test_the_coarse_solve_drops_the_constants_and_nothing_else(rng):
-    """Anisotropy of 1e-12: true modes lie below any threshold that a pseudo-inverse could use."""
+    """With an anisotropy of 1e-12 true modes lie below any threshold that a pseudo-inverse could use."""
     grid = dp.Grid((8, 8))
     weights = dp.diagonal(grid.faces, grid.join(1.0, 1e-12))
     op = -dp.divergence(grid) @ weights @ dp.gradient(grid)
@@ -151,7 +151,7 @@ def test_preconditioners(rng):
 
 
 def test_a_stale_preconditioner_costs_iterations_but_no_digits(rng):
-    """A hierarchy of other coefficients: the true operator decides."""
+    """The hierarchy is of other coefficients; the residual is that of the operator itself."""
     k = coefficients("inclusion", 32)
     old = heterogeneous(np.ones((32, 32)))
     new = heterogeneous(k)
@@ -173,7 +173,7 @@ def test_an_indefinite_operator_is_named():
 @pytest.mark.parametrize("method", ["multigrid", *(["structured"] if compiled() else [])])
 @pytest.mark.parametrize("nu", [1e-3, 1.0, 1e3])
 def test_obstacles_held_at_zero_are_found_by_substitution(method, nu, rng):
-    """Their rows of 1 - nu L read the fluid, and no row reads them: beside the solves they are an assignment."""
+    """Rows of 1 - nu L in obstacles use values of the fluid, and no row of the fluid uses theirs."""
     grid = dp.Grid((12, 15), size=(1.0, 2.0))
     solid = np.hypot(*(x - 0.4 for x in grid.centres())) < 0.25
     L = dp.laplacian(grid, {"x": (dp.dirichlet, dp.neumann)}, solid, dp.dirichlet)
@@ -275,7 +275,7 @@ def test_dense_and_sparse_factors(rng):
 
 
 def test_a_symmetric_matrix_without_a_diagonal(rng):
-    """Pivots have to leave the diagonal."""
+    """Pivots on the diagonal would be 0."""
     block = rng.standard_normal((50, 50))
     matrix = np.block([[np.zeros((50, 50)), block], [block.T, np.zeros((50, 50))]])
     inv = dp.inverse(dp.from_matrix(matrix))

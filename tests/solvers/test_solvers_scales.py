@@ -73,7 +73,7 @@ def test_bits_follow_the_coefficients(how, dim, method, capfd):
 
 @pytest.mark.parametrize("method", ["krylov", "multigrid"])
 def test_many_faint_regions_leave_the_whole_its_tolerance(method):
-    """The residual is relative to the data as they were given, not to those of 3000 regions lifted to their size."""
+    """The residual is relative to the data as given, not to the data of 3000 regions scaled up to their size."""
     chain = sp.diags_array([-np.ones(199), np.full(200, 2.01), -np.ones(199)], offsets=[-1, 0, 1])
     pair = np.array([[2.5, -1.0], [-1.0, 2.5]])
     op = dp.from_matrix(sp.csr_array(sp.block_diag([chain, *[pair] * 3000])))
@@ -87,7 +87,7 @@ def test_many_faint_regions_leave_the_whole_its_tolerance(method):
 @pytest.mark.parametrize("closed", [False, True])
 @pytest.mark.parametrize("method", ["direct", "multigrid", "structured", "krylov"])
 def test_a_region_with_faint_data_has_digits_of_its_own(method, closed):
-    """Two rooms that nothing links, with data of 1e-30 in one of them, forward and backward."""
+    """Two regions without links, with data of 1e-30 in one of them, forward and adjoint."""
     if method == "structured" and not kernels.compiled():
         pytest.skip("structured needs numba")
     grid = dp.Grid((12, 11), size=1.0)

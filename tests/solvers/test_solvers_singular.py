@@ -31,7 +31,7 @@ def weighted_mean(grid, x):
 @pytest.mark.parametrize("grid", [dp.Grid((20, 22)), stretched(20, 22)], ids=["uniform", "stretched"])
 @pytest.mark.parametrize("defect", [1e-14, 1e-7, 1.0])
 def test_neumann_defects(grid, method, defect, rng):
-    """Rounding passes, a small defect is recorded, a large one refused; the weights are the volumes."""
+    """Rounding is accepted, a small defect is recorded, a large one is refused; the weights are the volumes."""
     b = rng.standard_normal(grid.shape)
     b -= weighted_mean(grid, b)
     w = grid.volumes
@@ -126,7 +126,7 @@ def test_each_region_has_its_own_mean(method, count, rng):
 
 
 def test_rounding_on_a_region_without_data_is_not_refused():
-    """Rounding left by a divergence, on a region where nothing happens, is below the tolerance."""
+    """Rounding errors of a divergence on a region without data are below the tolerance."""
     grid = dp.Grid((14, 9))
     solid = walled(3)[:14]
     inv = dp.inverse(neumann(grid, solid))
@@ -155,7 +155,7 @@ def test_data_in_solids_and_islands(method):
 
 @GENERAL
 def test_solids_with_dirichlet_faces(method, rng):
-    """Rows of solid cells hold the flux into them; these cells are left out all the same."""
+    """Rows of solid cells hold the flux into them; these cells are left out of the solve."""
     grid = dp.Grid((21, 20), size=1.0)
     x, y = grid.centres()
     solid = (x - 0.5) ** 2 + (y - 0.4) ** 2 < 0.04
@@ -341,7 +341,7 @@ def test_systems_without_unknowns(method):
 
 @pytest.mark.parametrize("share, stretched", [(0.45, False), (0.6, False), (0.6, True)])
 def test_multigrid_ignores_rounding_residues(share, stretched):
-    """Regions that shrink to one unknown on a coarse level have a row of rounding there, and no equation."""
+    """A region of one unknown on a coarse level has a row of rounding errors there, and no equation."""
     for seed in range(4):
         rng = np.random.default_rng(seed)
         spacing = (rng.uniform(0.5, 2.0, 30), rng.uniform(0.5, 2.0, 26)) if stretched else None

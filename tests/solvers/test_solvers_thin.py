@@ -61,7 +61,7 @@ def test_thin_scenes(make, boundary, rng):
 
 
 def test_thin_scenes_in_elliptic_solver_go_to_multigrid(rng):
-    """Few solves are expected of a coefficient: no LU, and no point smoothing."""
+    """Few solves are expected for each coefficient: neither LU nor point smoothing is chosen."""
     grid = dp.Grid((160, 150), size=(1.0, 1e-4))
     solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet))
     solve(rng.uniform(1.0, 2.0, grid.faces.size), rng.standard_normal(grid.shape))

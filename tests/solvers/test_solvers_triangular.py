@@ -49,8 +49,8 @@ def blocks(rng, dtype=float):
     return sp.csr_array(matrix[order][:, order])
 
 
-def peeled(matrix, links):
-    """The unknowns that are found one after the other, each of which only links to those found before."""
+def removed(matrix, links):
+    """Return the unknowns that are removed one after the other, each of which uses only those removed before."""
     found = set()
     size = matrix.shape[0]
     while True:
@@ -74,9 +74,9 @@ def test_the_unknowns_found_by_substitution_are_those_of_repeated_removal(seed, 
     matrix = blocks(np.random.default_rng(seed), dtype)
     links = matrix.toarray() != 0
     found = split(matrix, None)
-    first = peeled(matrix, links)
+    first = removed(matrix, links)
     assert set(found.first.tolist()) == first
-    assert set(found.last.tolist()) == peeled(matrix, links.T) - first
+    assert set(found.last.tolist()) == removed(matrix, links.T) - first
     assert np.count_nonzero(found.coupled) == 40 - found.size >= 11 and found.first.size > 5 and found.last.size > 5
     assert split(sp.csr_array(np.ones((5, 5))), None) is None
 
@@ -105,7 +105,7 @@ def test_every_method_solves_the_coupled_unknowns(method, rng):
 
 
 def test_a_long_chain(both):
-    """The recursion of one call for each unknown ended in a RecursionError."""
+    """A recursion with one call for each unknown would raise RecursionError."""
     size = 1_000_000 if kernels.compiled() else 52_000
     inv = dp.inverse(dp.from_matrix(chain(size)))
     assert inv(np.ones(size))[-1] == pytest.approx(10.0, rel=1e-14)
@@ -126,7 +126,7 @@ WINDS = [
 @pytest.mark.parametrize("method", ["auto", "direct", "multigrid", "structured"])
 @pytest.mark.parametrize("shape, signs", WINDS)
 def test_upwind_sweeps(shape, signs, method, rng, both):
-    """Steady and in an implicit step, for winds from all sides."""
+    """Steady and in an implicit step, for winds in all directions."""
     op = sweep(shape, signs)
     x = rng.standard_normal(shape)
     for A in (op, dp.identity(op.domain) + 0.3 * op):
@@ -139,7 +139,7 @@ def test_upwind_sweeps(shape, signs, method, rng, both):
 
 @pytest.mark.parametrize("shape", [(256, 256), (32, 32, 32)])
 def test_a_sweep_takes_no_longer_than_that_of_scipy(shape):
-    """At most three times the processor's seconds of `spsolve_triangular`; the best of a few runs of each in turn."""
+    """At most three times the CPU time of `spsolve_triangular`, the minimum of a few alternating runs."""
     op = sweep(shape, (1,) * len(shape))
     matrix = op.matrix
     b = np.ones(shape)
@@ -176,7 +176,7 @@ def test_a_long_pipe_in_an_implicit_step():
 
 @pytest.mark.parametrize("signs", [(1, 1), (-1, 1)])
 def test_derivatives_in_the_entries(signs, rng):
-    """Values, first and second derivatives of a sweep given by its entries, beside dense algebra."""
+    """Values, first and second derivatives of a sweep given by its entries, compared with dense algebra."""
     matrix = sp.coo_array(sweep((4, 5), signs).matrix)
     solve = dp.matrix_solver.from_coo(matrix.row, matrix.col)
     data = matrix.data
@@ -203,7 +203,7 @@ def test_derivatives_in_the_entries(signs, rng):
 @pytest.mark.parametrize("scheme", ["backward_euler", "tr_bdf2"])
 @pytest.mark.parametrize("sign", [1, -1])
 def test_derivatives_in_the_wind(scheme, sign, rng):
-    """Of an implicit step, beside a dense one of the same scheme."""
+    """Of an implicit step, compared with a dense one of the same scheme."""
     grid = dp.Grid((5, 4), size=1.0)
     x, y = (dp.upwind(grid, axis, sign, {axis: SIDES[sign]}) for axis in "xy")
     dense_x = x.matrix.toarray()
@@ -238,7 +238,7 @@ def test_derivatives_in_the_wind(scheme, sign, rng):
 
 
 def network():
-    """A chain of reservoirs that drains into a closed pair, and a gauge that reads the pair."""
+    """A chain of reservoirs that drains into a closed pair, and a gauge that uses the levels of the pair."""
     matrix = np.array(
         [
             [2.0, 0.0, 0.0, 0.0, 0.0],
@@ -357,7 +357,7 @@ def test_the_choice_depends_on_the_coupled_unknowns():
 
 
 def test_refusals_name_the_operator_that_was_given():
-    """And not the part of it that is solved for."""
+    """They do not name the part of it that is solved."""
     matrix = sp.block_diag([chain(3), np.array([[2.0, 1.0], [1.0, -2.0]])])
     with pytest.raises(
         ValueError, match="of one sign; <matrix: space.5. -> space.5., explicit> has -2.0e.00 and 2.0e.00"
@@ -404,7 +404,7 @@ def two_fields(shape, signs):
 
 
 def lines(n):
-    """Rings of n cells, each of which reads the one before it."""
+    """Rings of n cells; each ring uses the one before it."""
     grid = dp.Grid((9, n), size=1.0, periodic=(False, True))
     return (dp.upwind(grid, "x", 1, {"x": SIDES[1]}) + dp.upwind(grid, "y") + dp.identity(grid.cells)).matrix
 
@@ -420,7 +420,7 @@ def between(rng):
 @pytest.mark.parametrize("dtype", [float, complex])
 @pytest.mark.parametrize("kind", ["two fields", "rings", "sweep between cycles"])
 def test_blocks_are_factored_one_by_one(kind, dtype, rng):
-    """Nothing is filled in between them, forward and transposed, in any numbering."""
+    """There is no fill-in between blocks, forward and transposed, in any numbering."""
     matrix = {"two fields": two_fields((9, 8), (1, -1)), "rings": lines(80), "sweep between cycles": between(rng)}[kind]
     matrix = (matrix * (1 + 0.3j) if dtype is complex else matrix).tocsr()
     order = rng.permutation(matrix.shape[0])
@@ -443,7 +443,7 @@ def test_a_singular_block_is_refused(rng):
 
 
 def test_auto_takes_lu_for_many_small_blocks():
-    """The limits are about the largest block."""
+    """The limits apply to the largest block."""
     matrix = two_fields((160, 161), (1, -1))
     inv = dp.inverse(dp.from_matrix(matrix))
     assert inv.method == "direct" and "51520 unknowns without a grid, in blocks of at most 2, one after" in inv.reason

@@ -167,7 +167,7 @@ def test_wrong_shapes():
 @EVERY
 @pytest.mark.parametrize("problem", ["wind", "stretched neumann"])
 def test_derivatives_of_every_order(problem, method, rng):
-    """Only primal data must be compatible: no cotangent or tangent of any order is refused."""
+    """Only primal data must be in the range: no cotangent or tangent of any order is refused."""
     op = ALL[problem]()
     inv, free = (dp.inverse(op, method, nullspace=word) for word in ("raise", "project"))
     b = op(rng.standard_normal(op.domain.shape))
@@ -191,7 +191,7 @@ def test_derivatives_of_every_order(problem, method, rng):
     "wrap", [lambda inv: 2 * inv, lambda inv: inv + inv, lambda inv: dp.mask(inv.domain, BOX) @ inv]
 )
 def test_products_and_sums_with_an_inverse_refuse_no_cotangent(wrap, rng):
-    """The transpose of a transpose is the twin that never refuses, also inside scalings, sums and chains."""
+    """The transpose of a transpose refuses no data, also inside scalings, sums and chains."""
     op = ALL["stretched neumann"]()
     strict, free = (wrap(dp.inverse(op, nullspace=word)) for word in ("raise", "project"))
     b = op(rng.standard_normal(op.domain.shape))
@@ -204,7 +204,7 @@ def test_products_and_sums_with_an_inverse_refuse_no_cotangent(wrap, rng):
 
 
 def test_projection_in_a_chain_has_second_derivatives(rng):
-    """Divergences are compatible; the cotangents inside are projected, never refused."""
+    """Divergences are in the range; the cotangents inside are projected, never refused."""
     grid = stretched(6, 5)
     G = dp.gradient(grid)
     D = dp.divergence(grid)
@@ -219,7 +219,7 @@ def test_projection_in_a_chain_has_second_derivatives(rng):
 
 
 def used(method):
-    """Make and differentiate solves; weak references to all that was set up."""
+    """Set up and differentiate solves; return weak references to all set-ups."""
     op = ALL["wind"]()
     grid = stretched(20, 19)
     inv = dp.inverse(op, method)

@@ -17,7 +17,7 @@ def across(n, strength, upwards=-1):
 
 
 def vortex(n, strength):
-    """Closed stream lines: nothing flows in or out."""
+    """Closed streamlines without inflow or outflow."""
     grid = dp.Grid((n, n), size=1.0)
     x, y = np.meshgrid(*[np.linspace(0.0, 1.0, n + 1)] * 2, indexing="ij")
     v = strength * dp.curl(grid)((np.sin(np.pi * x) * np.sin(np.pi * y)) ** 2)
@@ -31,7 +31,7 @@ def vortex(n, strength):
 @pytest.mark.parametrize("make", [across, vortex])
 @pytest.mark.parametrize("n", [60, 100])
 def test_strong_winds(n, make, strength, rng):
-    """Forward and adjoint take as many iterations, within 20 %, from one set-up."""
+    """Forward and adjoint solves take the same number of iterations, within 20 %, with one set-up."""
     op = make(n, strength)
     with recording() as calls:
         inv = dp.inverse(op, "multigrid")
