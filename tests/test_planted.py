@@ -214,8 +214,8 @@ BUGS = {
     ),
     "a stale set-up after a change of the coefficient": Bug(
         "solvers",
-        "known = self._cache.find((k, shift))",
-        "known = self._cache.last",
+        "inverse = self._cache.find((k, shift))",
+        "inverse = self._cache.last",
         "tests/solvers/test_elliptic.py",
     ),
     "a residual tested before unscaling": Bug(

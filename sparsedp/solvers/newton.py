@@ -118,7 +118,7 @@ class Unknowns:
         arrays = [plain(leaf) for leaf in arrays]
         for leaf in arrays:
             _check_unknown(leaf, name)
-        # Rebuilt without values: this object is kept, and must hold neither a trace nor a large array.
+        # Rebuilt without values: caches refer to this object, and it must hold neither a trace nor a large array.
         self.tree = rebuild([None] * len(arrays))
         _, self.rebuild = flatten(self.tree)
         self.shapes = [np.shape(leaf) for leaf in arrays]
@@ -216,7 +216,7 @@ class Equation:
         param_leaves, rebuild = flatten(params)
         self._variable_places = [place for place, leaf in enumerate(param_leaves) if is_variable(leaf)]
         self.statics = [None if is_variable(leaf) else constant(leaf) for leaf in param_leaves]
-        _, self._rebuild = flatten(rebuild(self.statics))  # equations are kept, and must hold no trace
+        _, self._rebuild = flatten(rebuild(self.statics))  # caches refer to equations, which must hold no trace
 
     @property
     def size(self) -> int:

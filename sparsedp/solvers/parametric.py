@@ -115,9 +115,9 @@ class ParametricSolver(Remade):
         """Return the inverse for these values, from the cache or new."""
         k = _in_floating_dtype(k)
         shift = _in_floating_dtype(shift)
-        known = self._cache.find((k, shift))
-        if known is not None:
-            return known
+        inverse = self._cache.find((k, shift))
+        if inverse is not None:
+            return inverse
         exponent = _exponent_out_of_range(k, shift)
         scaled_k = shifted(k, -exponent) if exponent else k.copy()
         scaled_shift = shifted(np.atleast_1d(shift), -exponent).reshape(np.shape(shift))
@@ -181,7 +181,7 @@ def elliptic_solver(
         and >= 0 or complex, or a tensor for each cell, shape (dim, dim, *grid.shape), its symmetric real part
         positive definite. b is a field on the cells. shift is a number or one for each cell, real or complex.
         Differentiable in all three, to every order. A set-up is built for each new content of (k, shift); the last
-        two are kept.
+        two are cached.
 
     Raises
     ------
@@ -386,12 +386,12 @@ class TensorSolver(ParametricSolver):
         return Operator(structure, self.G.domain, self.D.codomain, "shift - divergence of tensor fluxes")
 
 
-def _checked_parameter(name, given, space, advice="", other_space=None):
+def _checked_parameter(name, parameter, space, advice="", other_space=None):
     """Return a parameter, traced or not, which must be one finite number or a field on `space`.
 
     `advice` says what to write where it is a field on `other_space`.
     """
-    values = as_field(plain(given))
+    values = as_field(plain(parameter))
     if values.shape not in ((), space.shape):
         hint = ""
         if other_space is not None and values.shape == other_space.shape:
@@ -401,7 +401,7 @@ def _checked_parameter(name, given, space, advice="", other_space=None):
         )
     check_kind(name, values.dtype, "numbers", f"; write np.asarray({name}, float)")
     check_finite(name, values)
-    return given if isbox(given) else values
+    return parameter if isbox(parameter) else values
 
 
 class Elliptic(Sum):

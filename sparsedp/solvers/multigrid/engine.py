@@ -35,7 +35,7 @@ PRECISIONS = {"auto": None, "single": np.float32, "double": np.float64}  # optio
 
 THREADED_FROM = 100_000  # cells below which a second thread costs more time than it saves
 MAXITER = 200
-SLOW = 0.3  # a step that leaves more than this share of the residual may have met rounding
+SLOW = 0.3  # a step that leaves more than this share of the residual may have reached the level of rounding
 WEAK_SHARE = 0.1  # of cells: beyond it a cycle with point smoothing takes more than about 30 iterations
 GAUGE_ROUNDING = 1e-6  # relative error of a norm that is measured with weights in single precision
 PATIENCE = 20  # iterations without a smaller residual after which the solve has stagnated
