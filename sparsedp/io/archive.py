@@ -1,18 +1,25 @@
-"""Fields with their grid in files: what the end of a name means."""
+"""Save fields with their grid in files, and load them; the suffix of a name chooses the format."""
+
+from __future__ import annotations
 
 import os
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from sparsedp._utils.validation import check_finite
 from sparsedp.grid.grid import Grid, check_grid
 from sparsedp.io.atomic_files import load_tree, save_tree
 from sparsedp.io.contents import KIND, OTHERS, REAL, check_fields
 
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
 __all__ = ["load", "save"]
 
-LABELLED, PARAVIEW = (".nc", ".zarr"), (".vti", ".vtr", ".pvd")
-NEEDS = {  # of the extra `files`
+LABELLED = (".nc", ".zarr")
+PARAVIEW = (".vti", ".vtr", ".pvd")
+NEEDS: dict[str, tuple[str, ...]] = {  # of the extra `files`
     ".npz": (),
     ".nc": ("xarray", "h5netcdf", "h5py"),
     ".zarr": ("xarray", "zarr"),
@@ -21,49 +28,58 @@ NEEDS = {  # of the extra `files`
 DTYPES = {".npz": None, **dict.fromkeys(LABELLED, REAL + OTHERS), **dict.fromkeys(PARAVIEW, REAL)}
 
 
-def save(path, grid, /, *, times=None, attrs=None, at=None, **fields):
-    """Grid and fields on it -> a file, or a series of files; what its name ends in says of which kind.
+def save(
+    path: str | os.PathLike,
+    grid: Grid,
+    /,
+    *,
+    times: ArrayLike | None = None,
+    attrs: dict | None = None,
+    at: dict[str, str] | None = None,
+    **fields: ArrayLike,
+) -> None:
+    """Save a grid and fields on it in a file, or a series in several files; the suffix chooses the format.
 
     =========== ==============================================================================================
-    .npz        NumPy alone. `load` gives the same bits.
-    .nc, .zarr  A Dataset of xarray (`dp.interop.to_xarray` says what is in it) as NetCDF 4, or as a folder of
-                Zarr, with a checksum. `load` gives the same bits, bytes in the order of this machine.
-    .vti, .vtr  For ParaView, of a uniform grid or of any. Fields on cells are cell data, on nodes point data. Fields
-                on faces or edges become vectors in the cells: each component is the mean of the 2 faces, or of the 2
-                or 4 edges, of a cell. An entry of a batch has its number in the name. In 1-D and 2-D the other axes
-                have one cell, as wide as the first of x. `load` does not read these files.
+    .npz        NumPy alone. `load` returns the same bits.
+    .nc, .zarr  A Dataset of xarray (see `dp.interop.to_xarray`) as NetCDF 4, or as a folder of Zarr, with a checksum.
+                `load` returns the same bits, bytes in the order of this machine.
+    .vti, .vtr  For ParaView: .vti for a uniform grid, .vtr for any grid. Fields on cells are cell data, on nodes point
+                data. Fields on faces or edges are stored as vectors in the cells: each component is the mean of the 2
+                faces, or of the 2 or 4 edges, of a cell. An entry of a batch has its number in the name. In 1-D and
+                2-D the other axes have one cell, as wide as the first one along x. `load` does not read these files.
     .pvd        The same at each of `times`: wind.pvd, and wind/0000.vtr and so on.
     =========== ==============================================================================================
 
-    What has this name is replaced, once the new file or folder is whole; the files of a series are so one by one.
+    An existing file or folder of this name is replaced once the new one is complete; of a series, file by file.
 
     Parameters
     ----------
     path : str or path
     grid : Grid
-        Stretched axes, origin and periodic axes are kept, but that ParaView knows of no periodic axes.
+        Stretched axes, origin and periodic axes are stored; files for ParaView do not store periodicity.
     times : array, shape (n,), optional
         Times [time] of a series: then each field has n entries in its first axis.
     attrs : dict, optional
-        Units, or a dict of attributes, by the name of a field, "x", "y", "z" or "times", for those who read .nc and
-        .zarr elsewhere: ``{"x": "m", "u": {"units": "m/s", "long_name": "speed"}}``.
+        Units, or a dict of attributes, by the name of a field, "x", "y", "z" or "times", for other readers of .nc and
+        .zarr files: ``{"x": "m", "u": {"units": "m/s", "long_name": "speed"}}``.
     at : dict of str, optional
-        "cells", "faces", "nodes" or "edges" by the name of a field, where the first that fits is not the one.
+        "cells", "faces", "nodes" or "edges" by the name of a field; default: the first of them whose shape fits.
     **fields : arrays, shape (..., *space.shape)
         On cells, faces, nodes or edges of the grid; leading axes are a batch.
 
     Raises
     ------
     ShapeError
-        If an array is no field on the grid, or has not one entry for each time.
+        If an array is no field on the grid, or does not have one entry for each time.
     TypeError
-        If a field is no plain array of numbers: a value on a tape, a tensor, a field on ranks; or has a dtype that the
-        file has not: half precision; for ParaView complex numbers and truth values. Or if attributes are neither text
-        nor numbers.
+        If a field is no plain array of numbers (a traced value, a tensor, a distributed field), if its dtype cannot be
+        stored (half precision; for ParaView also complex numbers and bools), or if attributes are neither text nor
+        numbers.
     ValueError
-        If the name ends otherwise, or the file cannot hold this grid, a series, or attributes.
+        If the suffix is another one, or the file cannot hold this grid, a series, or attributes.
     ImportError
-        If a library is missing; the extra `files` brings all but those of .npz.
+        If a library is missing; the extra `files` installs all of them; .npz needs none.
     OSError
         If the file cannot be written.
 
@@ -85,9 +101,9 @@ def save(path, grid, /, *, times=None, attrs=None, at=None, **fields):
         _check_for_paraview(suffix, grid, times, content)
     _check_installed("save", suffix)
     if suffix == ".npz":
-        made = {"shape": grid.shape, "spacing": grid.widths, "origin": grid.origin, "periodic": grid.periodic}
+        arguments = {"shape": grid.shape, "spacing": grid.widths, "origin": grid.origin, "periodic": grid.periodic}
         arrays = {field: values for field, (_, values) in content.items()}
-        save_tree(path, {"grid": made, "times": times, "fields": arrays}, KIND)
+        save_tree(path, {"grid": arguments, "times": times, "fields": arrays}, KIND)
     elif suffix in LABELLED:
         from sparsedp.io import labelled
 
@@ -102,7 +118,7 @@ def save(path, grid, /, *, times=None, attrs=None, at=None, **fields):
 
 
 def _check_for_paraview(suffix, grid, times, content):
-    """Refuse what its files cannot hold."""
+    """Raise ValueError if a file for ParaView cannot hold the fields."""
     if (times is None) == (suffix == ".pvd"):
         raise ValueError(f"save puts one state into .vti or .vtr, and a series with times into .pvd, got {suffix}")
     if times is not None:
@@ -113,8 +129,8 @@ def _check_for_paraview(suffix, grid, times, content):
         )
 
 
-def load(path):
-    """File that `save` wrote -> (grid, fields).
+def load(path: str | os.PathLike) -> tuple[Grid, dict[str, Any]]:
+    """Load the grid and the fields of a file that `save` wrote.
 
     Parameters
     ----------
@@ -126,14 +142,14 @@ def load(path):
     grid : Grid
         Equal to the one that was saved.
     fields : dict of arrays
-        By name, with shapes and dtypes as saved; and "times", where times were saved.
+        By name, with shapes and dtypes as saved; and "times", if times were saved.
 
     Raises
     ------
     ValueError
-        If the file is another one, damaged, or changed by another program; or if its name ends otherwise.
+        If the file is of another kind, damaged, or changed by another program, or if its suffix is another one.
     ImportError
-        If a library is missing; the extra `files` brings all but those of .npz.
+        If a library is missing; the extra `files` installs all of them; .npz needs none.
     OSError
         If there is no such file, or it cannot be read.
 
@@ -166,6 +182,7 @@ def load(path):
 
 
 def _suffix(name, path, allowed):
+    """Return the suffix of a path, in lower case."""
     if not isinstance(path, (str, os.PathLike)):
         raise TypeError(f"{name} takes the path of a file first, got {type(path).__name__}; write 'fields.npz'")
     suffix = Path(path).suffix.lower()
@@ -179,6 +196,7 @@ def _suffix(name, path, allowed):
 
 
 def _check_installed(name, suffix):
+    """Raise ImportError if a library for a format is missing."""
     for library in NEEDS[suffix]:
         if find_spec(library) is None:
             raise ImportError(f"{name} needs {library} for {suffix} files; install sparsedp[files]")

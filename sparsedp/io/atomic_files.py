@@ -1,12 +1,16 @@
-"""Files that are there whole or not at all, a full disk and a kill included."""
+"""Atomic writing: a file exists in complete form or not at all, even if the disk is full or the process is killed."""
+
+from __future__ import annotations
 
 import contextlib
 import errno
 import json
 import os
 import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 from uuid import uuid4
 
 import numpy as np
@@ -21,25 +25,25 @@ PATH_ADVICE = {
     errno.ENOTDIR: "give a path through folders, a part of this one is a file",
 }
 SEQUENCES = {"list": list, "tuple": tuple}
-UNFINISHED = ".part"  # how the name of a file ends that is being written, or was when its run was killed
+UNFINISHED = ".part"  # suffix of a file that is being written, or was when its process was killed
 
 
-def write_file(path, content):
-    """Text, bytes or ``write(stream)`` -> a file that is whole, under its name; the only way to write one here.
+def write_file(path: str | os.PathLike, content: Any) -> None:
+    """Write a file atomically.
 
-    It is written under another name beside it, synced and renamed. A link is followed, and the mode of a file that
-    is replaced is kept; a device or a pipe is written into.
+    It is written under another name in the same folder, synced and renamed. Links are followed, and the mode of a
+    replaced file is kept; devices and pipes are written directly.
 
     Parameters
     ----------
     path : str or path
     content : str, bytes or callable
-        A function gets the open binary stream.
+        A function is called with the open binary stream.
 
     Raises
     ------
     OSError
-        If the file cannot be written. It names `path`, and what stood there stands there still.
+        If the file cannot be written. It names `path`; an existing file is unchanged.
 
     Examples
     --------
@@ -50,32 +54,32 @@ def write_file(path, content):
     ('1 2 3', 1)
     """
     target = Path(os.path.realpath(path))
-    part = target.parent / f"{target.name[:40]}.{uuid4().hex[:8]}{UNFINISHED}"  # whoever else writes has another
+    part = target.parent / f"{target.name[:40]}.{uuid4().hex[:8]}{UNFINISHED}"  # another writer has another name
     with path_errors(path):
         try:
-            there = target.exists()
-            if there and not target.is_file():
+            exists = target.exists()
+            if exists and not target.is_file():
                 _write(target, "wb", content)
                 return
-            if there:
-                open(target, "rb+").close()  # a file that may not be changed is not replaced either
+            if exists:
+                open(target, "rb+").close()  # raises if the file may not be changed; then it is not replaced
             _write(part, "xb", content)
-            if there:
+            if exists:
                 shutil.copymode(target, part)
             os.replace(part, target)
             _sync(target.parent)
         finally:
-            with contextlib.suppress(OSError):  # it is gone when all went well
+            with contextlib.suppress(OSError):  # it was renamed unless an error occurred
                 part.unlink()
 
 
 @contextlib.contextmanager
-def path_errors(path, reading=False):
-    """Let an OSError inside name `path`, not the unfinished file beside it, and say what to do about the path."""
+def path_errors(path: Any, reading: bool = False) -> Iterator[None]:
+    """Let an OSError inside name `path`, not a temporary file, and add advice about the path."""
     try:
         yield
     except OSError as error:
-        if error.errno is not None:  # else it was raised by a library, with a sentence of its own
+        if error.errno is not None:  # otherwise a library raised it, with its own message
             advice = PATH_ADVICE.get(error.errno)
             if reading and error.errno == errno.ENOENT:  # a new folder does not help
                 advice = None
@@ -87,18 +91,21 @@ def path_errors(path, reading=False):
 
 
 def _write(path, mode, content):
+    """Write content into an opened file."""
     with open(path, mode) as stream:
         if callable(content):
             content(stream)
         else:
-            stream.write(content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content)
+            if isinstance(content, str):
+                content = content.encode("utf-8", "backslashreplace")
+            stream.write(content)
         stream.flush()
         if mode == "xb":
             os.fsync(stream.fileno())
 
 
 def _sync(folder):
-    """The new name of a file on the disk too, where a folder can be synced."""
+    """Sync a folder, so that the new name of a file is on the disk; some systems do not support it."""
     with contextlib.suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:
@@ -107,23 +114,24 @@ def _sync(folder):
             os.close(handle)
 
 
-def write_through(path, write):
-    """``write(name)`` of a library that takes no stream -> a file or a folder that is whole, under its own name.
+def write_through(path: str | os.PathLike, write: Callable) -> None:
+    """Write a file or a folder atomically by a function of a library that takes no stream.
 
     Parameters
     ----------
     path : str or path
     write : callable
-        Gets a name that ends as `path` does, in lower case, in a folder beside it.
+        ``write(name)``: the name has the suffix of `path`, in lower case, and is in a temporary folder beside it.
 
     Raises
     ------
     OSError
-        If it cannot be written. It names `path`, and what stood there stands there still.
+        If it cannot be written. It names `path`; an existing file or folder is unchanged.
     """
     target = Path(os.path.realpath(path))
     with path_errors(path), TemporaryDirectory(suffix=UNFINISHED, dir=target.parent) as folder:
-        part, old = Path(folder, f"new{target.suffix.lower()}"), Path(folder, "old")
+        part = Path(folder, f"new{target.suffix.lower()}")
+        old = Path(folder, "old")
         write(part)
         if part.is_file():
             with open(part, "rb") as whole:
@@ -134,23 +142,27 @@ def write_through(path, write):
                 os.replace(target, old)
             os.replace(part, target)
         except BaseException:
-            if old.exists() and not target.exists():  # what is in this folder is deleted with it
+            if old.exists() and not target.exists():  # the temporary folder is deleted with its content
                 os.replace(old, target)
             raise
 
 
-def save_tree(path, tree, kind):
-    """Any nesting of tuples, lists and dicts of arrays, numbers, strings and None -> a .npz file without pickle.
+def save_tree(path: str | os.PathLike, tree: Any, kind: str) -> None:
+    """Save nested tuples, lists and dicts of arrays, numbers, strings and None in a .npz file without pickle.
 
-    The structure stands beside the arrays as JSON, with a word for the kind of file.
+    The structure is stored as JSON beside the arrays, with a word for the kind of file.
     """
     arrays: list = []
     text = json.dumps({"format": kind, "tree": _words(tree, arrays)})
-    write_file(path, lambda stream: np.savez(stream, np.frombuffer(text.encode(), np.uint8), *arrays))
+
+    def write(stream):
+        np.savez(stream, np.frombuffer(text.encode(), np.uint8), *arrays)
+
+    write_file(path, write)
 
 
-def load_tree(path, kind):
-    """File that `save_tree` wrote -> (the tree,); None when it is another file, or damaged.
+def load_tree(path: str | os.PathLike, kind: str) -> tuple[Any] | None:
+    """Return the tree of a file that `save_tree` wrote, in a tuple; None if the file is of another kind or damaged.
 
     Examples
     --------
@@ -166,13 +178,15 @@ def load_tree(path, kind):
         try:
             with np.load(file, allow_pickle=False) as stored:
                 words = json.loads(bytes(stored["arr_0"]).decode())
-                return (_tree(words["tree"], stored),) if words.get("format") == kind else None
-        except Exception:  # there is no end to what the readers raise on damage
+                if words.get("format") != kind:
+                    return None
+                return (_tree(words["tree"], stored),)
+        except Exception:  # readers raise errors of many classes for damaged files
             return None
 
 
 def _words(tree, arrays):
-    """A tree as JSON holds it; arrays are moved to a list and stand there by number."""
+    """Return a tree as JSON stores it; arrays are appended to a list and replaced by their number."""
     if isinstance(tree, dict):
         if not all(isinstance(key, str) for key in tree):
             raise TypeError("save needs dicts with strings as keys; write str(key)")
@@ -189,9 +203,12 @@ def _words(tree, arrays):
 
 
 def _tree(words, stored):
+    """Return the tree of its form in JSON and the stored arrays."""
     [(kind, value)] = words.items()
     if kind == "dict":
         return {key: _tree(branch, stored) for key, branch in value}
     if kind in SEQUENCES:
         return SEQUENCES[kind](_tree(branch, stored) for branch in value)
-    return stored[f"arr_{value}"] if kind == "array" else value
+    if kind == "array":
+        return stored[f"arr_{value}"]
+    return value

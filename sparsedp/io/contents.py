@@ -1,20 +1,41 @@
-"""What a file of fields may hold: arrays of numbers, each on a space of the grid."""
+"""The content of a file of fields: arrays of numbers, each on a space of the grid."""
+
+from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 
 from sparsedp._utils.validation import check_plain
 from sparsedp.errors import ShapeError
+from sparsedp.grid.grid import Grid
 
 __all__ = ["KIND", "OTHERS", "REAL", "check_fields", "check_names"]
 
 KIND = "sparsedp fields 1"
-REAL, OTHERS = "bBhHiIlLqQfd", "?FD"  # letters of dtypes: what all formats hold, and what not all do
+REAL = "bBhHiIlLqQfd"  # letters of the dtypes that all formats store
+OTHERS = "?FD"  # letters of the dtypes that some formats store
 
 
-def check_fields(name, grid, times, at, fields, dtypes=None):
-    """Arguments of `save` -> times as an array, or None; and the space and the array of each field, by its name.
+def check_fields(
+    name: str, grid: Grid, times: Any, at: dict[str, str] | None, fields: dict[str, Any], dtypes: str | None = None
+) -> tuple[Any, dict[str, Any]]:
+    """Return checked arguments of `save`.
 
-    dtypes: the letters of those that are allowed; None: all numbers.
+    Parameters
+    ----------
+    name : str
+        Of the function, for messages.
+    grid, times, at, fields
+        See `save`.
+    dtypes : str, optional
+        Letters of the allowed dtypes; default: all numbers.
+
+    Returns
+    -------
+    times : array or None
+    content : dict
+        (space, array) of each field, by its name.
     """
     check_names(name, "at", at, fields)
     if times is not None:
@@ -24,35 +45,44 @@ def check_fields(name, grid, times, at, fields, dtypes=None):
     content = {}
     for field, value in fields.items():
         if dtypes and not field.isidentifier():
-            raise ValueError(f"{name} takes names of fields as Python has them, got {field!r}; write another name")
+            raise ValueError(f"{name} takes Python identifiers as names of fields, got {field!r}; write another name")
         numbers = _numbers(name, field, value, dtypes)
         content[field] = _space(field, grid, numbers, times, at or {}), numbers
     return times, content
 
 
-def check_names(name, argument, given, known):
-    """Refuse what is no dict, or one with other keys than some names."""
-    unknown = sorted(set(given or ()) - set(known), key=str) if isinstance(given or {}, dict) else given
+def check_names(name: str, argument: str, entries: Any, known: Any) -> None:
+    """Raise ValueError if an argument is not a dict whose keys are some names."""
+    unknown = entries
+    if isinstance(entries or {}, dict):
+        unknown = sorted(set(entries or ()) - set(known), key=str)
     if unknown:
         raise ValueError(f"{name} takes {argument} as a dict with keys from {[*known]}, got {unknown}; leave them out")
 
 
 def _numbers(name, field, value, dtypes):
+    """Return a field as an array of an allowed dtype."""
     check_plain(name, value)
-    numbers = np.asarray(value) if isinstance(value, (np.ndarray, np.generic, float, int, list, tuple)) else None
+    numbers = None
+    if isinstance(value, (np.ndarray, np.generic, float, int, list, tuple)):
+        numbers = np.asarray(value)
     if numbers is None or numbers.dtype.kind not in "biufc":
         raise TypeError(
             f"{name} takes arrays of numbers, {field} is of type {type(value).__name__}; "
             f"write np.asarray({field}), or dp.gather({field}) on ranks"
         )
     if dtypes and numbers.dtype.char not in dtypes:
-        instead = f"{field}.real and {field}.imag" if numbers.dtype.kind == "c" else f"{field}.astype(float)"
+        instead = f"{field}.astype(float)"
+        if numbers.dtype.kind == "c":
+            instead = f"{field}.real and {field}.imag"
         raise TypeError(f"{field} has dtype {numbers.dtype}, which such a file does not hold; write {instead}")
-    return numbers.astype(numbers.dtype.name) if dtypes else numbers  # bytes in the order of this machine
+    if dtypes:
+        return numbers.astype(numbers.dtype.name)  # bytes in the order of this machine
+    return numbers
 
 
 def _space(field, grid, numbers, times, at):
-    """The first space that holds an array, leading axes left out, or the one that `at` names."""
+    """Return the first space whose shape is the shape of an array without leading axes, or the one that `at` names."""
     shape = numbers.shape
     if times is not None:
         if shape[:1] != times.shape:

@@ -1,10 +1,13 @@
-"""Fields as data sets of xarray, and .nc and .zarr files of them. The only file that imports xarray (extra `files`)."""
+"""Fields as datasets of xarray, and .nc and .zarr files of them. The only file that imports xarray (extra `files`)."""
+
+from __future__ import annotations
 
 import io
 import json
 import os
 from math import prod
 from pathlib import Path
+from typing import Any
 from zlib import crc32
 
 import numpy as np
@@ -12,21 +15,23 @@ import xarray
 
 from sparsedp._utils.validation import check_type
 from sparsedp.errors import ShapeError
-from sparsedp.grid.grid import AXES, check_grid, node_axes
+from sparsedp.grid.grid import AXES, Grid, check_grid, node_axes
 from sparsedp.io.atomic_files import path_errors, write_file, write_through
 from sparsedp.io.contents import KIND, check_fields, check_names
 
 __all__ = ["dataset_of", "from_xarray", "read_dataset", "to_xarray", "write_dataset"]
 
-OFF = 1e-3  # of the thinnest cell: so far coordinates may lie from where the grid has them, as those in float32 do
+TOLERANCE = 1e-3  # of the thinnest cell: largest deviation of coordinates, which float32 needs
 
 
-def to_xarray(grid, /, *, times=None, attrs=None, at=None, **fields):
-    """Fields on a grid -> a Dataset of xarray, with coordinates.
+def to_xarray(
+    grid: Grid, /, *, times: Any = None, attrs: dict | None = None, at: dict[str, str] | None = None, **fields: Any
+) -> xarray.Dataset:
+    """Return fields on a grid as a Dataset of xarray, with coordinates.
 
     A variable on cells has the dimensions x, y, z, on nodes x_nodes, y_nodes, z_nodes. A field on faces or edges is a
     variable for each component, u_x on (x_nodes, y, z) and so on; leading axes are u_batch_0 and so on. The widths
-    of the cells stand in x_widths and so on.
+    of the cells are the variables x_widths and so on.
 
     Parameters
     ----------
@@ -37,7 +42,7 @@ def to_xarray(grid, /, *, times=None, attrs=None, at=None, **fields):
         Units, or a dict of attributes, by the name of a field, "x", "y", "z" or "times":
         ``{"x": "m", "u": {"units": "m/s", "long_name": "speed"}}``.
     at : dict of str, optional
-        "cells", "faces", "nodes" or "edges" by the name of a field, where the first that fits is not the one.
+        "cells", "faces", "nodes" or "edges" by the name of a field; default: the first of them whose shape fits.
     **fields : arrays, shape (..., *space.shape)
 
     Returns
@@ -50,7 +55,7 @@ def to_xarray(grid, /, *, times=None, attrs=None, at=None, **fields):
     ShapeError, TypeError
         If an array is no field on the grid, or no plain array of numbers.
     ValueError
-        If two variables would have one name, or `attrs` or `at` name what is not there.
+        If two variables would have one name, or a key of `attrs` or `at` is unknown.
 
     Examples
     --------
@@ -62,15 +67,15 @@ def to_xarray(grid, /, *, times=None, attrs=None, at=None, **fields):
     return dataset_of("to_xarray", grid, attrs, *check_fields("to_xarray", grid, times, at, fields))
 
 
-def from_xarray(grid, array, /):
-    """DataArray of xarray -> an array on the cells of a grid: its dimensions are found by name and put in order.
+def from_xarray(grid: Grid, array: xarray.DataArray, /) -> np.ndarray:
+    """Return a DataArray of xarray as an array on the cells of a grid; dimensions are ordered by their names.
 
     Parameters
     ----------
     grid : Grid
     array : xarray.DataArray
-        With the dimensions x, y, z of the grid. Where these have coordinates, they are the centres of its cells, to
-        0.1 % of the thinnest one. Other dimensions come first, as a batch, and have no coordinates.
+        With the dimensions x, y, z of the grid. If these have coordinates, they are the centres of its cells, up to
+        0.1 % of the thinnest cell. Other dimensions come first, as a batch, and have no coordinates.
 
     Returns
     -------
@@ -82,9 +87,9 @@ def from_xarray(grid, array, /):
     TypeError
         If `array` is no DataArray.
     ShapeError
-        If it has other places along an axis than the grid.
+        If its coordinates along an axis are not those of the grid.
     ValueError
-        If a dimension is missing, or there are coordinates that would be lost.
+        If a dimension is missing, or the array has coordinates that would be lost.
 
     Examples
     --------
@@ -104,7 +109,8 @@ def from_xarray(grid, array, /):
             "write u.rename(lon='x') or u.drop_vars('time')"
         )
     for number, axis in enumerate(grid.axes):
-        centres, reach = grid.coordinates(number), OFF * np.min(grid.widths[number], initial=np.inf)
+        centres = grid.coordinates(number)
+        reach = TOLERANCE * np.min(grid.widths[number], initial=np.inf)
         places = array[axis].values if axis in array.coords else centres
         if array.sizes[axis] != centres.size or not np.allclose(places, centres, rtol=0, atol=reach):
             raise ShapeError(
@@ -114,8 +120,8 @@ def from_xarray(grid, array, /):
     return np.array(array.transpose(..., *grid.axes).values)
 
 
-def dataset_of(name, grid, attrs, times, content):
-    """What `check_fields` let through -> Dataset."""
+def dataset_of(name: str, grid: Grid, attrs: dict | None, times: Any, content: dict[str, Any]) -> xarray.Dataset:
+    """Return the Dataset of fields that `check_fields` has checked."""
     check_names(name, "attrs", attrs, [*content, *grid.axes, "times"])
     for key, one in (attrs or {}).items():
         if not isinstance(one, str) and not (isinstance(one, dict) and all(map(_is_attribute, one, one.values()))):
@@ -124,23 +130,26 @@ def dataset_of(name, grid, attrs, times, content):
                 f"write {{{key!r}: 'm'}}"
             )
     given = {key: {"units": one} if isinstance(one, str) else one for key, one in (attrs or {}).items()}
-    coords, variables = {}, {}
+    coords: dict[str, Any] = {}
+    variables: dict[str, Any] = {}
     for number, axis in enumerate(grid.axes):
         coords[axis] = axis, grid.coordinates(number), given.get(axis)
         coords[f"{axis}_nodes"] = f"{axis}_nodes", grid.coordinates(number, "nodes"), given.get(axis)
         variables[f"{axis}_widths"] = axis, grid.widths[number], given.get(axis)
     if times is not None:
         coords["time"] = "time", times, given.get("times")
-    notes = {"format": KIND, "origin": grid.origin, "periodic": grid.periodic, "fields": {}}
+    notes: dict[str, Any] = {"format": KIND, "origin": grid.origin, "periodic": grid.periodic, "fields": {}}
     series = [] if times is None else ["time"]
     for field, (space, values) in content.items():
         lead = values.shape[: values.ndim - len(space.shape)]
         batch = series + [f"{field}_batch_{n}" for n in range(len(lead) - len(series))]
         flat = np.split(values.reshape(*lead, space.size), space.offsets[1:-1], axis=-1)
-        labels = [f"{field}_{axis}" for axis in grid.axes] if space.kind in ("faces", "edges") else [field]
+        labels = [field]
+        if space.kind in ("faces", "edges"):
+            labels = [f"{field}_{axis}" for axis in grid.axes]
         for number, (label, part) in enumerate(zip(labels, flat)):
             if label in {*variables, *coords}:
-                raise ValueError(f"{name} would store {field} as {label}, which is there; write another name")
+                raise ValueError(f"{name} would store {field} as {label}, which exists; write another name")
             on_nodes = node_axes(space.kind, number, grid.dim) or ()
             places = [f"{axis}_nodes" if n in on_nodes else axis for n, axis in enumerate(grid.axes)]
             variables[label] = batch + places, part.reshape(*lead, *space.parts[number]), given.get(field)
@@ -149,6 +158,7 @@ def dataset_of(name, grid, attrs, times, content):
 
 
 def _is_attribute(key, value):
+    """Return whether files can store an attribute: text, numbers or an array of numbers."""
     entries = value if isinstance(value, (list, tuple)) else [value]
     numbers = all(
         isinstance(x, (np.ndarray, np.generic, int, float))
@@ -159,28 +169,29 @@ def _is_attribute(key, value):
     return isinstance(key, str) and key != "" and (isinstance(value, str) or numbers)
 
 
-def write_dataset(path, dataset):
-    """Dataset -> a .nc file or a .zarr folder that is whole, with a checksum of all it holds."""
+def write_dataset(path: Any, dataset: xarray.Dataset) -> None:
+    """Write a Dataset atomically as a .nc file or a .zarr folder, with a checksum of its content."""
     dataset.attrs["sparsedp_crc32"] = _checksum(dataset)
-    if _is_zarr(path):  # there -0.0 counts as empty, and so does a NaN with other bits
+    if _is_zarr(path):  # Zarr would drop chunks of -0.0, and of NaN with other bits, as empty
         options = {"zarr_format": 2, "consolidated": True, "write_empty_chunks": True}
         write_through(path, lambda part: dataset.to_zarr(part, **options))
     else:
         import h5netcdf
 
-        memory = io.BytesIO()  # HDF5 that finds no room on a disk ends the process, after the error
+        memory = io.BytesIO()  # on a full disk HDF5 would end the process
         with h5netcdf.File(memory, "w") as file:
             dataset.dump_to_store(xarray.backends.H5NetCDFStore(file))
         write_file(path, memory.getbuffer())
 
 
 def _is_zarr(path):
+    """Return whether a path is a folder of Zarr."""
     return Path(path).suffix.lower() == ".zarr"
 
 
-def read_dataset(path):
-    """File that `write_dataset` wrote -> (what `save` puts into .npz,); None when it is another file, or changed."""
-    with path_errors(path, reading=True):  # what is not there or may not be read is not damaged
+def read_dataset(path: Any) -> tuple[dict] | None:
+    """Return the content of a file that `write_dataset` wrote, in a tuple; None if it is another file, or changed."""
+    with path_errors(path, reading=True):  # a missing or unreadable file is not a damaged one
         if _is_zarr(path):
             os.scandir(path).close()
         else:
@@ -194,7 +205,7 @@ def read_dataset(path):
             return None
     except (MemoryError, PermissionError):
         raise
-    except Exception:  # there is no end to what the readers raise on damage
+    except Exception:  # readers raise errors of many classes for damaged files
         return None
     fields = {field: _joined(dataset, *stored) for field, stored in notes.pop("fields").items()}
     widths = [dataset[f"{axis}_widths"].values for axis, _ in zip(AXES, notes["origin"])]
@@ -204,15 +215,16 @@ def read_dataset(path):
 
 
 def _joined(dataset, kind, labels):
-    """Variables of a field -> the field."""
+    """Return a field of its variables."""
     parts = [dataset[label].values for label in labels]
     if kind in ("cells", "nodes"):
         return parts[0]
-    lead = parts[0].ndim - len(labels)  # there is a component for each axis of the grid
+    lead = parts[0].ndim - len(labels)  # one component for each axis of the grid
     return np.concatenate([part.reshape(*part.shape[:lead], prod(part.shape[lead:])) for part in parts], axis=-1)
 
 
 def _checksum(dataset):
+    """Return a checksum of all variables and notes of a Dataset."""
     total = crc32(dataset.attrs["sparsedp"].encode())
     for name in sorted(dataset.variables):
         values = dataset[name].values

@@ -1,20 +1,23 @@
 """Fields as .vti, .vtr and .pvd files for ParaView. The only file that imports pyevtk (extra `files`)."""
 
+from __future__ import annotations
+
 import re
 from pathlib import Path
+from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from pyevtk.hl import gridToVTK, imageToVTK
 
-from sparsedp.grid.grid import node_axes
+from sparsedp.grid.grid import Grid, node_axes
 from sparsedp.io.atomic_files import path_errors, write_file, write_through
 
 __all__ = ["write_grid", "write_series"]
 
 
-def write_series(path, grid, times, content):
-    """Fields at each time -> a file in the folder that is called as `path` without .pvd, and then `path` itself."""
+def write_series(path: Any, grid: Grid, times: Any, content: dict[str, Any]) -> None:
+    """Write the fields at each time into a file of the folder `path` without .pvd, and then the index `path`."""
     folder = Path(path).with_suffix("")
     with path_errors(path):
         folder.mkdir(exist_ok=True)
@@ -26,18 +29,18 @@ def write_series(path, grid, times, content):
         )
         entries.append(f'<DataSet timestep="{time}" file={quoteattr(place)}/>\n')
     write_file(path, f'<VTKFile type="Collection"><Collection>\n{"".join(entries)}</Collection></VTKFile>\n')
-    for old in folder.glob("*.vtr"):  # of a longer series that was there
+    for old in folder.glob("*.vtr"):  # files of a longer series of the same name
         if re.fullmatch("[0-9]{4,}", old.stem) and int(old.stem) >= len(entries):
             old.unlink()
 
 
-def write_grid(path, grid, content):
-    """Fields by name, as `check_fields` gives them -> a .vti file of a uniform grid, or a .vtr file of any."""
+def write_grid(path: Any, grid: Grid, content: dict[str, Any]) -> None:
+    """Write fields, as `check_fields` returns them, into a .vti file (uniform grid) or a .vtr file (any grid)."""
     cells: dict = {}
     points: dict = {}
     for field, (space, values) in content.items():
         (points if space.kind == "nodes" else cells).update(_arrays(field, space, values))
-    missing = 3 - grid.dim  # axes, along which the file is as thick as the first cell is wide
+    missing = 3 - grid.dim  # axes that the grid lacks: one cell, as wide as the first one along x
     lines = [grid.coordinates(axis, "ends") for axis in range(grid.dim)]
     lines += [np.append(0.0, grid.widths[0][:1])] * missing
 
@@ -53,11 +56,13 @@ def write_grid(path, grid, content):
 
 
 def _arrays(field, space, values):
-    """Names and arrays of a field, or of each entry of a batch: numbers, or three components, in cells or on nodes."""
-    grid, kind, flat = space.grid, space.kind, (1,) * (3 - space.grid.dim)
+    """Yield the name and the array, or the three components, of a field or of each entry of a batch."""
+    grid = space.grid
+    kind = space.kind
+    flat = (1,) * (3 - grid.dim)
     for index in np.ndindex(values.shape[: values.ndim - len(space.shape)]):
         parts = [part.reshape(part.shape + flat) for part in space.split(values[index])]
-        if kind == "nodes":  # in the file the last node of a periodic axis is one of its own
+        if kind == "nodes":  # the file stores the last node of a periodic axis, too
             parts = [np.pad(parts[0], [(0, int(more)) for more in grid.periodic + flat], mode="wrap")]
         elif kind != "cells":
             parts = [_means(part, node_axes(kind, number, grid.dim), grid.shape) for number, part in enumerate(parts)]
@@ -67,8 +72,8 @@ def _arrays(field, space, values):
 
 
 def _means(part, on_nodes, shape):
-    """A component of faces or edges -> the means of those around each cell."""
+    """Return the mean of a component of faces or edges around each cell."""
     part = part.astype(np.result_type(part, np.float32))
     for axis in on_nodes:
         part = 0.5 * part + 0.5 * np.roll(part, -1, axis)
-    return part[tuple(map(slice, shape))]  # the last face of a bounded axis has none beyond it
+    return part[tuple(map(slice, shape))]  # the mean of the last face of a bounded axis wraps around

@@ -1,4 +1,8 @@
-"""Pictures as fields. Pillow comes with the extra `plot`."""
+"""Pictures as fields. The extra `plot` installs Pillow."""
+
+from __future__ import annotations
+
+import os
 
 import numpy as np
 
@@ -6,11 +10,19 @@ from sparsedp.io.atomic_files import path_errors
 
 __all__ = ["from_image"]
 
-SHADES = {"1": 1, "L": 255, "P": 255, "RGB": 255, "I;16": 65535, "I;16L": 65535, "I;16B": 65535}  # what counts as white
+SHADES = {
+    "1": 1,
+    "L": 255,
+    "P": 255,
+    "RGB": 255,
+    "I;16": 65535,
+    "I;16L": 65535,
+    "I;16B": 65535,
+}  # white
 
 
-def from_image(path):
-    """Picture -> array from 0 (black) to 1 (white), its axes turned: axis 0 is x, to the right, axis 1 is y, up.
+def from_image(path: str | os.PathLike) -> np.ndarray:
+    """Return a picture as an array from 0 (black) to 1 (white); axis 0 is x, to the right, axis 1 is y, upwards.
 
     Parameters
     ----------
@@ -25,9 +37,9 @@ def from_image(path):
     Raises
     ------
     ValueError
-        If the picture has transparent parts, or numbers whose white is not known.
+        If the picture has transparent parts, or a mode without a known number for white.
     ImportError
-        If Pillow is missing; the extra `plot` brings it.
+        If Pillow is missing; the extra `plot` installs it.
     OSError
         If there is no such file, or it is no picture.
 
@@ -56,5 +68,7 @@ def from_image(path):
                 "save it as RGB"
             )
         white = SHADES[image.mode]
-        pixels = np.asarray(image.convert("RGB") if image.mode == "P" else image)
+        if image.mode == "P":
+            image = image.convert("RGB")
+        pixels = np.asarray(image)
     return np.moveaxis(pixels[::-1], (0, 1), (-1, -2)) / white

@@ -16,17 +16,17 @@ LINE = dp.Grid((3, 2), size=(3.0, 1.0))
 REFUSED = {
     "a name that is a coordinate": (
         ValueError,
-        "save would store x as x, which is there; write another name",
+        "save would store x as x, which exists; write another name",
         lambda path: dp.save(path, LINE, x=np.ones(LINE.shape)),
     ),
     "a name that is a component": (
         ValueError,
-        "save would store v_y as v_y, which is there; write another name",
+        "save would store v_y as v_y, which exists; write another name",
         lambda path: dp.save(path, LINE, v=np.ones(LINE.faces.shape), v_y=np.ones(LINE.shape)),
     ),
     "no name of a variable": (
         ValueError,
-        "save takes names of fields as Python has them, got 'a/b'; write another name",
+        "save takes Python identifiers as names of fields, got 'a/b'; write another name",
         lambda path: dp.save(path, LINE, **{"a/b": np.ones(LINE.shape)}),
     ),
     "attributes of nothing": (
