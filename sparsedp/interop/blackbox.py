@@ -1,6 +1,9 @@
-"""A simulator without derivatives becomes differentiable: sparse Jacobians by coloured differences."""
+"""Differentiable black boxes: sparse Jacobians of a simulator without derivatives, by coloured differences."""
+
+from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from contextlib import contextmanager, suppress
 from itertools import product
 from threading import RLock
@@ -35,13 +38,13 @@ SMALLER = 1.0, -1.0, 1e-2, -1e-2, 1e-4, -1e-4  # shares of a move, until the cod
 TIMES = 2, 5, 11  # steps at which what a row lacks is looked at again
 
 
-def from_blackbox(f, sparsity=None, derivative="auto", name=None):
-    """Any NumPy function of an array -> the same function, differentiable.
+def from_blackbox(f: Callable, sparsity: Any = None, derivative: str = "auto", name: str | None = None) -> Adopted:
+    """Return a NumPy function of an array as a differentiable function.
 
     Parameters
     ----------
     f : callable
-        ``f(x) -> y``, real arrays of any shapes; it must give the same y for the same x.
+        ``f(x)``, real arrays of any shapes; it must return the same result for the same x.
     sparsity : sparse matrix or array, optional
         (y.size, x.size), not 0 where y_i may depend on x_j. Default: what three cells touch, moved over the grid, if
         each row of the Jacobian agrees with a derivative along a random direction; else found by changing random parts
@@ -51,7 +54,7 @@ def from_blackbox(f, sparsity=None, derivative="auto", name=None):
         complex: f(x + i h v), to rounding, for code that is analytic and takes complex numbers. difference: central
         differences, about ten digits. auto: complex where it is found to agree with differences.
     name : str, optional
-        Appears in errors and counts; default: that of f.
+        Name in errors and counts; default: the name of f.
 
     Returns
     -------
@@ -80,7 +83,10 @@ def from_blackbox(f, sparsity=None, derivative="auto", name=None):
     the Jacobian row by row along a direction which is another one at each x. Where only a few rows miss something, at
     a branch of code that takes no complex step there, they are taken by central differences. At a kink the derivative
     is the mean of both sides, next to it that of its own side.
-    Source: A. R. Curtis, M. J. D. Powell, J. K. Reid, IMA J. Appl. Math. 13, 1974 (colouring); W. Squire, G. Trapp,
+
+    References
+    ----------
+    A. R. Curtis, M. J. D. Powell, J. K. Reid, IMA J. Appl. Math. 13, 1974 (colouring); W. Squire, G. Trapp,
     SIAM Rev. 40, 1998 (complex step).
 
     Examples
@@ -97,14 +103,14 @@ def from_blackbox(f, sparsity=None, derivative="auto", name=None):
 
 
 class Adopted(Remade):
-    """A foreign function with a sparse Jacobian, kept for the last two points. Made by `from_blackbox`.
+    """A foreign function with a sparse Jacobian, kept for the last two points: see `from_blackbox`.
 
     Attributes
     ----------
     runs : int
         Runs of the function so far.
     way : str
-        STEP or DIFFERENCES; empty where the first derivative is to tell.
+        STEP or DIFFERENCES; empty until the first derivative decides.
     """
 
     _shapes: Any
@@ -124,14 +130,14 @@ class Adopted(Remade):
             lambda nums, tangents, y, x: self._operator(x, y)(tangents[0]),
         )
 
-    def recipe(self):
-        """The call that makes it again: see _utils/reconstruction.py."""
+    def recipe(self) -> tuple:
+        """Return the call that builds an equal object, for pickling and copying."""
         # The pattern found so far travels too: it took many runs.
         jacobian = self._shapes, self.way, self._coloured
         return Adopted, (self._f, self._sparsity, self._derivative, self.name, jacobian)
 
     @public("dp.from_blackbox(f)")
-    def __call__(self, x):
+    def __call__(self, x: Any) -> Any:
         return self._rule(x)
 
     def __str__(self):
@@ -174,8 +180,8 @@ class Adopted(Remade):
         inputs, outputs = self._shapes
         return from_matrix(matrix, inputs, outputs, f"{self.name}.J")
 
-    def jacobian(self, x):
-        """dy/dx at a point, csr_array; kept for the last two points.
+    def jacobian(self, x: Any) -> Any:
+        """Return dy/dx at a point as a csr_array; kept for the last two points.
 
         Parameters
         ----------

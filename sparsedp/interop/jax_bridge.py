@@ -1,5 +1,8 @@
 """JAX: a function of arrays as one of JAX, and the other way. The only file that imports jax (extra `jax`)."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
 from itertools import compress
@@ -23,22 +26,22 @@ __all__ = ["from_jax", "to_jax"]
 # ---- functions of this library for JAX -------------------------------------------------------------------------------
 
 
-def to_jax(f, like=None):
-    """Function of arrays -> the same function of JAX arrays, for jit, grad and vmap.
+def to_jax(f: Callable, like: Any = None) -> Callable:
+    """Return a function of arrays as a function of JAX arrays, for jit, grad and vmap.
 
     Parameters
     ----------
     f : callable
-        ``f(*args)``, made of this library and autograd.numpy: an Operator, an inverse, a solver, a rollout, a loss.
+        ``f(*args)``, of this library and autograd.numpy: an Operator, an inverse, a solver, a rollout, a loss.
         Arguments and result are arrays, or pytrees of arrays.
     like : pytree of arrays, optional
         Of the structure, shapes and dtypes of the result of f, whose entries are paired with it by key. Default: f is
-        run once with ones, for each set of shapes that jit or vmap bring.
+        called once with ones, for each set of shapes that jit or vmap use.
 
     Returns
     -------
     callable
-        Takes and gives JAX arrays. Dtypes follow JAX: float32, unless ``jax_enable_x64`` is set.
+        Takes and returns JAX arrays. Dtypes follow JAX: float32, unless ``jax_enable_x64`` is set.
 
     Raises
     ------
@@ -80,7 +83,7 @@ def to_jax(f, like=None):
 
 
 def _called(f, structure, like):
-    """f, called with trees of one structure -> its node, and the form of its result."""
+    """Return the node of f for arguments of one structure, and the form of its result."""
     result, known = _Result("result of to_jax", like), {}  # type: _Result, dict
 
     def fun(arrays):
@@ -200,7 +203,7 @@ class _Node:
         return tuple(next(slopes) if moves else None for moves in key[0])
 
     def _pull(self, moving, given):
-        """The node of (arguments, cotangents of some results) -> gradients of the arguments that move."""
+        """Return the node from arguments and cotangents of some results to the gradients of the variable arguments."""
         count, places = len(moving), [*compress(range(len(given)), given)]
 
         def slopes(arrays):
@@ -224,8 +227,8 @@ class _Host(NamedTuple):
 # ---- functions of JAX on our tape ------------------------------------------------------------------------------------
 
 
-def from_jax(function):
-    """Function of JAX arrays -> the same function of NumPy arrays, differentiable by this library.
+def from_jax(function: Callable) -> Callable:
+    """Return a function of JAX arrays as a function of NumPy arrays, differentiable by this library.
 
     Parameters
     ----------
@@ -277,7 +280,7 @@ def from_jax(function):
 
 
 class _Traced:
-    """A JAX function ``f(*entries) -> list`` as a rule of our tape. Its derivatives are JAX functions, too."""
+    """Return a JAX function that returns a list as a rule of the tape; its derivatives are JAX functions, too."""
 
     def __init__(self, function):
         self.function, self._compiled, self._derivatives = function, jax.jit(function), {}  # type: Any, Any, dict
@@ -308,7 +311,7 @@ class _Traced:
 
 
 def _pulled(function, nums, used, count, *values):
-    """Function, (its arguments, cotangents of the results `used`) -> gradients of the arguments `nums`."""
+    """Return the gradients of the arguments `nums`, from the arguments and the cotangents of the results `used`."""
 
     def some(*moving):
         results = function(*placed(values[:count], nums, moving))
@@ -319,7 +322,7 @@ def _pulled(function, nums, used, count, *values):
 
 
 def _pushed(function, nums, used, count, *values):
-    """Function, (its arguments, tangents of the arguments `nums`) -> tangents of the results; 0 of those not `used`."""
+    """Return the tangents of the results (0 if not `used`), from the arguments and the tangents of those in `nums`."""
     moving = [values[num] for num in nums]
     tangents = _alike(values[count:], moving)
     results, slopes = jax.jvp(lambda *xs: function(*placed(values[:count], nums, xs)), moving, tangents)

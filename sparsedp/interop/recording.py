@@ -1,4 +1,9 @@
-"""What both bridges need of our tape: one run of a function, and the gradients that belong to it."""
+"""Record one run of a function on the tape, and compute its gradients: for both bridges."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -8,10 +13,24 @@ from sparsedp.autodiff.derivative import gradient_of, linearised
 __all__ = ["owned", "parts", "recorded"]
 
 
-def recorded(fun, arrays, moving):
-    """Function of a list of arrays, some of which move -> (leaves of its result, how to build it, gradients).
+def recorded(fun: Callable, arrays: Sequence, moving: Sequence[bool]) -> tuple[list, Callable, Callable]:
+    """Run a function of a list of arrays on the tape.
 
-    ``gradients(cotangents)``: of all leaves of the result, None where there is none -> those of the arrays that move.
+    Parameters
+    ----------
+    fun : callable
+    arrays : list of arrays
+    moving : list of bool
+        Whether each array is a variable.
+
+    Returns
+    -------
+    values : list
+        The leaves of the result.
+    rebuild : callable
+        ``rebuild(values)`` is the result.
+    gradients : callable
+        ``gradients(cotangents)`` are the gradients of the variables; a cotangent for each leaf, or None.
     """
     values, rebuild, pull = linearised(fun, arrays, moving)
 
@@ -22,13 +41,15 @@ def recorded(fun, arrays, moving):
     return values, rebuild, gradients
 
 
-def owned(array):
-    """Array of another library -> one of our own, or a number; whole numbers stay arrays, as the tape takes them."""
+def owned(array: Any) -> Any:
+    """Return an array of another library as a NumPy array, or as a number if it is floating and has no axes."""
     check_precision("a result of another library", array)
     array = np.array(array)
-    return array[()] if array.dtype.kind in "fc" else array
+    if array.dtype.kind in "fc":
+        return array[()]
+    return array
 
 
-def parts(values, count):
-    """A tuple, traced or not, as one of values that are traced or not."""
+def parts(values: Any, count: int) -> tuple:
+    """Return the entries of a tuple that may be traced."""
     return tuple(values[k] for k in range(count))

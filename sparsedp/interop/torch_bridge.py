@@ -4,6 +4,10 @@ Torch's gradient in a complex number is dL/dRe + i dL/dIm, the cotangent of our 
 into the other where it crosses.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
+
 import autograd.numpy as anp
 import numpy as np
 import torch
@@ -24,28 +28,28 @@ SAME = "; return the same entries each time"
 # ---- functions of this library for torch -----------------------------------------------------------------------------
 
 
-def to_torch(f):
-    """Function of arrays -> the same function of torch tensors, differentiable by torch.
+def to_torch(f: Callable) -> Callable:
+    """Return a function of arrays as a function of torch tensors, differentiable by torch.
 
     Parameters
     ----------
     f : callable
-        ``f(*args, **options)``, made of this library and autograd.numpy: an Operator, an inverse, a solver, a rollout,
+        ``f(*args, **options)``, of this library and autograd.numpy: an Operator, an inverse, a solver, a rollout,
         a loss. Arguments and result are arrays, or trees (tuples, lists, dicts) of arrays.
 
     Returns
     -------
     callable
-        Takes tensors in the place of arrays, in the same trees, and hands on as it is what is no tensor. Results have
-        the dtypes that f gives them: float32 for float32. Only arguments that require a gradient are differentiated;
-        where none does nothing is recorded.
+        Takes tensors instead of arrays, in the same trees, and passes other arguments unchanged. Results have the
+        dtypes of the results of f: float32 for float32. Only arguments that require a gradient are differentiated; if
+        there are none, nothing is recorded.
 
     Raises
     ------
     TypeError
         If f is no function; on use, if a tensor is not on the CPU, or has half precision.
     RuntimeError
-        By torch, on the way back, if a tensor has been changed in place since the call.
+        By torch, in the backward pass, if a tensor has been changed in place since the call.
 
     Notes
     -----
@@ -68,7 +72,7 @@ def to_torch(f):
 
 
 def _bridged(fun, tree):
-    """Function of a tree of arrays, at a tree in which some are tensors -> its result as a tree of tensors."""
+    """Return the result of a function of a tree of arrays as a tree of tensors, for a tree with some tensors."""
     given, rebuild = flatten(tree)
     places = [place for place, leaf in enumerate(given) if isinstance(leaf, torch.Tensor)]
     tensors = [given[place] for place in places]
@@ -130,7 +134,7 @@ class _Call(torch.autograd.Function):
 
 
 def _array(tensor):
-    """Tensor -> its memory as an array that nobody writes into, or a number."""
+    """Return the memory of a tensor as a read-only array, or as a number."""
     if tensor.device.type != "cpu":
         raise TypeError(f"to_torch computes on the CPU, got a tensor on {tensor.device}; write tensor.cpu()")
     if tensor.is_floating_point() and tensor.dtype.itemsize < 4:
@@ -139,7 +143,7 @@ def _array(tensor):
 
 
 def _tensors(values, others):
-    """Arrays -> tensors of the same memory, copied where it is read-only, or that of other arrays or of each other."""
+    """Return arrays as tensors of the same memory; copied if it is read-only or shared with other arrays."""
     found, seen = [], [*others]
     for value in map(np.asarray, values):
         if not value.flags.writeable or min(value.strides, default=0) < 0:
@@ -152,15 +156,15 @@ def _tensors(values, others):
 
 
 def _turned(g):
-    """A gradient of torch -> a cotangent of the tape, and back."""
+    """Convert a gradient of torch to a cotangent of the tape, or back."""
     return anp.conj(g) if dtype_of(g).kind == "c" else g
 
 
 # ---- functions of torch on our tape ----------------------------------------------------------------------------------
 
 
-def from_torch(function):
-    """Function of torch tensors, or a module -> the same function of arrays, differentiable by this library.
+def from_torch(function: Callable) -> Callable:
+    """Return a function of torch tensors, or a module, as a function of arrays, differentiable by this library.
 
     Parameters
     ----------
@@ -170,9 +174,9 @@ def from_torch(function):
     Returns
     -------
     callable
-        Takes and gives arrays in the place of tensors. That of a module takes its parameters first, as a dict of
-        arrays: ``net(net.parameters, x)``, with copies of those of the module in ``net.parameters``. Parameters that
-        a dict leaves out are those of the module, as constants.
+        Takes and returns arrays instead of tensors. For a module the first argument is a dict of its parameters as
+        arrays: ``net(net.parameters, x)``; ``net.parameters`` are copies of the parameters of the module. Parameters
+        that are missing in a dict are taken from the module, as constants.
 
     Raises
     ------
@@ -218,7 +222,7 @@ def from_torch(function):
         entries, rebuild = flatten(args)
         moving = [*map(isbox, entries)]
         built: list = []
-        # Copies: torch may write into its arguments, and the caller into his before the way back. Traced ones are safe.
+        # Copies: torch, or the caller before the backward pass, may write into the arguments. Traced ones are safe.
         entries = [np.array(one) if isinstance(one, np.ndarray) else one for one in entries]
 
         def act(tensors):
@@ -253,7 +257,7 @@ class _Graph:
         self._continues = bool(self.inputs)
 
     def run(self, *entries):
-        """Arguments as arrays -> results as a tuple of arrays."""
+        """Return the results as a tuple of arrays, for arguments as arrays."""
         for entry, moves in [*zip(entries, self._moving, strict=True)][len(self.inputs) :]:
             tensor = _tensors([entry], ())[0].requires_grad_(moves) if moves or isinstance(entry, np.ndarray) else entry
             self.inputs.append(tensor)
@@ -291,7 +295,7 @@ _rule = Rule("torch function", _Graph.run, _pull)
 
 
 def _owned(tensor):
-    """Tensor -> array or number apart from it: it may be a parameter, or what the way back needs."""
+    """Return a tensor as an array or number with its own memory: the tensor may be a parameter, or saved by torch."""
     if tensor.is_floating_point() and tensor.dtype.itemsize < 4:
         raise TypeError(f"from_torch takes and gives float32 or float64, got {tensor.dtype}; write tensor.float()")
     return owned(tensor.numpy(force=True))
