@@ -167,7 +167,10 @@ class _Examination:
         for direction in directions:
             if direction.word == "disagrees":
                 note = direction.note
-                words = f"its VJP is {note}" if note.startswith("off") else note
+                if note.startswith("off"):
+                    words = f"its VJP is {note}"
+                else:
+                    words = note
                 return words + _entries_of_rule(node, evaluations, directions, direction, weights, self.spaces)
         modes = compare_modes(loss, directions[:RANDOM_DIRECTIONS])
         if modes is None or modes.is_allowed or modes.is_hidden:
@@ -180,7 +183,9 @@ Weights = dict[int, Any]  # by the number of a result
 
 def _results(node: Node, value: Any) -> list[Any]:
     """Return the results of a call as a list, traced or not."""
-    return [value[number] for number in range(len(node.value))] if isinstance(node.value, tuple) else [value]
+    if isinstance(node.value, tuple):
+        return [value[number] for number in range(len(node.value))]
+    return [value]
 
 
 def _weights(node: Node, rng: np.random.Generator | None) -> Weights:
@@ -213,7 +218,9 @@ class Arguments(Point):
         super().__init__(node.values)
 
         def argument(match: re.Match[str]) -> str:
-            return f"argument {node.places[int(match[1])]}" if len(node.places) > 1 else "argument"
+            if len(node.places) > 1:
+                return f"argument {node.places[int(match[1])]}"
+            return "argument"
 
         self.names = [re.sub(r"^x\[(\d+)\]", argument, name) for name in self.names]
 
@@ -238,7 +245,10 @@ def _entries_of_rule(
     is_complex = point.complex or any(map(np.iscomplexobj, weights.values()))
     if not is_complex and sum(map(prod, shapes)) > 1:
         for entry in largest_gaps(_gap_of_results(node, point, worst, weights), shapes, 1):
-            name = f"result {entry.leaf}" if len(shapes) > 1 else "result"
+            if len(shapes) > 1:
+                name = f"result {entry.leaf}"
+            else:
+                name = "result"
             words.append(f"in its {_named(name, entry, shapes[entry.leaf], spaces)}")
     return "".join(f"; {word}" for word in words)
 
@@ -251,7 +261,10 @@ def _gap_of_results(
     d is the direction of the arguments in which the VJP is worst, J d a central difference. The gap is linear in parts.
     """
     direction = worst.line.direction
-    step = worst.step if worst.step > 0 else DEFAULT_STEP
+    if worst.step > 0:
+        step = worst.step
+    else:
+        step = DEFAULT_STEP
 
     def results_at(values: Any) -> list[Any]:
         return _results(node, node.again(values))
@@ -298,12 +311,18 @@ def _entries_of_operator(op: Operator, rng: np.random.Generator) -> str:
     in_result = largest_gaps(gap_in_result, [g.shape], 1)
     words = ""
     for name, found, space in (("argument", in_argument, op.domain), ("result", in_result, op.codomain)):
-        spaces = [space] if space.grid is not None and space.backend.whole_fields else []
+        if space.grid is not None and space.backend.whole_fields:
+            spaces = [space]
+        else:
+            spaces = []
         words += "".join(f"; largest gap in its {_named(name, one, space.shape, spaces)}" for one in found)
     return words
 
 
 def _named(name: str, entry: EntryGap, shape: tuple[int, ...], spaces: Sequence[Any]) -> str:
     """Return an entry, or the region that holds the whole gap, and its place in words."""
-    block = entry.block if entry.region is None else entry.region
+    if entry.region is None:
+        block = entry.block
+    else:
+        block = entry.region
     return f"{name}{subscript(block, shape)}{where(block, shape, spaces)}"

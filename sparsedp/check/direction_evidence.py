@@ -309,7 +309,10 @@ def _estimate_plateau(evidence: DirectionEvidence) -> None:
     """Choose the estimate with the smallest bar that no finer level contradicts, away from kinks if there is one."""
     line = evidence.line
     eps = line.point.eps
-    least = THRESHOLDS.noisy_agreement_share if line.evaluations.solved else THRESHOLDS.agreement_share
+    if line.evaluations.solved:
+        least = THRESHOLDS.noisy_agreement_share
+    else:
+        least = THRESHOLDS.agreement_share
     by_noise = THRESHOLDS.agreement_per_noise * line.evaluations.eps * evidence.jitter
     by_noise = float(np.clip(by_noise, least, THRESHOLDS.noisy_agreement_share))
     evidence.agreement = max(by_noise, SINGLE_PRECISION_EPS * eps)
@@ -394,7 +397,10 @@ def _compare_gap_and_bar(evidence: DirectionEvidence) -> None:
     by_tolerance = THRESHOLDS.solve_remainder_tolerances * evaluations.tolerance * max(base, scale)
     evidence.left_by_solves = max(THRESHOLDS.solve_remainder_share * base, by_tolerance) * evaluations.solved
     evidence.left_by_steps = THRESHOLDS.step_remainder_tolerances * evaluations.step_tolerance * scale
-    reference = evidence.curvature if evidence.is_zero else scale
+    if evidence.is_zero:
+        reference = evidence.curvature
+    else:
+        reference = scale
     evidence.digits = float(np.clip(-np.log10(max(size, bar) / reference), 0, 16))
 
 

@@ -63,7 +63,9 @@ class EntryGap(NamedTuple):
     @property
     def rank(self) -> float:
         """Key that sorts the largest gap first, and unknown ones last."""
-        return inf if isnan(self.gap) else -abs(self.gap)
+        if isnan(self.gap):
+            return inf
+        return -abs(self.gap)
 
 
 class _NotMeasured(Exception):
@@ -196,7 +198,9 @@ class _Search:
             return None
         region = tuple(part if axis in certain_axes else slice(None) for axis, part in enumerate(block))
         gap = self.block_gap(leaf, region)
-        return region if abs(gap_of_leaf - gap) <= NEGLIGIBLE_SHARE * abs(gap_of_leaf) else None
+        if abs(gap_of_leaf - gap) <= NEGLIGIBLE_SHARE * abs(gap_of_leaf):
+            return region
+        return None
 
     def _bisect(self, length: int, gap_between: Callable[[int, int], float], gap: float) -> _Bisection:
         """Halve a range again and again, and keep the half with the larger gap."""
@@ -234,14 +238,23 @@ def gaps_along_entries(
     if point.entries < 2 or not wrong:
         return []
     worst = max(wrong, key=lambda direction: 0.0 if isnan(direction.share) else direction.share)
-    step = worst.step if worst.step > 0 else DEFAULT_STEP
-    jitter = worst.jitter if worst.jitter > 0 else 0.0
+    if worst.step > 0:
+        step = worst.step
+    else:
+        step = DEFAULT_STEP
+    if worst.jitter > 0:
+        jitter = worst.jitter
+    else:
+        jitter = 0.0
     noise = CLEAR_OF_NOISE * max(2.0, jitter) * evaluations.eps * abs(evaluations.base) / step
 
     def gap_along(weights: Sequence[NDArray[Any]]) -> float:
         parts = []
         for weight, x in zip(weights, point.values, strict=True):
-            part = weight * (1 + 1j) if np.iscomplexobj(x) else weight
+            if np.iscomplexobj(x):
+                part = weight * (1 + 1j)
+            else:
+                part = weight
             parts.append(np.ravel(part).view(float))
         direction = point.units * np.concatenate(parts)
         if not np.any(direction):
@@ -292,7 +305,10 @@ def listed(
     source : str
         Its name.
     """
-    slopes = [None] * len(point.values) if gradient is None else point.split(gradient)
+    if gradient is None:
+        slopes = [None] * len(point.values)
+    else:
+        slopes = point.split(gradient)
     sentences = []
     for entry in entries:
         name = point.names[entry.leaf]
@@ -328,7 +344,9 @@ def subscript(index: Block, shape: tuple[int, ...]) -> str:
             parts.append(f"{low}")
         else:
             parts.append(f"{low}:{high}")
-    return f"[{', '.join(parts)}]" if parts else ""
+    if parts:
+        return f"[{', '.join(parts)}]"
+    return ""
 
 
 def where(index: Block, shape: tuple[int, ...], spaces: Sequence[Any]) -> str:
@@ -337,7 +355,9 @@ def where(index: Block, shape: tuple[int, ...], spaces: Sequence[Any]) -> str:
         dim = len(space.shape)
         if dim and shape[len(shape) - dim :] == space.shape:
             words = _place(space, index[len(index) - dim :])
-            return f", {words}" if words else ""
+            if words:
+                return f", {words}"
+            return ""
     return ""
 
 

@@ -117,7 +117,10 @@ class Evaluations:
 
     def gradient_at(self, tree: Any) -> NDArray[Any]:
         """Return the gradient under test as a vector."""
-        gradient = self.gradient(tree) if callable(self.gradient) else self.gradient
+        if callable(self.gradient):
+            gradient = self.gradient(tree)
+        else:
+            gradient = self.gradient
         return self.point.gradient(gradient)
 
     def start(self) -> None:

@@ -132,8 +132,9 @@ def gradient(
     """
     check_function("check.gradient", loss, "lambda x: np.sum(x**2)")
     count = check_whole("directions of check.gradient", directions, 0, "; the default is 3")
-    chosen_steps = () if steps is None else tuple(map(float, steps))
+    chosen_steps: tuple[float, ...] = ()
     if steps is not None:
+        chosen_steps = tuple(map(float, steps))
         is_positive = all(0 < step < inf for step in chosen_steps)
         if len(set(chosen_steps)) < FEWEST_STEPS or not is_positive:
             raise ValueError(f"a sweep needs at least {FEWEST_STEPS} different positive steps, got {chosen_steps}")
@@ -203,7 +204,10 @@ class _Auditor:
 
     def examine(self) -> None:
         """Examine the gradient along all directions and by other derivatives."""
-        is_wanted = QUICK_DIRECTIONS.__contains__ if self.quick else None
+        if self.quick:
+            is_wanted = QUICK_DIRECTIONS.__contains__
+        else:
+            is_wanted = None
         self.directions, self.findings = examine_directions(self.evaluations, self.count, self.rng, is_wanted)
         excuse_kinks(self.evaluations, self.directions)
         random = self.directions[: self.count]
@@ -241,7 +245,10 @@ class _Auditor:
             if self.is_taped:
                 self.find_culprit(is_excused, spaces)
         if self.verdict == "disagrees":
-            most = 1 if self.quick else MOST_ENTRIES
+            if self.quick:
+                most = 1
+            else:
+                most = MOST_ENTRIES
             found = gaps_along_entries(self.evaluations, self.directions, most)
             self.gaps = tuple(listed(found, self.point, self.evaluations.slopes, spaces))
         if self.gaps:
@@ -373,7 +380,10 @@ class Audit(Result):
 
     def __repr__(self) -> str:
         """One line, which is what pytest shows of an assertion that fails."""
-        details = [self.reason] if self.reason else []
+        if self.reason:
+            details = [self.reason]
+        else:
+            details = []
         details += [note for note in self.notes if note.startswith(("culprit", "largest gaps"))]
         return f"<gradient {self.verdict}: {'; '.join(details) or f'{self.digits} digits'}>"
 
@@ -381,7 +391,10 @@ class Audit(Result):
         """Return the table of |difference - g . d| relative to the derivative, over steps (down) and directions."""
         cells: dict[float, dict[str, Any]] = {}
         for row in self.rows:
-            gap = "-" if row["note"] else abs(row["gap"])
+            if row["note"]:
+                gap = "-"
+            else:
+                gap = abs(row["gap"])
             cells.setdefault(row["step"], {})[row["direction"]] = gap
         rows = [{"step": step, **cells[step]} for step in sorted(cells, reverse=True)]
         return table_of(rows, ["step", *(direction.direction for direction in self.lines)])

@@ -69,7 +69,9 @@ class Node:
 
 def _as_new(argument: Any) -> Any:
     """Return an argument for another run of a call; one that keeps the results of its run has `as_new`."""
-    return argument.as_new() if hasattr(argument, "as_new") else argument
+    if hasattr(argument, "as_new"):
+        return argument.as_new()
+    return argument
 
 
 @contextmanager
@@ -81,7 +83,10 @@ def calls_seen() -> Iterator[list[Node]]:
     def see(tape_node: Any, *call: Any) -> None:
         node = Node(*call)
         pull = tape_node.vjp
-        outer = running[-1].inner if running else calls
+        if running:
+            outer = running[-1].inner
+        else:
+            outer = calls
         outer.append(node)
 
         def watched(*cotangents: Any) -> Any:
@@ -140,4 +145,6 @@ def _parts(thing: Any) -> Any:
         return (thing._value,)
     if isinstance(thing, FunctionType):  # not the names of its module
         return (thing.__closure__, thing.__defaults__)
-    return gc.get_referents(thing) if isinstance(thing, HOLDERS) else ()
+    if isinstance(thing, HOLDERS):
+        return gc.get_referents(thing)
+    return ()

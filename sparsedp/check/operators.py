@@ -85,13 +85,22 @@ class Probe:
         self.real = op.dtype.kind != "c"
         structure = self.op.structure
         self.tolerance = tolerance_of(structure)
-        self.real_linear = "" if self.real or structure.has_entries else self._find_real_side()
-        largest = LARGEST if structure.has_entries else MOST_COLUMNS
+        if self.real or structure.has_entries:
+            self.real_linear = ""
+        else:
+            self.real_linear = self._find_real_side()
+        if structure.has_entries:
+            largest = LARGEST
+        else:
+            largest = MOST_COLUMNS
         self.listed = max(op.shape) <= largest and not self.real_linear  # a matrix is linear over complex numbers
         self.bounds: tuple[Callable[[Any], Any], ...] = ()
         if self.listed and structure.has_entries:
             self.bounds = (structure.magnitude(), structure.transpose().magnitude())
-        self.size = self._size_from_entries() if self.bounds else self._size_from_products()
+        if self.bounds:
+            self.size = self._size_from_entries()
+        else:
+            self.size = self._size_from_products()
         self.forms: tuple[Operator, ...] = ()
         self.matrix: Any = None
         if self.listed:
@@ -135,13 +144,18 @@ class Probe:
             gap = float(self.gap(name, dtype))
         except Exception as error:  # a function may raise anything
             note = error_text(error)
-            return Row(label, note=f"refused, {note}") if is_optional else Row(label, inf, LIMIT, False, note)
+            if is_optional:
+                return Row(label, note=f"refused, {note}")
+            return Row(label, inf, LIMIT, False, note)
         return Row(label, inf if isnan(gap) else gap, LIMIT, gap <= LIMIT)
 
     def gap(self, name: str, dtype: np.dtype[Any]) -> float:
         """Return the distance of the two sides of an identity in units of rounding, at worst over entries and seeds."""
         identity = IDENTITIES[name]
-        tolerance = 0.0 if identity.is_exact else self.tolerance
+        if identity.is_exact:
+            tolerance = 0.0
+        else:
+            tolerance = self.tolerance
         rounding = max(tolerance, float(np.finfo(dtype).eps))
         worst: Any = 0.0
         for _ in range(self.seeds):
@@ -167,7 +181,9 @@ class Probe:
     def product(self, a: NDArray[Any], b: NDArray[Any]) -> Any:
         """Return the sum of a b; its real part where only that is the same for an operator and its transpose."""
         product = np.sum(a * b.astype(np.result_type(b, float)))  # in double precision: the sum is not what is tested
-        return np.real(product) if self.real_linear else product
+        if self.real_linear:
+            return np.real(product)
+        return product
 
     def transposed(self, g: NDArray[Any], real: bool) -> NDArray[Any]:
         """Return A^T g by the transposed matrix, or by `.T` without one; of real fields the real part."""
@@ -175,7 +191,9 @@ class Probe:
             result = (self.matrix.T @ g.ravel()).reshape(self.op.domain.shape)
         else:
             result = self.op.T.apply(g)
-        return result.real if real else result
+        if real:
+            return result.real
+        return result
 
     def _find_real_side(self) -> str:
         """Return which fields of an operator are real, if it is not linear over the complex numbers."""
@@ -191,7 +209,9 @@ class Probe:
                 return ""
             if not np.any(of_imaginary):
                 return "domain"
-            return "" if np.any(np.imag([of_real, of_imaginary])) else "codomain"
+            if np.any(np.imag([of_real, of_imaginary])):
+                return ""
+            return "codomain"
 
     def _size_from_entries(self) -> float:
         """Return sqrt(|A|_1 |A|_inf)."""
@@ -442,15 +462,23 @@ def _forms_in_words(structure: Any, listed: bool) -> str:
     if isinstance(structure, Matrix):
         return "one form: given as a matrix; compared with the product by SciPy"
     if structure.has_entries:
-        return "both" if listed else "too large: the matrix was not built for this test"
-    compared = "; compared with" if listed else ", and too large to list"
+        if listed:
+            return "both"
+        return "too large: the matrix was not built for this test"
+    if listed:
+        compared = "; compared with"
+    else:
+        compared = ", and too large to list"
     return f"one form: given by functions{compared} its columns"
 
 
 def fault_of(op: Operator, rng: np.random.Generator) -> str:
     """Return in words what is wrong with the linearity or the transpose of an operator; empty if nothing."""
     probe = Probe(op, 1, rng)
-    dtypes = DTYPES[:1] if probe.real or probe.real_linear == "domain" else DTYPES[1:2]
+    if probe.real or probe.real_linear == "domain":
+        dtypes = DTYPES[:1]
+    else:
+        dtypes = DTYPES[1:2]
     failed = []
     for name in ("linearity", "transpose"):
         failed += [row for row in probe.rows(name, dtypes) if row.ok is False]

@@ -80,7 +80,10 @@ def compare_modes(loss: Callable[[Any], Any], directions: Sequence[DirectionEvid
         difference = abs(float(slope) - direction.slope)
         if difference == 0:
             continue
-        gap = difference / direction.scale if direction.scale else inf
+        if direction.scale:
+            gap = difference / direction.scale
+        else:
+            gap = inf
         largest_gap = float(np.maximum(largest_gap, gap))  # NaN stays NaN
         if not gap <= allowed:
             is_hidden = difference <= THRESHOLDS.bars_disagree * direction.bar

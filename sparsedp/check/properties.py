@@ -37,7 +37,10 @@ def facts_of(op: Operator, listed: bool, is_right: bool) -> dict[str, Any]:
     """
     is_square = fits(op.domain, op.codomain)
     facts: dict[str, Any] = _facts_of_entries(op.matrix, is_square) if listed else {}
-    most_rows = MOST_ROWS if listed else MOST_DENSE_ROWS
+    if listed:
+        most_rows = MOST_ROWS
+    else:
+        most_rows = MOST_DENSE_ROWS
     if is_right and is_square and op.dtype.kind != "c" and 0 < op.shape[0] <= most_rows:
         facts |= _facts_of_spectrum(op.tangent, facts.get("symmetric", False))
     return facts
@@ -75,14 +78,19 @@ def _facts_of_spectrum(op: Operator, is_symmetric: bool) -> dict[str, Any]:
     if is_whole or is_symmetric:
         steps = -2 * np.minimum(nonzero.real, 0.0) / np.abs(nonzero) / np.abs(nonzero)
         step = float(np.min(steps, initial=np.inf))
-        facts["stable step"] = 0.0 if step * radius <= ZERO_SHARE else step
+        if step * radius <= ZERO_SHARE:
+            facts["stable step"] = 0.0
+        else:
+            facts["stable step"] = step
     return facts
 
 
 def _all_eigenvalues(op: Operator, is_symmetric: bool) -> NDArray[Any]:
     """Return all eigenvalues of a small operator."""
     entries = op.matrix.toarray()
-    return np.linalg.eigvalsh(entries) if is_symmetric else np.linalg.eigvals(entries)
+    if is_symmetric:
+        return np.linalg.eigvalsh(entries)
+    return np.linalg.eigvals(entries)
 
 
 def _ends_of_spectrum(op: Operator, is_symmetric: bool) -> NDArray[Any] | None:
@@ -107,4 +115,6 @@ def _definiteness(values: NDArray[Any], nonzero: NDArray[Any], is_whole: bool) -
         return "indefinite"
     if nonzero.size < values.size:
         return f"{sign} semidefinite"
-    return f"{sign} definite" if is_whole else f"{sign} definite or semidefinite"
+    if is_whole:
+        return f"{sign} definite"
+    return f"{sign} definite or semidefinite"

@@ -67,7 +67,10 @@ def order(
     if isnan(slope):
         reason = "an error is 0 or not finite: no slope"
     elif expected is not None:
-        verdict = "agrees" if expected[0] <= slope <= expected[1] else "disagrees"
+        if expected[0] <= slope <= expected[1]:
+            verdict = "agrees"
+        else:
+            verdict = "disagrees"
         reason = f"expected {expected[0]:g} to {expected[1]:g}"
         if verdict == "disagrees":
             reason += f", got {number_beside(slope, *expected, digits=3)}"

@@ -168,7 +168,10 @@ class Summary(Result):
         words = {True: "ok", False: "FAILS", None: "-"}
         cells = []
         for row in self.rows:
-            limit = "" if row.limit is None else f"<= {row.limit:g}"
+            if row.limit is None:
+                limit = ""
+            else:
+                limit = f"<= {row.limit:g}"
             cells.append((row.name, _figure(row), limit, words[row.ok], row.note))
         return [f"{self.title}: {self.verdict}", Table(("property", "figure", "limit", "", ""), cells)]
 

@@ -32,7 +32,10 @@ class Table(NamedTuple):
     def __str__(self) -> str:
         columns = []
         for column in zip(*self.texts(), strict=True):
-            side = ">" if all(map(NUMBER.fullmatch, column[1:])) else "<"
+            if all(map(NUMBER.fullmatch, column[1:])):
+                side = ">"
+            else:
+                side = "<"
             width = max(map(len, column))
             columns.append([f"{cell:{side}{width}}" for cell in column])
         return "\n".join(f"  {'  '.join(cells)}".rstrip() for cells in zip(*columns))
@@ -46,7 +49,9 @@ class Table(NamedTuple):
     def html(self) -> Markup:
         """Return the table as HTML; nothing without a row."""
         names, *rows = self.texts()
-        return table(rows, names) if rows else Markup("")
+        if rows:
+            return table(rows, names)
+        return Markup("")
 
     def csv(self) -> str:
         """Return the table as CSV: every digit of a number, a line of names."""

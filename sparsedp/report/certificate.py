@@ -135,7 +135,10 @@ class RecordedSolves(dict[SolveKey, RecordedSolve]):
 
     def linear(self, solver: Any, b: NDArray[Any], transposed: bool, checked: bool, start: Any) -> NDArray[Any]:
         """Return the flat solution of a linear solve. The solver calls this in place of its own `solve`."""
-        operator = solver.system.unscaled.T if transposed else solver.system.unscaled
+        if transposed:
+            operator = solver.system.unscaled.T
+        else:
+            operator = solver.system.unscaled
         product = operator._flat.apply
 
         def solve() -> NDArray[Any]:
@@ -319,7 +322,10 @@ def _advice(error: float, causes: dict[str, float], rows: list[dict[str, Any]], 
     if error <= ROUNDING_ERROR:
         return "solves are exact to rounding"
     worst = max(iterative, key=lambda row: row["error"])
-    side = "adjoint" if causes["adjoint solves"] > causes["forward solves"] else "forward solve"
+    if causes["adjoint solves"] > causes["forward solves"]:
+        side = "adjoint"
+    else:
+        side = "forward solve"
     name = worst["solver"]
     rtol = worst["rtol"]
     goal = f"for {100 * target:g} %"

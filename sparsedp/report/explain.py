@@ -280,5 +280,8 @@ def _skipped_extras() -> Iterator[str]:
     """Say which extras this process has not imported."""
     for name, use in EXTRAS.items():
         if name not in sys.modules:
-            missing = "" if find_spec(name) else ", which is not installed"
+            if find_spec(name):
+                missing = ""
+            else:
+                missing = ", which is not installed"
             yield f"not imported: {name} ({use}){missing}"

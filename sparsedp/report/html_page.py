@@ -82,7 +82,10 @@ def section(title: str, result: Result, files: Sequence[Path], caption: str) -> 
             picture += f'<img alt="{cell(title)}" src="data:image/png;base64,{data}">'
     if not picture:
         picture = curves(*result.curves(), log=(True, True))
-    figure = f"<figure>{picture}<figcaption>{cell(caption)}</figcaption></figure>" if picture else ""
+    if picture:
+        figure = f"<figure>{picture}<figcaption>{cell(caption)}</figcaption></figure>"
+    else:
+        figure = ""
     return f'<section><h2>{cell(title)}</h2>{figure}<div class="wide">{result.html()}</div></section>'
 
 

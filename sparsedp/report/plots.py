@@ -99,13 +99,22 @@ def plot(
     if title is not None:
         ax.set_title(title)
     if grid.dim == 1:
-        marker = "." if values.size <= MOST_MARKERS else None
+        if values.size <= MOST_MARKERS:
+            marker = "."
+        else:
+            marker = None
         ax.plot(grid.coordinates(0, kind), values, marker=marker)
         ax.set(xlim=(grid.origin[0], grid.origin[0] + grid.size[0]), xlabel="x", ylabel=label or "")
         return ax
     low, high = limits or _range(values)
-    views = [(ax, values, [0, 1])] if grid.dim == 2 else _middle_slices(grid, values, kind, ax)
-    places = "nodes" if kind == "nodes" else "ends"  # pcolormesh takes nodes, or the ends of cells
+    views = [(ax, values, [0, 1])]
+    if grid.dim == 3:
+        views = list(_middle_slices(grid, values, kind, ax))
+    # pcolormesh takes nodes, or the ends of cells
+    if kind == "nodes":
+        places = "nodes"
+    else:
+        places = "ends"
     for view, part, axes in views:
         lines = [grid.coordinates(axis, places) for axis in axes]
         # pcolormesh has rows along y, so the array is transposed.
@@ -187,7 +196,7 @@ def _scalar_field(
 
     A map of a face field shows its magnitude at the centres of the cells.
     """
-    kinds = (at,) if at else ("cells", "faces", "nodes")
+    kinds = [at] if at else ["cells", "faces", "nodes"]
     kind = next((kind for kind in kinds if u.shape == getattr(grid, kind).shape), None)
     if kind is None:
         where = at or "cells, faces or nodes"
@@ -204,7 +213,9 @@ def _scalar_field(
 def _range(u: NDArray[Any]) -> tuple[float, float]:
     """Return the least and the largest finite value; 0 and 1 without any."""
     finite = u[np.isfinite(u)]
-    return (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+    if finite.size:
+        return (float(finite.min()), float(finite.max()))
+    return (0.0, 1.0)
 
 
 def _middle_slices(grid: Grid, u: NDArray[Any], kind: str, ax: Any) -> Iterator[tuple[Any, NDArray[Any], list[int]]]:
@@ -307,7 +318,10 @@ def convergence(best: Minimum, ax: Any = None, against: str = "iteration") -> An
     records = [(getattr(record, against), record.value, record.gradient_norm) for record in best.history]
     numbers = np.array(records, float)
     least = numbers[:, 1].min()
-    name = "loss - least loss" if least <= 0 else "loss"
+    if least <= 0:
+        name = "loss - least loss"
+    else:
+        name = "loss"
     lines = {name: numbers[:, :2] - (0.0, min(least, 0.0)), "gradient norm": numbers[:, ::2]}
     return _labelled_curves(lines, ax, against, "", f"{best.method}: {best.message.split(':')[0]}", xscale="linear")
 
@@ -345,7 +359,10 @@ def v_curve(audit: Audit, ax: Any = None) -> Any:
     """
     check_type("v_curve", audit, Audit, "what check.gradient returns", "dp.v_curve(dp.check.gradient(loss, x))")
     lines, xlabel, ylabel = audit.curves()
-    title = f"{audit.verdict}: {audit.culprit}" if audit.culprit else audit.verdict
+    if audit.culprit:
+        title = f"{audit.verdict}: {audit.culprit}"
+    else:
+        title = audit.verdict
     return _labelled_curves(lines, current(ax), xlabel, ylabel, title)
 
 
@@ -388,7 +405,9 @@ def figure() -> Any:
 
 def current(ax: Any) -> Any:
     """Return the axes, or the current ones of pyplot for None."""
-    return _matplotlib(".pyplot").gca() if ax is None else ax
+    if ax is None:
+        return _matplotlib(".pyplot").gca()
+    return ax
 
 
 def write_picture(path: Path, draw: Callable[[Any], Any]) -> None:

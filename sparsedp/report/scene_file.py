@@ -65,7 +65,7 @@ def load_scene(target: str) -> SceneFile:
         raise ValueError(f"{target!r} names no scene; write FILE.py:loss, or FILE.py:loss:start")
     file = Path(parts[1])
     loss_name = parts[2] or "loss"
-    point_names = [parts[3]] if parts[3] else POINT_NAMES
+    point_names = (parts[3],) if parts[3] else POINT_NAMES
     names = _run(file)
     if not callable(names.get(loss_name)):
         raise ValueError(f"{file} has no function {loss_name!r}; write {file}:NAME of the function to examine")
@@ -83,7 +83,10 @@ def load_scene(target: str) -> SceneFile:
             kind = type(arguments).__name__
             raise ValueError(f"{instrument}_options in {file} must be a dict of arguments, got {kind}")
         options[instrument] = arguments
-    name = file.stem if loss_name == "loss" else f"{file.stem}-{loss_name}"
+    if loss_name == "loss":
+        name = file.stem
+    else:
+        name = f"{file.stem}-{loss_name}"
     point = names[point_name]
     return SceneFile(name, _with_one_argument(names[loss_name], point), point, options)
 
@@ -170,7 +173,9 @@ def _line_of(error: BaseException, file: str) -> str:
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
     if isinstance(error, SyntaxError) and error.filename == file:
         lines.append(error.lineno)
-    return f"line {lines[-1]}: " if lines else ""
+    if lines:
+        return f"line {lines[-1]}: "
+    return ""
 
 
 # ---------------------------------------------------------------- folders

@@ -132,7 +132,9 @@ def _draw_v_curve(audit: Any) -> Callable[[Any], Any]:
 
 def _draw_stability_map(stress_result: Any) -> Callable[[Any], Any] | None:
     """Return what draws the stability map, None without one."""
-    return stress_result.plot if stress_result.map else None
+    if stress_result.map:
+        return stress_result.plot
+    return None
 
 
 def _draw_rows(rows: Any) -> Callable[[Any], Any]:

@@ -67,7 +67,10 @@ def growth_of(loss: Callable[[Any], Any], x: Any, step: Callable[[Any], Any] | N
         ``step(x)`` returns (advance, state) of another loop.
     """
     try:
-        loop = _first_rollout(loss, x) if step is None else step(x)
+        if step is None:
+            loop = _first_rollout(loss, x)
+        else:
+            loop = step(x)
         return loop and _measure_growth(*loop)
     except (SparsedpError, ValueError, ArithmeticError, RuntimeError) as error:
         return Growth(np.nan, refusal=type(error).__name__)

@@ -88,7 +88,10 @@ class Scene:
         if isinstance(ranges, dict):
             self.ranges = ranges
         else:
-            self.ranges = {"x": ranges} if ranges else {}
+            if ranges:
+                self.ranges = {"x": ranges}
+            else:
+                self.ranges = {}
         for name in (*self.ranges, time_step, viscosity):
             if name is not None and name not in names:
                 raise ValueError(f"stress knows the parameters {', '.join(names)}, got {name!r}; write one of them")
@@ -124,7 +127,9 @@ class Scene:
         """Return the word for a wrong number: FAILED at x itself, in stated ranges, and without viscosity."""
         is_stated = all(name in self.ranges and self.is_legal(name, value) for name, value in changed.items())
         is_inviscid = self.viscosity is not None and not np.any(changed.get(self.viscosity, 1.0))
-        return FAILED if is_stated or is_inviscid else DEGRADED
+        if is_stated or is_inviscid:
+            return FAILED
+        return DEGRADED
 
 
 class Outcome(NamedTuple):
@@ -359,7 +364,9 @@ def _smallest_gap(line: Line, largest: float) -> float:
             return gap
     if line.unchanged_steps and abs(line.slope) <= INVISIBLE_CHANGE * abs(line.base):
         return 0.0  # rounding of the loss hides the derivative
-    return gap if scale else inf
+    if scale:
+        return gap
+    return inf
 
 
 # ---------------------------------------------------------------- cases of a parameter: (case, other value, grade)
@@ -394,7 +401,9 @@ def scalings(scene: Scene, name: str, x: NDArray[Any]) -> Iterator[Case]:
     if not np.any(x):
         return
     for exponent in (1, -1, 10, -10, 100, -100, 900, -900):
-        grade = partial(grade_scaling, power=degree * exponent) if degree else grade_soundness
+        grade: Callable[..., Grade] = grade_soundness
+        if degree:
+            grade = partial(grade_scaling, power=degree * exponent)
         yield f"times 2^{exponent}", x * 2.0**exponent, grade
 
 
@@ -403,7 +412,9 @@ def _degree(scene: Scene, name: str, x: NDArray[Any]) -> int:
     values = [scene.value_or_nan(scene.at({name: scale * x})) for scale in (0.5, 1.0, 2.0)]
     low, high = np.diff(np.log2(np.abs(values)))
     is_monomial = abs(low - high) + abs(low - np.rint(low)) < 1e-12
-    return round(low) if is_monomial else 0
+    if is_monomial:
+        return round(low)
+    return 0
 
 
 def legal_range(scene: Scene, name: str, x: NDArray[Any]) -> Iterator[Case]:
@@ -411,8 +422,10 @@ def legal_range(scene: Scene, name: str, x: NDArray[Any]) -> Iterator[Case]:
     if name not in scene.ranges:
         return
     low, high = scene.ranges[name]
-    spread = np.geomspace if _spans_decades(low, high) else np.linspace
-    for value in spread(low, high, 5):
+    values = np.linspace(low, high, 5)
+    if _spans_decades(low, high):
+        values = np.geomspace(low, high, 5)
+    for value in values:
         yield f"all {value:.3g}", np.full_like(x, value), grade_soundness
     yield "below its range", np.full_like(x, 2 * low - high), grade_soundness
     yield "above its range", np.full_like(x, 2 * high - low), grade_soundness
@@ -431,9 +444,15 @@ def jumps(scene: Scene, name: str, x: NDArray[Any]) -> Iterator[Case]:
     if x.size <= 1 or not (has_range or np.all(x > 0)):
         return
     low, high = scene.ranges.get(name, (1e-4 * x, 1e4 * x))
-    words = f"{low:.3g} to {high:.3g}" if has_range else "8 decades"
+    if has_range:
+        words = f"{low:.3g} to {high:.3g}"
+    else:
+        words = "8 decades"
     share = np.random.default_rng(SEED).random(x.shape)
-    between = low * (high / low) ** share if _spans_decades(low, high) else low + (high - low) * share
+    if _spans_decades(low, high):
+        between = low * (high / low) ** share
+    else:
+        between = low + (high - low) * share
     is_first_half = np.arange(x.size).reshape(x.shape) < x.size // 2
     yield f"jump, {words}", np.where(is_first_half, low, high), grade_soundness
     yield f"random, {words}", between, grade_soundness

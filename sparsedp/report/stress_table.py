@@ -157,7 +157,10 @@ class Stress(Result):
 
     def parts(self) -> list[str | Table]:
         """Return all cases, what was skipped, the map, the failures, and the counts."""
-        growth = self.map.parts() if self.map else []
+        if self.map:
+            growth = self.map.parts()
+        else:
+            growth = []
         failures = [_failure(row) for row in self.failures]
         return ["stress", table_of(self.rows, COLUMNS), *self.omissions(), *growth, *failures, self.summary]
 

@@ -170,7 +170,10 @@ def work_precision(
     rows = []
     for (method, choice), *values in itertools.product(methods.items(), *over.values()):
         settings = dict(zip(over, values)) | dict(choice)
-        reason = skip(str(method), settings) if skip else None
+        if skip:
+            reason = skip(str(method), settings)
+        else:
+            reason = None
         if reason:
             skipped.append(f"{method} with {words_of(settings)}: {reason}")
             continue
@@ -250,7 +253,10 @@ def _prepare(problem: Callable[..., Any], settings: Mapping[str, Any]) -> _Task:
         kind = type(parts).__name__
         raise TypeError(f"a problem gives (loss, x) or (loss, x, facts), got {kind}; write return loss, x")
     loss, x = parts[:2]
-    facts = parts[2] if len(parts) == 3 else {}
+    if len(parts) == 3:
+        facts = parts[2]
+    else:
+        facts = {}
     output = facts.get("output")
     if x is None:  # the loss is the run itself, its result the answer
         return _Task([loss], x, facts, output)
@@ -266,7 +272,10 @@ def _measure(problem: Callable[..., Any], settings: Mapping[str, Any], repeats: 
         task = _prepare(problem, settings)
         seconds = perf_counter() - start
         status, first_calls, last_calls = _warm_up(task.runs[-1])
-        times = _times(task.runs, repeats) if status == "ok" else {}
+        if status == "ok":
+            times = _times(task.runs, repeats)
+        else:
+            times = {}
         peak_bytes, result = _peak_bytes(task.runs[-1])
         answer, gradient = task.answer(result)
     except FAILURES as error:
@@ -373,7 +382,10 @@ class _References:
             return *reference, 0.0
         if isinstance(reference, tuple):
             return *reference, 0.0
-        refinements = [reference] if isinstance(reference, dict) else reference
+        if isinstance(reference, dict):
+            refinements = [reference]
+        else:
+            refinements = reference
         answers = []
         for refinement in refinements:
             task = _prepare(self.problem, shared | refinement)
@@ -424,7 +436,9 @@ class Rows(Result):
     @property
     def main_error(self) -> str:
         """Column that methods are compared by: the error of the gradient, where there is one."""
-        return "gradient_error" if self.pareto() else "forward_error"
+        if self.pareto():
+            return "gradient_error"
+        return "forward_error"
 
     def seconds(self, row: dict[str, Any], error: str = "gradient_error") -> float:
         """Return the run time that belongs to an error: of the value, or of value and gradient."""
@@ -451,7 +465,10 @@ class Rows(Result):
         best = [row for row in self.pareto(error) if row[error] < 1]
         rows = []
         for row in self.rows:
-            star = "*" if row in best else ""
+            if row in best:
+                star = "*"
+            else:
+                star = ""
             rows.append(json.loads(row["settings"]) | row | {"best": star})
         settings = [name for name in self.over if name not in COLUMNS]
         parts: list[str | Table] = [
@@ -549,4 +566,6 @@ def _stored(file: Any) -> list[dict[str, Any]]:
 
 def _number(text: str) -> float:
     """Return a number from a cell; an empty one is NaN."""
-    return int(text) if text.isdigit() else float(text or "nan")
+    if text.isdigit():
+        return int(text)
+    return float(text or "nan")

@@ -117,7 +117,11 @@ def _check_gradient(study: Study, grid: dp.Grid, loss: Any) -> Any:
     """Check the gradient at a ground without special values, and print the result."""
     x, y = grid.centres()
     check = dp.check.gradient(loss, 0.5 * np.sin(5 * x + 1) * np.cos(4 * y), directions=1)
-    shown = check if grid is study.grids[-1] else check.verdict  # one table is enough
+    # one table is enough
+    if grid is study.grids[-1]:
+        shown = check
+    else:
+        shown = check.verdict
     print(f"On {grid}. Is the gradient right?", shown, sep="\n", end="\n\n", flush=True)
     return check
 
