@@ -21,7 +21,7 @@ def bad(array, index, value=np.nan):
 
 
 def through_walls():
-    """Much too fast at one face, which leaves a cell of a 1-D grid."""
+    """A velocity that is too large on one face, out of a cell of a 1-D grid."""
     return dp.transport(dp.Grid(4, spacing=0.5))(np.ones(4), np.array([0, 0, 2.0, 0, 0]), 0.5)
 
 
@@ -146,7 +146,7 @@ def test_message(case):
 
 
 def test_messages_of_other_schemes(monkeypatch):
-    """What a scheme says that is not linear and has no second derivatives."""
+    """Messages of a scheme that is not linear and has no second derivatives."""
     move = dp.transport(GRID)
     move.method.linear = move.method.any_order = False
     message = "transport upwind is not linear in u and has no matrix; write scheme='upwind', or call move(u, v, dt)"

@@ -27,7 +27,7 @@ def without_numba(monkeypatch):
 
 
 def setting(shape, periodic, scheme, form, interpolation, of="cells", velocity="faces", solid=None, **options):
-    """A transport and a point (u, v, dt, inflow) that is off all kinks."""
+    """Return a transport and arguments (u, v, dt, inflow) away from all kinks."""
     grid = dp.Grid(shape, spacing=(0.3, 0.4, 0.5)[: len(shape)], periodic=periodic)
     move = dp.transport(
         grid, scheme, velocity=velocity, of=of, interpolation=interpolation, **form, solid=solid, **options
@@ -88,7 +88,7 @@ def test_gradient_agrees_with_differences(scheme, form, of):
 @pytest.mark.parametrize(("scheme", "form"), SCHEMES)
 @pytest.mark.parametrize("of", ["cells", "faces"])
 def test_solid(without_numba, scheme, form, of):
-    """What is in a solid stays, and cells around it do not see it; the derivative knows."""
+    """Values in a solid do not change and have no effect on fluid cells; the derivatives agree."""
     solid = np.zeros((6, 5), bool)
     solid[2:5, 1:4] = True
     move, point = setting((6, 5), (False, True), scheme, form, "linear", of, solid=solid)
@@ -131,7 +131,7 @@ def test_maccormack_has_no_matrix():
 
 
 def test_second_derivatives(without_numba):
-    """In the field of the linear scheme, any; else a typed error."""
+    """The linear scheme has them in the field; all others raise a typed error."""
     move, (u, v, dt, _) = setting((6, 5), True, "semi_lagrangian", {}, "linear")
     slope = lambda u: dp.value_and_grad(lambda w: (move(w, v, dt) ** 3).sum())(u)[1]
     along = np.sin(np.arange(u.size)).reshape(u.shape)
@@ -145,7 +145,7 @@ def test_second_derivatives(without_numba):
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
 @pytest.mark.parametrize("shape", [(5,), (4, 3), (3, 4, 2), (1, 300)])
 def test_loops_agree_with_the_matrix_and_stay_within_the_samples(shape, interpolation):
-    """Departure points far out on all sides and at the points; what lies around the samples is NaN."""
+    """Departure points far outside and at the points; memory around the samples holds NaN."""
     periodic = (False, True, False)[: len(shape)]
     points = departure_samples.Points.of(shape, periodic, interpolation)
     rng = np.random.default_rng(1)
@@ -201,7 +201,7 @@ def test_bits_do_not_depend_on_threads(monkeypatch, scheme, shape):
 
 @pytest.mark.parametrize(("share", "order"), [(0.0, 1), (0.5, 2), (1.0, 1)])
 def test_which_velocity_makes_maccormack_second_order_in_time(share, order):
-    """That of the start of a step, the mean of both ends, that of the end: v = (1 + t)^2 carries 7 / 3 far until 1."""
+    """Velocity at the start of a step, mean of both ends, at the end: v = (1 + t)^2 transports by 7 / 3 until t = 1."""
 
     def error(n):
         grid = dp.Grid(n, size=2 * np.pi, periodic=True)

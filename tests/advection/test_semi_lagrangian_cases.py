@@ -11,7 +11,7 @@ from sparsedp.autodiff.derivative import pullback
 
 
 def burgers(cells=128):
-    """Case A7: explicit diffusion, then the diffused field carries itself."""
+    """Case A7: explicit diffusion, then transport of the field by itself."""
     grid = dp.Grid(cells, size=2.0, origin=-1.0, periodic=True)
     L = dp.laplacian(grid)
     carry = dp.transport(grid, "semi_lagrangian", velocity="cells")
@@ -56,7 +56,7 @@ def test_burgers_inverse():
 
 
 def test_rotating_hump():
-    """A3: the L1 error of each scheme after one turn, beside donor cell's 2.4e-2."""
+    """A3: the L1 error of each scheme after one revolution; upwind has 2.4e-2."""
     n = 64
     grid = dp.Grid((n, n), size=1.0)
     x, y = grid.centres()
@@ -82,7 +82,7 @@ def test_rotating_hump():
 
 
 def turned_blob(n, **options):
-    """Mean error of a blob after an eighth of a turn."""
+    """Return the mean error of a blob after an eighth of a revolution."""
     grid = dp.Grid((n, n), size=1.0)
     x, y = grid.centres()
     blob = lambda cx, cy: np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / 0.01)
@@ -133,7 +133,7 @@ def test_derivative_at_a_bound_is_the_mean_of_both_sides():
 @pytest.mark.parametrize("boundary", [dp.neumann, dp.dirichlet])
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
 def test_departure_points_far_outside(boundary, interpolation):
-    """What comes from far away has the value at the wall, and no slope in the velocity."""
+    """A departure point far outside gives the value at the wall, with a slope of 0 in the velocity."""
     move = dp.transport(dp.Grid(3), "semi_lagrangian", boundary, "cells", interpolation=interpolation)
     u = np.array([1.0, 5.0, 7.0])
     v = np.array([1e3, 1e300, -1e6])

@@ -11,7 +11,7 @@ from sparsedp.autodiff.derivative import value_and_grad
 
 
 class Recovery:
-    """Case A1: a marker carried round a periodic line by an unknown velocity in each cell."""
+    """Case A1: a marker transported along a periodic line by an unknown velocity in each cell."""
 
     def __init__(self, n=64, steps=60):
         self.grid = dp.Grid(n, size=1.0, periodic=True)
@@ -118,7 +118,7 @@ def test_exact_shift_and_growth_of_a_wave(velocity, form, speed):
 
 
 def rotate(n, scheme, steps):
-    """One turn; errors L1, L2, Linf and the largest value."""
+    """Return the errors L1, L2, Linf and the largest value after one revolution."""
     grid = dp.Grid((n, n), size=1.0)
     v = grid.join(-2 * np.pi * (grid.face_centres(0)[1] - 0.5), 2 * np.pi * (grid.face_centres(1)[0] - 0.5))
     x, y = grid.centres()
@@ -150,7 +150,7 @@ def profile(x):
 
 
 def error(n, scheme, form, velocity, stretched):
-    """Mean error after half a turn round a periodic line."""
+    """Return the mean error after half a period of a periodic line."""
     s = np.linspace(0, 1, n + 1)
     widths = np.diff(s + 0.1 * np.sin(2 * np.pi * s) / (2 * np.pi)) if stretched else np.full(n, 1 / n)
     grid = dp.Grid(n, spacing=widths, periodic=True)

@@ -64,7 +64,7 @@ def test_invalid_time_steps_are_refused(scheme, dt):
 
 @pytest.mark.parametrize("scheme, most", [("upwind", 1.0), ("van_leer", 0.5)])
 def test_the_stated_largest_step_is_stable(scheme, most):
-    """At the limit it passes, a little above it does not, and the message names the limit."""
+    """A step at the limit passes, a slightly longer one raises, and the message names the limit."""
     move, u, v, q = scene(scheme, (7,))
     with pytest.raises(UnstableStepError, match="the largest stable dt is") as caught:
         move(u, v, 10.0, q)
@@ -106,7 +106,7 @@ def test_an_overflowing_derivative_is_an_error(scheme, velocity):
 
 
 def disguises(x):
-    """The same numbers as other arrays."""
+    """Yield arrays of other layouts with the same values."""
     yield np.asfortranarray(x)
     yield np.repeat(x, 2, axis=-1)[..., ::2]
     yield np.ascontiguousarray(np.flip(x))[tuple(slice(None, None, -1) for _ in x.shape)]

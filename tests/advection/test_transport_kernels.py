@@ -33,7 +33,7 @@ def scenes():
 
 
 def results(move, u, v, q):
-    """Step and all cotangents, through the plain forms."""
+    """Return the result and all cotangents of the plain functions."""
     law = move.method
     args = (u.ravel(), v.ravel(), 0.01, q)
     new = law.forward(*args)
@@ -89,7 +89,7 @@ def test_separate_cotangents_are_bit_equal():
 
 
 def test_a_short_last_axis():
-    """A grid whose last axis has few cells is gathered instead of cut into segments."""
+    """A grid with few cells along its last axis."""
     grid = dp.Grid((3000, 2), size=1.0)
     move = dp.transport(grid)
     rng = np.random.default_rng(1)
@@ -99,7 +99,7 @@ def test_a_short_last_axis():
 
 
 def minmod(a, b, c, e):
-    """The difference to the nearer neighbour in value, halved; for equal cells."""
+    """Return half of the smaller of both differences (minmod); for equal cells."""
     low = np.abs(a) <= np.abs(b)
     same = a * b > 0
     slope = 0.5 * (low * a + (1.0 - low) * b) * same
@@ -114,14 +114,14 @@ def parabola(a, b, c, e):
 
 @cache
 def loop_of(limiter):
-    """Compiled once for all tests."""
+    """Return the compiled slope loop of a limiter, cached for all tests."""
     return fluxes.slope_loop("other", limiter, cache=False)
 
 
 @pytest.mark.parametrize("limiter", [minmod, pytest.param(parabola, marks=pytest.mark.whole)])
 @pytest.mark.parametrize("velocity, form", FORMS)
 def test_custom_limiters(limiter, velocity, form, monkeypatch):
-    """A scheme is a function and a line: its loops, its tangent and its cotangents are there."""
+    """A limiter function and an entry of SCHEMES give the loops, the tangent and the cotangents."""
     scheme = fluxes.Scheme(limiter, (0.0, 0.75, 1 / 3), 1.0, limiter is minmod)
     monkeypatch.setitem(fluxes.SCHEMES, "van_leer", scheme)
     monkeypatch.setitem(fluxes.slope_loops, "van_leer", loop_of(limiter))

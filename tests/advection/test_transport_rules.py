@@ -22,7 +22,7 @@ FORMS = list(product(("faces", "cells"), ("flux", "advective")))
 
 
 def scene(scheme, grid, velocity, form, of="cells", **options):
-    """A move, its arguments and a loss of all four."""
+    """Return a transport, its arguments and a loss of all four."""
     rng = np.random.default_rng(1)
     move = dp.transport(grid, scheme, dp.dirichlet, velocity, of, form=form, **options)
     shape = move.settings.velocity_shapes[0]
@@ -157,7 +157,7 @@ def test_gradients_are_reproducible(scheme):
 @pytest.mark.parametrize("scheme", ["upwind", "van_leer"])
 @pytest.mark.parametrize("velocity", ["faces", "cells"])
 def test_gradient_in_a_velocity_shared_by_steps(scheme, velocity):
-    """They add its cotangent up in one array, that nothing else holds: as if each had a velocity of its own."""
+    """Its cotangents are summed in one array; the result equals the sum of separate gradients."""
     move, args = scene(scheme, GRIDS["2-D"], velocity, "advective")[:2]
     u, v, dt, inflow = args.values()
     weight = RNG.normal(size=v.shape)
@@ -186,7 +186,7 @@ def test_gradient_in_a_velocity_shared_by_steps(scheme, velocity):
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_a_field_that_is_its_own_velocity(dtype):
-    """Field and velocity are one array, whose two cotangents meet."""
+    """Field and velocity are the same array, whose two cotangents are added."""
     grid = dp.Grid(12, periodic=True)
     move = dp.transport(grid, "upwind", velocity="cells")
     u = RNG.uniform(0.5, 1, 12).astype(dtype)
@@ -237,7 +237,7 @@ def test_kinks_get_the_mean_of_both_sides(velocity, kink):
 
 @pytest.mark.parametrize("scheme", ["upwind", "van_leer", "semi_lagrangian", "maccormack", "convection"])
 def test_an_array_may_be_reused_before_the_pullback(scheme):
-    """What is constant on the tape counts as it was when the step was made."""
+    """Constants on the tape keep the values that they had when the step was evaluated."""
     grid = dp.Grid((5, 4), size=1.0, periodic=(True, False))
     carry = dp.convection(grid) if scheme == "convection" else dp.transport(grid, scheme, dp.dirichlet, of="faces")
     buffers = [np.cos(np.arange(float(grid.faces.size))), 0.3 * np.sin(np.arange(float(grid.faces.size)))]

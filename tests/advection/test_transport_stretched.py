@@ -91,7 +91,7 @@ def test_matrix(interpolation, of):
 
 
 def error(n, options):
-    """One turn of a wave along a periodic line whose cells are stretched smoothly, error of value and of gradient."""
+    """Return the errors of value and gradient of a wave after one period, on smoothly stretched cells."""
     nodes = np.linspace(0.0, 1.0, n + 1)
     widths = np.diff(nodes + 0.05 * np.sin(2 * np.pi * nodes))
     grid = dp.Grid(n, spacing=[widths], periodic=True)

@@ -47,7 +47,7 @@ def rusanov(speed):
 
 
 def run(law, u, end, cfl=0.4, params=None):
-    """The state at a time, with steps of the right length for the first state."""
+    """Return the state at a time, with steps that are stable for the first state."""
     steps = int(np.ceil(2.2 * end / law.time_step(u, params, cfl)))
     return dp.rollout(dp.stepper("ssprk3", law, end / steps), u, params, steps)
 
@@ -78,7 +78,7 @@ def sod(x, time):
 
 @pytest.mark.parametrize(("speed", "most"), [(euler_speed, 0.002), (rusanov(euler_speed), 0.0023)])
 def test_sod(speed, most):
-    """Mean error of the density at 400 cells; 0.004 is what the field asks for."""
+    """Mean error of the density with 400 cells; the required accuracy is 0.004."""
     grid = dp.Grid(400, size=1.0)
     (x,) = grid.centres()
     start = np.stack([np.where(x < 0.5, 1.0, 0.125), 0 * x, np.where(x < 0.5, 1.0, 0.1) / (GAMMA - 1)])
@@ -160,7 +160,7 @@ def river(n, flow, equilibrium="lake", bump=True):
 
 
 def settled(law, lake, flow, end):
-    """The state that a lake with such an inflow is in after a time."""
+    """Return the state of a lake with an inflow after a time."""
     dt = 0.5 * law.grid.widths[0][0] / (np.sqrt(2 * GRAVITY) + 0.5 * flow)
     return dp.rollout(dp.stepper("ssprk3", law, dt), lake, None, int(end / dt))
 
@@ -381,7 +381,7 @@ def test_time_step():
 
 
 def test_states_at_rest_do_not_change():
-    """Where no wave moves the flux is the mean of both sides: of a constant pressure nothing is left."""
+    """Without waves the flux is the mean of both sides, which cancels for a constant pressure."""
     grid = dp.Grid(6)
     law = dp.conservation_law(grid, lambda u, p, axis: 3 + 0 * u, lambda u, p, axis: 0 * u)
     assert np.array_equal(law(np.arange(6.0)), np.zeros(6))
@@ -456,7 +456,7 @@ def test_refused_values():
 
 
 def test_negative_speeds_are_refused():
-    """It would take the mean flux, which is unstable, for the flux of the wind."""
+    """The flux would be the unstable mean instead of the upwind flux."""
     u = np.array([1.0, 2.0, 4.0, 3.0])
     for speed in (lambda u, p, axis: -u, lambda u, p, axis: (u + 1.0, u - 1.0)):
         law = dp.conservation_law(LINE, carry, speed)

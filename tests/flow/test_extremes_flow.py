@@ -35,7 +35,7 @@ def scene(scheme, rng, shape=(6, 5), **options):
 
 @pytest.mark.parametrize("scheme, of", list(product(SCHEMES, ("cells", "faces"))))
 def test_separate_gradients_next_to_solids(scheme, of, rng):
-    """What is asked alone is what is asked together."""
+    """Gradients requested separately equal those requested together."""
     solid = np.zeros((6, 5), bool)
     solid[2:4, 1:3] = solid[5, 4] = True
     move, *args = scene(scheme, rng, of=of, solid=solid)
@@ -51,7 +51,7 @@ def test_separate_gradients_next_to_solids(scheme, of, rng):
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_single_precision_in_a_rollout(scheme, rng):
-    """State, or params, or both: the gradient comes in the dtype of each, close to that in double precision."""
+    """In state, params or both: gradients have the dtype of each and are close to double precision."""
     move, u, v, q = scene(scheme, rng)
     step = lambda u, v: move(u, v, 0.02, q)
     slopes = dp.value_and_grad(lambda x: anp.sum(dp.rollout(step, *x, 7) ** 2))
@@ -105,7 +105,7 @@ def test_a_complex_rate_of_a_real_state(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_nonfinite_values_are_named(method):
-    """Also where a solver on the way is the first to meet it."""
+    """Also where a solver is the first to detect it."""
     step = made(method, lambda u, p: -p * u)
     timed = made(method, lambda u, p, t: -p * u * anp.cos(t))
     u = np.ones(5)
@@ -150,7 +150,7 @@ def test_a_rollout_of_whole_numbers_that_become_floats_is_refused():
 
 @pytest.mark.parametrize("method", ["backward_euler", "crank_nicolson", "tr_bdf2", "imex"])
 def test_a_fixed_operator_over_n_steps(method, rng):
-    """One set-up; a solve a stage forward and one back, in nu too; the same bits on any budget."""
+    """One set-up, one forward and one backward solve per stage; the same bits for every memory budget."""
     step = dp.stepper(method, dp.laplacian(dp.Grid((9, 8)), dp.dirichlet), 0.7)
     u = rng.random((9, 8))
     n = 6

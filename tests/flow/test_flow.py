@@ -192,7 +192,7 @@ def test_order_two_in_time(implicit):
 
 @pytest.mark.parametrize("implicit", [False, True])
 def test_a_force_on_walls_and_inflows_does_nothing(implicit):
-    """Implicit viscosity once carried it into the fluid: a first-order error. What flows in is given."""
+    """Implicit viscosity must not carry the force into the fluid, which is a first-order error."""
     grid = dp.Grid((8, 8), size=1.0)
     end = 0.016
     x, y = grid.centres()
@@ -228,7 +228,7 @@ def test_unneeded_operators_are_not_built():
 
 
 def test_free_stream_passes_an_open_channel():
-    """A uniform wind between gliding walls stays as it is."""
+    """A uniform flow between free-slip walls does not change."""
     grid = dp.Grid((10, 6))
     sides = {"x": (dp.inflow, dp.outflow), "y": dp.free_slip}
     step = dp.flow_step(grid, 0.2, 0.1, boundary=sides)
@@ -311,7 +311,7 @@ def test_refused_arguments():
 
 @pytest.mark.parametrize("convective", [False, True])
 def test_short_steps_with_explicit_and_implicit_viscosity_agree(convective):
-    """Moving walls drag the field at both ends of an implicit step: a short one ends where the explicit one does."""
+    """Moving walls act at both ends of an implicit step: short explicit and implicit steps agree."""
     grid = dp.Grid((6, 5), size=1.0)
     dt = 1e-6
     nu = 0.3

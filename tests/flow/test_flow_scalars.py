@@ -22,7 +22,7 @@ def cavity(n, dt, implicit=True, rayleigh=1e4, **options):
 
 
 def heat_flow(n, implicit, dt):
-    """Through each plane across x, carried and conducted, in the end."""
+    """Return the final heat flow through each plane across x, convective and diffusive."""
     grid, step, state = cavity(n, dt, implicit)
     end = dp.rollout(step, state, 1e4, round(0.25 / dt))
     u = grid.split(end["v"])[0]
@@ -58,7 +58,7 @@ def test_gradients():
 
 
 def test_dye_that_flows_in_and_past_a_solid():
-    """A channel: what enters is what leaves and stays; nothing gets into the solid; in the end all is dyed."""
+    """A channel: dye is conserved, does not enter the solid, and finally fills the fluid."""
     grid = dp.Grid((16, 9), size=(16.0, 9.0))
     solid = np.zeros(grid.shape, bool)
     solid[5:7, 3:6] = True

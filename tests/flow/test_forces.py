@@ -31,7 +31,7 @@ SIDES = {"x": (dp.inflow, dp.outflow), "y": (dp.no_slip, dp.free_slip)}
 
 
 def obstacles(periodic, rng):
-    """A stretched channel with two obstacles, what it needs, and a flow in it."""
+    """Return a stretched channel with two obstacles, its operators, and a flow in it."""
     h = rng.uniform(0.5, 2.0, 9), rng.uniform(0.5, 2.0, 7)
     grid = dp.Grid((9, 7), spacing=h, periodic=(periodic, False), origin=(-1.0, 2.0))
     sides = {axis: SIDES[axis] for axis in grid.axes[periodic:]}
@@ -43,7 +43,7 @@ def obstacles(periodic, rng):
 
 
 def incoming(grid, v, p, nu):
-    """Momentum along x that comes in: through the middle of the first cells, the outflow and the lower wall."""
+    """Return the momentum along x that enters through the first cells, the outflow and the lower wall."""
     u, (h, k) = grid.split(v)[0], grid.widths
     if grid.periodic[0]:
         return -nu * np.sum(grid.spacings(0) * u[:, 0]) / (0.5 * k[0])
@@ -54,7 +54,7 @@ def incoming(grid, v, p, nu):
 @pytest.mark.parametrize("periodic", [False, True])
 @pytest.mark.parametrize("slip", [dp.no_slip, dp.free_slip])
 def test_total_force_equals_the_momentum_through_the_boundary(periodic, slip, rng):
-    """The momentum equation, summed over the free faces, and the force on the obstacles are what comes in."""
+    """The momentum equation summed over the free faces plus the force equals the momentum that enters."""
     grid, sides, cells, v, p = obstacles(periodic, rng)
     slope = dp.gradient(grid, {} if periodic else {"x": (dp.neumann, dp.dirichlet)}, cells)
     rate = 0.3 * dp.face_laplacian(grid, sides, cells, slip)(v) - dp.convection(grid, sides, cells)(v, v) - slope(p)
@@ -81,7 +81,7 @@ def test_forces_are_additive_over_cells(rng):
 
 
 def test_torque(rng):
-    """Of a uniform acceleration: that of a point mass in the middle; about another point, force times arm."""
+    """A uniform acceleration has the torque of a point mass in the centre; elsewhere, force times lever arm."""
     for dim in (2, 3):
         grid = dp.Grid((4, 5, 6)[:dim], spacing=0.5, origin=1.0)
         on = dp.forces(grid, cells=np.ones(grid.shape, bool), about=(1.5, 2.0, 2.5)[:dim])
@@ -111,14 +111,14 @@ def test_derivatives_of_forces(rng):
 
 
 def flat_wall(grid, angle, place):
-    """Distance to a wall of this slope, at the faces."""
+    """Return the distance of the faces to a wall of a given slope."""
     x, y = (grid.join(*(grid.face_centres(axis)[a] for axis in (0, 1))) for a in (0, 1))
     return np.cos(angle) * (x - place) + np.sin(angle) * (y - place)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.4, np.pi / 4, 2.0])
 def test_effective_position_of_a_flat_wall(angle):
-    """The profile of the formula solves the equation on the grid, at every slope and every place."""
+    """The profile of the formula solves the equation on the grid, for every slope and position of the wall."""
     grid = dp.Grid((12, 12), size=3.0)
     h = 0.25
     for place in (1.3, 1.41, 1.5):

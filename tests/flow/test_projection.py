@@ -34,7 +34,7 @@ def velocity(grid, seed=0):
 
 
 def dense(grid, solid, boundary):
-    """The same map by dense algebra: P = K - G (D G)^+ D K on the faces that are not closed."""
+    """Return the same map by dense algebra: P = K - G (D G)^+ D K on the faces that are not closed."""
     keep = np.diag(np.ones(grid.faces.size))
     conditions = {}
     for axis, name in enumerate(grid.axes):
@@ -90,7 +90,7 @@ def test_divergence_idempotence_and_symmetry(shape, scenes):
 @pytest.mark.parametrize("shape", [(9,), (6, 5), (36, 40), (4, 3, 5)])
 @pytest.mark.parametrize("stretched", [False, True])
 def test_openings(shape, stretched):
-    """The inflow keeps its values, what enters leaves, and the transpose is the transpose."""
+    """The inflow keeps its values, inflow and outflow balance, and the transpose is exact."""
     grid = list(grids(shape))[int(stretched)]
     solid = np.zeros(shape, bool)
     solid[(slice(3, 5), slice(2, 3))[: len(shape)]] = len(shape) > 1
@@ -153,7 +153,7 @@ def test_all_derivative_modes(solid):
 
 
 def test_nan_anywhere_is_refused():
-    """A NaN on a wall would be dropped with the wall: the field is looked at first."""
+    """A NaN on a closed wall is refused too, although its value is not used."""
     grid = dp.Grid((4, 3))
     P = dp.projection(grid)
     for index in range(grid.faces.size):

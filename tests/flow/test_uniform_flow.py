@@ -109,7 +109,7 @@ STEPPING += [pytest.param(shape, True, name, id=f"{shape}-{name}", marks=WHOLE) 
 
 @pytest.mark.parametrize(("shape", "every", "name"), STEPPING)
 def test_flow_steps_preserve_a_uniform_flow(shape, every, name):
-    """With wall velocities as a function, and, where they can be told apart, as what `face_lift` makes of them."""
+    """Yield wall velocities as a function and, where it determines them, as the result of `face_lift`."""
     for flow in flows(shape, every):
         grid = flow.grid
         options = {"boundary": flow.sides, "unstable": "allow", **STEPS[name]}
@@ -122,7 +122,7 @@ def test_flow_steps_preserve_a_uniform_flow(shape, every, name):
 
 
 def test_scalars_and_friction_preserve_a_uniform_flow():
-    """Heat that is 1 everywhere, at the walls too; a friction that is far away."""
+    """A scalar of 1 in the cells and at the walls; a friction of an obstacle far away."""
     flow = Uniform((4, 5), (False, False), True)
     grid = flow.grid
     sides = dict.fromkeys(flow.grid.axes, dp.dirichlet)
@@ -147,7 +147,7 @@ def test_without_wall_velocities_flow_enters_at_right_angles():
 
 
 def free_of(grid, sides):
-    """The mask of the faces whose velocity is not given: where a uniform acceleration acts."""
+    """Return the mask of the faces whose velocity is unknown, on which a uniform acceleration acts."""
     still = dp.flow_step(grid, 1.0, boundary=sides, convective=False, force=lambda v, p: 1.0)
     return dp.mask(grid.faces, still.start(np.zeros(grid.faces.size))["a"] != 0.0)
 
@@ -214,7 +214,7 @@ def cylinder(angle, cells=10, far=8.0):
 
 @WHOLE
 def test_cylinder_in_an_oblique_flow():
-    """The drag does not depend on how the grid is turned, and there is no lift."""
+    """The drag does not depend on the orientation of the grid, and the lift is 0."""
     (straight, _), (turned, around) = cylinder(0.0), cylinder(np.deg2rad(20.0))
     assert turned[0] == pytest.approx(1.62, rel=0.02) and turned[0] == pytest.approx(straight[0], rel=0.015)
     assert abs(turned[1]) < 0.03 and abs(straight[1]) < 1e-9
@@ -276,7 +276,7 @@ CHANNEL = {"x": (dp.inflow, dp.outflow), "y": dp.no_slip}
 
 
 def channel(implicit, dt=0.02, dtype=float):
-    """A channel whose inflow blows and turns, and whose upper wall moves; all with the params."""
+    """Return a channel whose inflow and upper wall change with the params."""
     grid = dp.Grid((6, 4), size=(1.5, 1.0))
     space = dp.face_lift(grid, CHANNEL).domain
     bump = np.sin(np.pi * grid.coordinates(1, "cells"))
@@ -346,7 +346,7 @@ def test_a_lid_given_as_a_function_and_as_a_lift():
 
 
 def test_an_array_as_walls_gives_the_inflow_angle():
-    """What `face_lift` makes of velocities that differ along the inflow, with the same value and gradient."""
+    """The result of `face_lift` for velocities that vary along the inflow gives the same value and gradient."""
     grid = dp.Grid((4, 3), size=1.0)
     lift = dp.face_lift(grid, CHANNEL)
     wind = grid.join(1.0, 0.0)
@@ -395,7 +395,7 @@ def test_an_obstacle_beside_a_moving_wall(given):
 
 @pytest.mark.parametrize("part", [np.s_[:, :3], np.s_[:, 1:]])
 def test_forces_on_fluid_beside_a_moving_wall(part):
-    """Couette flow is steady: no force acts on any part of it, whether the wall at rest or the moving one is near."""
+    """Couette flow is steady: the force on any part of it is 0, next to either wall."""
     grid = dp.Grid((3, 5), size=(1.0, 1.0), periodic=(True, False))
     v = grid.join(2.0 * grid.face_centres(0)[1], 0.0)
     cells = np.zeros(grid.shape, bool)
@@ -412,7 +412,7 @@ def test_forces_on_fluid_beside_a_moving_wall(part):
 
 
 class Case(NamedTuple):
-    """What is refused."""
+    """Refused wall velocities."""
 
     act: Any
     error: Any

@@ -19,15 +19,20 @@ NUMBA = pytest.mark.skipif(not kernels.compiled(), reason="numba is not installe
 
 @pytest.fixture(params=[False, pytest.param(True, marks=NUMBA)], ids=["reference", "compiled"])
 def side(request, monkeypatch):
-    """Without numba and with it, there with threads for every size."""
+    """Run without numba, and with numba on several threads for every size."""
     monkeypatch.setattr(kernels, "compiled", lambda: request.param)
     monkeypatch.setattr(team, "SERIAL", 0)
 
 
 def line(rng, n, periodic, stretched):
-    """A tridiagonal matrix: random, or constant but for its ends."""
+    """Return a tridiagonal matrix: random, or constant except at its ends."""
     lower, centre, upper = rng.uniform(0.5, 1.5, (3, n))
-    first, last = (0, 0) if stretched else (0, n) if periodic else (1, max(1, n - 1))
+    if stretched:
+        first, last = 0, 0
+    elif periodic:
+        first, last = 0, n
+    else:
+        first, last = 1, max(1, n - 1)
     for band, value in ((lower, 1.25), (centre, -2.5), (upper, 0.75 if n % 2 else 1.25)):
         band[first:last] = value
     if not periodic or n == 1:
@@ -54,7 +59,7 @@ def matrix_of(axes, shape, shift):
 
 
 def cases():
-    """Shapes with axes of all kinds."""
+    """Yield shapes with all kinds of axes."""
     rng = np.random.default_rng(0)
     for turn, shape in enumerate(SHAPES * 3):
         kinds = [None if rng.random() < 0.2 else rng.random(2) < 0.5 for _ in shape]
@@ -80,7 +85,7 @@ def added(u, axes, shift):
 
 
 def threads_and_one(make):
-    """What `make` gives with all threads and with one."""
+    """Return the results of `make` with all threads and with one."""
     found = [make()]
     kernels.set_threads(1)
     try:
@@ -101,7 +106,7 @@ def test_sum_of_axes_is_the_sparse_matrix(side):
 
 @NUMBA
 def test_uniform_rows_give_the_same_bits():
-    """The same three numbers in every row, read once or read in each."""
+    """The same three numbers in every row, read once or for each row."""
     rng = np.random.default_rng(4)
     for shape in ((1, 1, 1), (1, 1, 2), (1, 5, 3), (1, 7, 40), (4, 1, 37), (3, 5, 40), (2, 3, 1)):
         axes = tuple(line(rng, n, n > 1, n > 1) for n in shape)

@@ -77,7 +77,7 @@ sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 @NUMBA
 @pytest.mark.whole
 def test_numba_compiles_the_functions_counted_by_the_house_test():
-    """Every function of the package that numba holds when all loops are compiled is one that test_house.py sees."""
+    """When all loops are compiled, numba holds exactly the functions that test_house.py counts."""
     from numba.core.dispatcher import Dispatcher
 
     from sparsedp.kernels import team

@@ -50,7 +50,8 @@ def test_elimination_solves_every_mode(n, transposed, compiled, rng, monkeypatch
         line, dense = bands(rng, n, uniform)
         modes = np.array([1e-9, 0.3, 7.0, 1e4] * 10)
         b = rng.standard_normal((n, modes.size))
-        Elimination(line, np.zeros(n), modes, 1.0).solve(x := b.copy(), transposed)
+        x = b.copy()
+        Elimination(line, np.zeros(n), modes, 1.0).solve(x, transposed)
         for j, mode in enumerate(modes):
             matrix = (dense.T if transposed else dense) + mode * np.eye(n)
             rest = np.abs(matrix @ x[:, j] - b[:, j])
@@ -61,5 +62,6 @@ def test_a_singular_mode_is_solved_up_to_its_null_vector(rng):
     line, dense = bands(rng, 40, True)
     b = rng.standard_normal((40, 16))
     b = b - b.mean(axis=0)
-    Elimination(line, np.zeros(40), np.zeros(16), 1.0).solve(x := b.copy(), False)
+    x = b.copy()
+    Elimination(line, np.zeros(40), np.zeros(16), 1.0).solve(x, False)
     assert np.max(np.abs(dense @ x - b)) <= 1e-12 * np.max(np.abs(x))
