@@ -42,8 +42,8 @@ FAULTS = {
     ),
     "cotangents of kept states at the step before": Bug(
         "trajectory",
-        "return None if row is None else [block[row] for block in blocks]",
-        "return None if row is None else [block[row - 1] for block in blocks]",
+        "return [block[row] for block in blocks]",
+        "return [block[row - 1] for block in blocks]",
         "",
     ),
     "a truncation one step early": Bug(

@@ -331,7 +331,6 @@ NOT_ANNOTATED = {
     "autodiff",
     "flow",
     "grid",
-    "integrators",
     "interop",
     "io",
     "kernels",
@@ -339,7 +338,6 @@ NOT_ANNOTATED = {
     "operators",
     "optimize",
     "parallel",
-    "trajectory",
 }
 
 

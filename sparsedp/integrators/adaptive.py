@@ -145,11 +145,17 @@ class Adaptive(Scheme):
         self.dyadic = scheme.dyadic
         self.tolerance = tolerance
         self.floor = constant(floor)
-        self.max_step = np.inf if max_step is None else float(max_step)
+        if max_step is None:
+            self.max_step = np.inf
+        else:
+            self.max_step = float(max_step)
         self.taken: list[float] = []
         self.compared = self.order
         self.ratio: float = 2**self.order - 1
-        self.weight = 0.0 if scheme.name == "crank_nicolson" else 1 / self.ratio
+        if scheme.name == "crank_nicolson":
+            self.weight = 0.0
+        else:
+            self.weight = 1 / self.ratio
 
     def __call__(self, *arguments: Any) -> Any:
         """Return the state after the interval h, from (u, params, t, h)."""
@@ -188,7 +194,10 @@ class Adaptive(Scheme):
         inspector = self.inspector(arguments)
         u, params, t, h = arguments
         for step in self._steps(u, params, t, h, inspector):
-            crossing = detector.first_crossing(self, step, arguments) if detector else None
+            if detector:
+                crossing = detector.first_crossing(self, step, arguments)
+            else:
+                crossing = None
             if crossing:
                 step = crossing.step
                 event = crossing.event
@@ -297,7 +306,9 @@ class Adaptive(Scheme):
         """Return the step from the same state with another length, a share of the interval; None if there is none."""
         _, params, t, h = arguments
         middle, new, _ = self._trial(step.u, params, later(t, step.done * h), length, h)
-        return None if new is None else AcceptedStep(length, step.done, step.u, middle, new)
+        if new is None:
+            return None
+        return AcceptedStep(length, step.done, step.u, middle, new)
 
     # ------------------------------------------------------------ error control
 
@@ -352,7 +363,10 @@ class Adaptive(Scheme):
                 yield AcceptedStep(length, done, u, middle, new)
                 count += 1
                 u = new
-                done = done + length if length < rest else 1.0
+                if length < rest:
+                    done = done + length
+                else:
+                    done = 1.0
                 error = max(error, QUIET)
                 if done == 1.0:
                     return
@@ -360,9 +374,16 @@ class Adaptive(Scheme):
                     last_length, last_error = last
                     change = min(change, change * length / last_length * (error / last_error) ** power)
                 last = length, error
-            least = SMALLEST if is_accepted or error > 1 else 0.0
+            if is_accepted or error > 1:
+                least = SMALLEST
+            else:
+                least = 0.0
             length *= float(np.clip(change, least, most))
-            most = LARGEST if is_accepted else 1.0  # the step after a refused one does not become longer
+            # the step after a refused one does not become longer
+            if is_accepted:
+                most = LARGEST
+            else:
+                most = 1.0
             if length < max(LEAST * done, TINY):
                 break
             if trial % self.window == 0:
@@ -396,7 +417,10 @@ class Adaptive(Scheme):
             raise NonFiniteError(
                 f"the rate of {self.name} must be finite at the state given; take a state in its domain"
             )
-        length = 0.01 * (size or 1.0) / (speed * float(h)) if speed > 0 else 1.0
+        if speed > 0:
+            length = 0.01 * (size or 1.0) / (speed * float(h))
+        else:
+            length = 1.0
         return min(max(1e3 * TINY, length), CAREFUL if self.problem.timed else 1.0)
 
     def _allowed(self, length: float, rest: float) -> float:
@@ -440,7 +464,9 @@ class Adaptive(Scheme):
     @staticmethod
     def extrapolated(fine: Any, whole: Any, weight: float) -> Any:
         """Return fine + weight (fine - whole)."""
-        return combine(fine, (weight, fine), (-weight, whole)) if weight else fine
+        if weight:
+            return combine(fine, (weight, fine), (-weight, whole))
+        return fine
 
     def _floors(self, u: Any) -> list:
         """Return a floor for each array of the state; a number or None may stand for a whole branch."""
@@ -536,9 +562,15 @@ class Adaptive(Scheme):
             start = later(later(t, step.done * h), shift)
             if event and step is path[-1]:
                 return self._state_at_event(event, step, less, u, params, start, half)
-            first = _length_shift(u, row[0]) if row else -returned * plain(half)
+            if row:
+                first = _length_shift(u, row[0])
+            else:
+                first = -returned * plain(half)
             middle = _with_values(self.scheme(u, params, start, half + first), step.middle)
-            second = _length_shift(middle, row[1]) if row else -returned * plain(half)
+            if row:
+                second = _length_shift(middle, row[1])
+            else:
+                second = -returned * plain(half)
             fine = self.scheme(middle, params, later(later(start, half), first), half + second)
             whole = self.scheme(u, params, start, half + first + (half + second))
             u = _with_values(self.extrapolated(fine, whole, self.weight - less), step.new)
@@ -604,7 +636,10 @@ class Adaptive(Scheme):
         deviation of the solution at the end, and refuses it if the perturbed ones differ too much.
         """
         share = self.compared / (self.compared + 1)
-        limit = UNCERTAIN * self.tolerance**share if self.weight else TIMES * self.tolerance
+        if self.weight:
+            limit = UNCERTAIN * self.tolerance**share
+        else:
+            limit = TIMES * self.tolerance
         unit = EPSILON * self.ratio
         scale = 0.0  # of the last input
         largest = 0.0  # of all inputs
@@ -630,7 +665,10 @@ class Adaptive(Scheme):
                     "before its first bounce; leave it out, or take fixed steps"
                 )
             # Without extrapolation errors fall more slowly than the tolerance: a smaller one is refused all the more.
-            cure = "give a smaller floor or tolerance" if self.weight else "take tr_bdf2, which extrapolates"
+            if self.weight:
+                cure = "give a smaller floor or tolerance"
+            else:
+                cure = "take tr_bdf2, which extrapolates"
             shown = number_beside(error / size, limit, float(f"{limit:.1e}"), digits=1, style="e")
             raise DerivativeError(
                 f"the derivative of {self.name} over {count} steps is uncertain by {shown} of its "
@@ -709,7 +747,9 @@ def _length_shift(u: Any, rows: Sequence) -> Any:
 
 
 def _magnitude(leaf: Any) -> Any:
-    return None if leaf is None else np.abs(leaf)
+    if leaf is None:
+        return None
+    return np.abs(leaf)
 
 
 def _largest_entry(tree: Any) -> float:
@@ -724,5 +764,8 @@ def inner_product(cotangent: Any, tangent: Any) -> float:
 
 def relative_sizes(leaf: Any) -> Any:
     """Return the unit of relative changes of each entry: the entry itself, and where it is 0, the largest one."""
-    size = np.abs(leaf) if is_variable(leaf) else 1.0
+    if is_variable(leaf):
+        size = np.abs(leaf)
+    else:
+        size = 1.0
     return np.where(size > 0, size, np.max(size, initial=0.0))

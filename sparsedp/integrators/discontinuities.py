@@ -84,7 +84,10 @@ class RateInspector:
 
     def rate(self, u: Any, share: float) -> list[np.ndarray]:
         """Return the rate at a share of the interval, as a list of arrays."""
-        time = None if self.t is None else self.t + share * self.h
+        if self.t is None:
+            time = None
+        else:
+            time = self.t + share * self.h
         return [np.asarray(leaf) for leaf in leaves(self.problem(u, self.params, time))]
 
     def rate_at_state(self, u: Any, time: Any) -> Any:
@@ -143,7 +146,9 @@ class RateInspector:
         for rate, moved in zip(rates, path.displacement(), strict=True):
             mean = np.tensordot(widths, 0.5 * (rate[1:] + rate[:-1]), 1)
             missed.append(path.length * self.h * mean - moved)
-        return MISSED if path.norm(missed) > UNSEEN * self.scheme.tolerance else None
+        if path.norm(missed) > UNSEEN * self.scheme.tolerance:
+            return MISSED
+        return None
 
     def _share_by_search(self, path: _StepPath, start: float, stop: float) -> float | None:
         """Locate the change of the rate between two shares of a step, and return the share that resolves it."""
@@ -152,7 +157,9 @@ class RateInspector:
             return None
         if not change.is_jump:
             width = RESOLVED * (change.stop - change.start)
-            return max(0.999 * change.start, width) if width < 0.5 else None
+            if width < 0.5:
+                return max(0.999 * change.start, width)
+            return None
         kick = change.size * path.length * self.h / self.scheme.tolerance
         if kick > 1:
             return max(0.999 * change.start, 0.5 / kick)
@@ -235,7 +242,9 @@ class RateInspector:
         total = np.convolve(changes, window, "same")
         shares = np.convolve(errors, window, "same") / np.where(total > 0, total, 1.0)
         worst = int(np.argmax(shares))
-        return worst if shares[worst] > COARSE else None
+        if shares[worst] > COARSE:
+            return worst
+        return None
 
 
 class _StepPath:
@@ -308,7 +317,10 @@ class _StepPath:
             return self.inspector.rate(self.state(share), place)
         if share not in self._rates:
             inspector = self.inspector
-            time = None if inspector.t is None else inspector.t + place * inspector.h
+            if inspector.t is None:
+                time = None
+            else:
+                time = inspector.t + place * inspector.h
             rate = inspector.rate_at_state(self.trees[share], time)
             self._rates[share] = [np.asarray(leaf) for leaf in leaves(rate)]
         return self._rates[share]
@@ -382,5 +394,9 @@ def steepest_change(path: _StepPath, start: float, stop: float, is_thorough: boo
         last = [rate[place + 1] for rate in rates]
         if division + 1 >= DIVISIONS and steady >= STEADY:
             is_isolated = np.sum(variation) - variation[place] < 0.2 * size
-            return _Change(size, start, stop, True) if is_isolated else None
-    return _Change(last_size, start, stop, True) if steady >= STEADY else None
+            if is_isolated:
+                return _Change(size, start, stop, True)
+            return None
+    if steady >= STEADY:
+        return _Change(last_size, start, stop, True)
+    return None

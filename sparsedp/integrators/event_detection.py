@@ -164,7 +164,10 @@ class EventDetector:
             if crossing is not None:
                 crossings.append(crossing)
         first = min(crossings, key=_length, default=None)
-        last = step if first is None else first.step
+        if first is None:
+            last = step
+        else:
+            last = first.step
         for place in unlocated:  # the signs where the next step begins
             value = self.events[place].plain_value(scheme.tree(last.new), self.params, t + last.length * h)
             self.signs[place] = float(np.sign(value)) or self.signs[place]
@@ -241,7 +244,9 @@ class EventDetector:
             return sign * self._value(scheme, step, start, event, part * step.length)
 
         lowest = minimize_scalar(distance, bounds=(0.0, 1.0), method="bounded", options={"xatol": 1e-6})
-        return lowest.x * step.length if lowest.fun < 0 else None
+        if lowest.fun < 0:
+            return lowest.x * step.length
+        return None
 
     def _located(
         self,

@@ -56,12 +56,17 @@ class Event:
 
     def value(self, u: Any, params: Any, t: Any) -> Any:
         """Return the number whose zero is located, traced or not."""
-        result = self.function(u, params, t) if self.takes_time else self.function(u, params)
+        if self.takes_time:
+            result = self.function(u, params, t)
+        else:
+            result = self.function(u, params)
         if np.size(plain(result)) != 1 or dtype_of(result).kind not in "fiu":
             raise ShapeError(
                 f"{self.name} must return one real number, got {dtype_of(result)} of shape {np.shape(plain(result))}"
             )
-        return result if np.ndim(plain(result)) == 0 else result.reshape(())
+        if np.ndim(plain(result)) == 0:
+            return result
+        return result.reshape(())
 
     def plain_value(self, u: Any, params: Any, t: float) -> float:
         """Return the number whose zero is located, as a float."""
@@ -85,7 +90,10 @@ class Event:
         """Return the state with which the step continues."""
         if self.jump is None:
             return u
-        new = self.jump(u, params, t) if self.jump_takes_time else self.jump(u, params)
+        if self.jump_takes_time:
+            new = self.jump(u, params, t)
+        else:
+            new = self.jump(u, params)
         return flatten(u)[1](field_leaves(new, u, f"the jump of {self.name}"))
 
 
@@ -191,7 +199,10 @@ class Surface:
             by_time = 1.0 / of_time
         directions = []
         for row, weight in zip(rows, weights, strict=True):
-            directions.append(np.conj(row) * weight**2 / square if square else 0.0 * weight)
+            if square:
+                directions.append(np.conj(row) * weight**2 / square)
+            else:
+                directions.append(0.0 * weight)
         margin = MARGIN * (np.sqrt(square) + abs(of_time * time))
         shift = 0.0
         for _ in range(SHIFTS):

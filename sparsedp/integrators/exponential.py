@@ -143,7 +143,10 @@ class PhiFunctions:
         def transposed() -> Rule:
             return self._rule(function, not is_transposed)
 
-        name = f"{self.name}.T" if is_transposed else self.name
+        if is_transposed:
+            name = f"{self.name}.T"
+        else:
+            name = self.name
         return family(name, forward, slope, transposed)
 
     def _set_up(self, function: Function, z: float) -> Operator:
@@ -198,7 +201,10 @@ class Exponential(Scheme):
             self.functions[op] = PhiFunctions(op, "stepper(etdrk4)")
         self.nodes: tuple = ()
         if problem.source is not None:
-            self.nodes = NODES if problem.source_takes_time else NODES[:1]
+            if problem.source_takes_time:
+                self.nodes = NODES
+            else:
+                self.nodes = NODES[:1]
         self.parts = [quadrature(self.nodes, *ends) for ends in ((0.0, 1.0), (0.0, 0.5), (0.5, 1.0))]
 
     def __call__(self, u: Any, params: Any, t: Any, h: Any) -> Any:

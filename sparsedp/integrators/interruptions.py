@@ -126,7 +126,10 @@ class Interrupted(Scheme):
 
     def breaks_within(self, params: Any, t: float, end: float) -> tuple[list[tuple[int, float]], bool]:
         """Return the places and times of the breaks in (t, end], in order, and whether there is one at t."""
-        times = np.array(self.break_times(params), float) if callable(self.breaks) else self.breaks
+        if callable(self.breaks):
+            times = np.array(self.break_times(params), float)
+        else:
+            times = self.breaks
         order = np.argsort(times, kind="stable")
         first, last = np.searchsorted(times[order], [t, end], "right")
         places: list[int] = []
@@ -137,7 +140,9 @@ class Interrupted(Scheme):
 
     def break_times(self, params: Any) -> Any:
         """Return the breaks, traced or not."""
-        return times_of(self.breaks(params)) if callable(self.breaks) else self.breaks
+        if callable(self.breaks):
+            return times_of(self.breaks(params))
+        return self.breaks
 
     # ------------------------------------------------------------ derivatives
 
@@ -205,7 +210,10 @@ class Interrupted(Scheme):
         event = segment.event
         starts = []
         for (u, t), run_params, stop in zip(states, params, stops, strict=True):
-            length = segment.length if event else stop - t
+            if event:
+                length = segment.length
+            else:
+                length = stop - t
             starts.append((u, Sided(run_params, segment.side), t, length))
         if not segment.path and event:
             return [self._event_at_start(event, *start[:3]) for start in starts]
@@ -289,7 +297,10 @@ class _IntervalRun:
     def _ends_before(self, place: int, stop: float, is_after_break: bool, latest: float) -> bool:
         """Continue to a stop; return whether a terminal event came first."""
         events = self.parent.events
-        earliest = np.nextafter(self.t, np.inf) if is_after_break else -np.inf
+        if is_after_break:
+            earliest = np.nextafter(self.t, np.inf)
+        else:
+            earliest = -np.inf
         count = 0
         repeats = 0
         while True:
@@ -307,7 +318,10 @@ class _IntervalRun:
                 return False
             count += 1
             is_repeated = self.t - start <= ROUNDING * max(abs(self.t), self.h)
-            repeats = repeats + 1 if is_repeated else 0
+            if is_repeated:
+                repeats = repeats + 1
+            else:
+                repeats = 0
             if count > MOST_EVENTS or repeats > REPEATS * len(events):
                 raise ConvergenceError(
                     f"{event.name} of {self.parent.name} occurs again and again at t = {self.t:.12g}; let it be "

@@ -117,7 +117,10 @@ def _kinds(tape: Any, batched_calls: dict) -> list:
             kind = node.vjp, [getattr(x, "shape", x) for x in node.held]
         else:
             batched = batched_calls[node]
-            kind = batched[0] if batched else node
+            if batched:
+                kind = batched[0]
+            else:
+                kind = node
         kinds.append((kind, [places[parent] for parent in node.parents]))
     return kinds
 
@@ -131,11 +134,17 @@ def _rows(tapes: list, size: int, batched_calls: dict) -> list:
     def add(parent: Any, g: Any) -> None:
         total, is_ours = sums.get(parent, (None, False))
         if type(g) is not Part:
-            sums[parent] = (g, False) if total is None else (total + g, True)
+            if total is None:
+                sums[parent] = (g, False)
+            else:
+                sums[parent] = (total + g, True)
             return
         part, index, shape = g
         if not is_ours:
-            total = np.zeros((*shape, count, size)) if total is None else np.array(total)
+            if total is None:
+                total = np.zeros((*shape, count, size))
+            else:
+                total = np.array(total)
             sums[parent] = total, True
         if index is Ellipsis or (type(index) is tuple and Ellipsis in index):  # it counts from the last axes
             total = np.moveaxis(total, (-2, -1), (0, 1))
@@ -164,7 +173,9 @@ def _pulled(nodes: Sequence, g: Any, batched_calls: dict) -> Any:
         act = batched_calls[node][2]
         return act(g, [batched_calls[node][1] for node in nodes])
     # A call of one tape, one cotangent after the other.
-    cotangents = g if type(g) is Several else np.ascontiguousarray(np.moveaxis(g[..., 0, :], -1, 0))
+    cotangents: Any = g
+    if type(g) is not Several:
+        cotangents = np.ascontiguousarray(np.moveaxis(g[..., 0, :], -1, 0))
     columns = zip(*(node.vjp(one, *node.held) for one in cotangents), strict=True)
     return [_joined([added(None, back)[0] for back in column]) for column in columns]
 
@@ -179,7 +190,9 @@ class Several(list):
 
 def _joined(column: list) -> Any:
     """Return cotangents of one tape, side by side."""
-    return Several(column) if isinstance(column[0], (tuple, list)) else np.stack(column, -1)[..., None, :]
+    if isinstance(column[0], (tuple, list)):
+        return Several(column)
+    return np.stack(column, -1)[..., None, :]
 
 
 def _side_by_side(rows: Sequence) -> list:

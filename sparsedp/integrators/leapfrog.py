@@ -201,7 +201,7 @@ def sponge(
     half, 2e-3 for one. A mean of p that is not 0 leaves an echo of 1e-2, where open space leaves none.
 
     References
-    ------
+    ----------
     J.-P. Berenger, J. Comput. Phys. 114 (1994) 185-200.
 
     Examples

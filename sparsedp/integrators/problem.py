@@ -1,5 +1,7 @@
-"""The right-hand side u' = c L u + rate(u, params, t) + source(params, t), the checks of its numbers, and arithmetic on
-states: an array, or any tree of arrays, plus multiples of others. Each field of a tree has a c L of its own, or none.
+"""The right-hand side of a problem, the checks of its numbers, and arithmetic on states.
+
+A problem is u' = c L u + rate(u, params, t) + source(params, t). A state is an array, or any tree of arrays; each field
+of a tree has a c L of its own, or none.
 
 Where a rate switches, at a time or on a surface of the state, it has two values. Steps that end there need the value
 before, steps that begin there the value after. The stepper then passes the params of the rate as `Sided`, and `Problem`
@@ -98,7 +100,9 @@ def _rounded(leaf: Any, old: Any) -> Any:
 
 def later(t: Any, h: Any) -> Any:
     """Return the time t + h, or None where nothing depends on the time."""
-    return t if t is None else t + h
+    if t is None:
+        return t
+    return t + h
 
 
 def untraced(tree: Any) -> Any:
@@ -119,7 +123,9 @@ def check_pair(name: str, value: Any, example: str) -> Any:
 def real_number(value: Any, name: str, sign: str = "", advice: str = "") -> Any:
     """Return one finite real number, traced or as a float, so that a float32 state stays in single precision."""
     check_number(name, plain(value), sign, advice)
-    return value if isbox(value) else float(value)
+    if isbox(value):
+        return value
+    return float(value)
 
 
 def takes_arguments(fun: Callable | None, least: int) -> bool:
@@ -162,7 +168,9 @@ class Side:
             return None
         value = plain(t)
         clipped = min(max(value, self.earliest), self.latest)
-        return t if clipped == value else t + (clipped - value)
+        if clipped == value:
+            return t
+        return t + (clipped - value)
 
     def inside(self, u: Any, params: Any, t: Any) -> tuple:
         """Return the state and time at which the rate is evaluated in place of (u, t)."""
@@ -181,7 +189,9 @@ class Sided(NamedTuple):
 
 def unsided(params: Any) -> Any:
     """Return the params as the user passed them."""
-    return params.params if type(params) is Sided else params
+    if type(params) is Sided:
+        return params.params
+    return params
 
 
 # ---- the right-hand side ---------------------------------------------------------------------------------------------
@@ -215,7 +225,7 @@ class StiffTerm:
         value = self._coefficient
         if callable(value):
             value = value(unsided(params))
-        return real_number(value, self.name, ">= 0", "; write a number >= 0, the sign is that of the operator")
+        return real_number(value, self.name, ">= 0", "; write a number >= 0, the sign belongs to the operator")
 
 
 def _stiff_terms(linear: Any, place: str) -> Any:
@@ -240,7 +250,9 @@ def _is_none(term: Any) -> bool:
 
 def _coefficient_from_params(params: Any) -> Any:
     """Return c of a rate that is an Operator: the params themselves, 1 where there are none."""
-    return 1.0 if params is None else params
+    if params is None:
+        return 1.0
+    return params
 
 
 class Problem:
@@ -306,11 +318,14 @@ class Problem:
         """
         entries, rebuild = flatten(u)
         rows = zip(self.terms(u), entries, *(field_leaves(tree, u) for tree in trees), strict=True)
-        results = []
+        results: list = []
         for term, leaf, *row in rows:
-            op = term.op if term else None
-            factor = h * term.coefficient(params) if term else h
-            results.append(None if leaf is None else act(op, factor, leaf, *row))
+            if leaf is None:
+                results.append(None)
+            elif term:
+                results.append(act(term.op, h * term.coefficient(params), leaf, *row))
+            else:
+                results.append(act(None, h, leaf, *row))
         return rebuild(results)
 
     def rate_value(self, u: Any, params: Any, t: Any) -> Any:
@@ -320,8 +335,9 @@ class Problem:
         if type(params) is Sided:
             u, t = params.side.inside(u, params.params, t)
             params = params.params
-        arguments = (params, t) if self.rate_takes_time else (params,)
-        return copied(_call_rate(self.rate, u, arguments))
+        if self.rate_takes_time:
+            return copied(_call_rate(self.rate, u, (params, t)))
+        return copied(_call_rate(self.rate, u, (params,)))
 
     def source_value(self, params: Any, t: Any) -> Any:
         """Return the source alone, or None."""

@@ -114,12 +114,16 @@ class Flat:
 
     def state(self, v: Any) -> Any:
         """Return the tree of flat unknowns."""
-        return v if self.is_vector else self.layout.split(v)
+        if self.is_vector:
+            return v
+        return self.layout.split(v)
 
     def __call__(self, v: Any, params: Any, t: Any) -> Any:
         """Return the flat rate."""
         rate = self.problem(self.state(v), params, t)
-        return rate if self.is_vector else self.layout.flat(rate)
+        if self.is_vector:
+            return rate
+        return self.layout.flat(rate)
 
     def rows(self, points: Iterable[tuple], params: Any, moving: Sequence[bool]) -> tuple[np.ndarray, np.ndarray]:
         """Return the rates at points (v, t), and their derivatives in the state, the moving params, and the time."""
@@ -186,8 +190,14 @@ class Radau(Adaptive):
         super().__init__(Scheme(problem, "radau", 5), tolerance, floor, max_step)
         self.user_jacobian = jacobian
         self.taken = [1.0]
-        self.newton_tolerance = NEWTON * tolerance if tolerance else settings["rtol"]
-        self.max_iterations = ITERATIONS if tolerance else settings["maxiter"] or 50
+        if tolerance:
+            self.newton_tolerance = NEWTON * tolerance
+        else:
+            self.newton_tolerance = settings["rtol"]
+        if tolerance:
+            self.max_iterations = ITERATIONS
+        else:
+            self.max_iterations = settings["maxiter"] or 50
         self.compared = EMBEDDED
         self.ratio = 1.0
         self.weight = 1.0
@@ -340,7 +350,10 @@ class Radau(Adaptive):
                 self.is_fresh = False
                 if self.is_slow:
                     self.J = None
-            z = self._newton(v, t, h) if self.J is not None else None
+            if self.J is not None:
+                z = self._newton(v, t, h)
+            else:
+                z = None
             if z is None and not self.is_fresh:
                 self.is_fresh = True
                 self.factored_length = None
@@ -391,13 +404,21 @@ class Radau(Adaptive):
             if iteration == 1:
                 size = self.units(v, v + z[2])
             moved = norm(correction / size)
-            ratio = moved / last if last else 0.0
-            error = moved * ratio / (1 - ratio) if ratio < 1 else np.inf
+            if last:
+                ratio = moved / last
+            else:
+                ratio = 0.0
+            if ratio < 1:
+                error = moved * ratio / (1 - ratio)
+            else:
+                error = np.inf
             if moved == 0.0 or (last and error <= max(self.newton_tolerance, ROUNDING)):
                 break
             rest = self.max_iterations - iteration
             if not (np.isfinite(error) and ratio ** (rest - 1) * error <= self.newton_tolerance):
-                return z if moved <= STALLED else None
+                if moved <= STALLED:
+                    return z
+                return None
             last = moved
         self.is_slow = ratio > FAST and iteration > 2
         return z
@@ -447,7 +468,10 @@ class Radau(Adaptive):
             """Apply the transpose."""
             y = np.zeros((start_units.size + 1, len(g)))
             y[: end_units.size] = (g / end_units).T
-            of_time = y[n].copy() if event else 0.0
+            if event:
+                of_time = y[n].copy()
+            else:
+                of_time = 0.0
             for group in reversed(groups):
                 for step, correction in self._linearised(group, path[-1], t, h, event)[::-1]:
                     head = y[: n + 1].copy()
@@ -491,7 +515,10 @@ class Radau(Adaptive):
         is_last = np.array([step is end for step in steps])
         sections = [self.section(*row)[0][0] for row in zip(u, rates[:m, None], length * h)]
         section = np.where(is_last[:, None], 0.0, sections)
-        gives_back = np.zeros(m, bool) if event else is_last
+        if event:
+            gives_back = np.zeros(m, bool)
+        else:
+            gives_back = is_last
         lengths = (length * h)[:, None, None]
         length = length[:, None, None]
         done = done[:, None, None]

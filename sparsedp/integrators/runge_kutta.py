@@ -163,7 +163,9 @@ class Polynomial(Scheme):
         name = f"stepper({self.name})"
 
         def advanced(op: Operator | None, z: Any, leaf: Any) -> Any:
-            return 1.0 * leaf if op is None else self._rule(op, name, self.order)(z, leaf)
+            if op is None:
+                return 1.0 * leaf
+            return self._rule(op, name, self.order)(z, leaf)
 
         return self.problem.on_fields(advanced, h, params, u)
 
@@ -173,13 +175,19 @@ def taylor(op: Operator, name: str, order: int, power: int = 0) -> Rule:
 
     Its derivative in z is the same rule with order - 1 and power + 1.
     """
-    other = name.removesuffix(".T") if name.endswith(".T") else f"{name}.T"
+    if name.endswith(".T"):
+        other = name.removesuffix(".T")
+    else:
+        other = f"{name}.T"
     transposed = partial(taylor, op.T, other, order, power)
     slope = partial(taylor, op, name, order - 1, power + 1)
 
     def forward(z: Any, u: Any) -> Any:
         z = float(z)  # a NumPy scalar would round float32
-        total = u if order >= 0 else 0.0 * u
+        if order >= 0:
+            total = u
+        else:
+            total = 0.0 * u
         for k in range(order, 0, -1):
             total = op.apply(total)
             total *= z / k
@@ -222,7 +230,10 @@ def family(name: str, forward: Callable, slope: Callable[[], Rule], transposed: 
     def jvp(nums: Sequence[int], tangents: Sequence, ans: Any, z: Any, b: Any) -> Any:
         parts = []
         for num, tangent in zip(nums, tangents, strict=True):
-            parts.append(rule(z, tangent) if num == 1 else tangent * slope()(z, b))
+            if num == 1:
+                parts.append(rule(z, tangent))
+            else:
+                parts.append(tangent * slope()(z, b))
         return reduce(add, parts)
 
     rule = Rule(name, forward, vjp, jvp)
@@ -274,13 +285,18 @@ class Resolvent:
         inverse = self._inverse(float(z))
         if transposed:
             return inverse.T.apply(b)
-        return inverse.apply(b) if checked else inverse.tangent.apply(b)
+        if checked:
+            return inverse.apply(b)
+        return inverse.tangent.apply(b)
 
     def _back(self, params: Sequence, places: Any, y: Any, x: Any) -> list:
         return [of_argument(anp.sum(y * self.op(x)), params[0])]
 
     def _product(self, transposed: bool, x: Any, z: Any) -> Any:
-        op = self.op.T if transposed else self.op
+        if transposed:
+            op = self.op.T
+        else:
+            op = self.op
         return x - z * op(x)
 
     def _set_up(self, z: float) -> Operator:
@@ -316,7 +332,9 @@ class Resolvent:
         if not self.op.structure.has_entries or system.complex or system.weights is None:
             return None
         null = system.null_space
-        return self._named(Projector(null, self.op.shape)) if null.count else None
+        if null.count:
+            return self._named(Projector(null, self.op.shape))
+        return None
 
 
 # ---- implicit: steps made of stages ----------------------------------------------------------------------------------
@@ -409,7 +427,9 @@ class Linear(Stages):
             b = combine(b, *((factor, self.problem.source_value(params, t)) for factor, t in shares))
 
         def solved(op: Operator | None, z: Any, leaf: Any) -> Any:
-            return leaf if op is None else self.resolvents[op](z, leaf)
+            if op is None:
+                return leaf
+            return self.resolvents[op](z, leaf)
 
         return self.problem.on_fields(solved, h, params, b)
 
@@ -446,7 +466,10 @@ class Nonlinear(Stages):
             return combine(x, (-1.0, b), (-h, problem(x, params, t)))
 
         residual.__name__ = name
-        derivative = None if jacobian is None else residual_jacobian(jacobian, bool(problem.timed))
+        if jacobian is None:
+            derivative = None
+        else:
+            derivative = residual_jacobian(jacobian, bool(problem.timed))
         self.root = implicit(residual, derivative, **options)
         self.info = self.root.info
 
@@ -476,8 +499,10 @@ def residual_jacobian(jacobian: Callable, timed: bool) -> Callable:
     def of_residual(x: Any, b: Any, h: Any, params: Any, t: Any) -> Any:
         if type(params) is Sided:
             x, t = params.side.inside(x, params.params, t)
-        arguments = (x, unsided(params), t) if timed else (x, unsided(params))
-        J = as_matrix(jacobian(*arguments))
+        if timed:
+            J = as_matrix(jacobian(x, unsided(params), t))
+        else:
+            J = as_matrix(jacobian(x, unsided(params)))
         return sp.eye_array(J.shape[0]) - h * J
 
     return of_residual

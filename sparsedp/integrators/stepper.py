@@ -467,7 +467,9 @@ class Step(Remade):
         )
 
     def _length(self, params: Any) -> Any:
-        return real_number(self.dt(params), "dt", "> 0") if callable(self.dt) else self.dt
+        if callable(self.dt):
+            return real_number(self.dt(params), "dt", "> 0")
+        return self.dt
 
     def check_reversible(self) -> None:
         """Refuse a step that `back` cannot reverse."""
@@ -499,7 +501,10 @@ class Step(Remade):
                     check_finite(f"{place} of {self.name}", np.asarray(plain(leaf)))
 
     def __repr__(self) -> str:
-        length = "given by the params" if callable(self.dt) else f"{float(plain(self.dt)):g}"
+        if callable(self.dt):
+            length = "given by the params"
+        else:
+            length = f"{float(plain(self.dt)):g}"
         return f"<{self.name}: order {self.order}, dt {length}>"
 
 
@@ -517,7 +522,9 @@ def largest_step(op: Any, reach: float) -> float:
         Length of the stable interval of the method on the negative real axis.
     """
     least = least_eigenvalue(op)
-    return reach / -least if least is not None and least < 0 else np.inf
+    if least is not None and least < 0:
+        return reach / -least
+    return np.inf
 
 
 def least_eigenvalue(op: Any) -> float | None:

@@ -83,13 +83,18 @@ class CheckpointPlan:
         kept : int
             Number of states kept so far.
         """
-        free = 1 if self.slots is None else max(self.slots - kept + 1, 1)
+        if self.slots is None:
+            free = 1
+        else:
+            free = max(self.slots - kept + 1, 1)
         return start + stride(stop + 1 - start, free)
 
 
 def beta(s: int, r: int) -> int:
     """Return the number of steps that s kept states and r runs can reverse; 0 where r or s is negative."""
-    return comb(s + r, r) if s >= 0 <= r else 0
+    if s >= 0 <= r:
+        return comb(s + r, r)
+    return 0
 
 
 def repetitions(n: int, s: int) -> int:

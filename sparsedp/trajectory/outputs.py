@@ -81,7 +81,10 @@ class LastState:
         """Return the user's result, from arrays as `finish` returns them."""
         values = []
         for value, is_python_float in zip(arrays, self.layout.is_float, strict=True):
-            values.append(float(value) if is_python_float and not isbox(value) else value)
+            if is_python_float and not isbox(value):
+                values.append(float(value))
+            else:
+                values.append(value)
         return self.layout.build(values, self._statics)
 
     def sources(self, n: int, cotangents: list) -> Callable[[State], list | None]:
@@ -90,7 +93,9 @@ class LastState:
             cotangents = [None if _is_zero(g) else g for g in cotangents]
 
         def source(state: State) -> list | None:
-            return cotangents if state.i == n else None
+            if state.i == n:
+                return cotangents
+            return None
 
         return source
 
@@ -139,7 +144,10 @@ class SelectedStates(LastState):
         for k, block in enumerate(self._blocks):
             if is_distributed(values[k]) and not isinstance(block, list):
                 block = self._blocks[k] = [*block]  # the first state was a NumPy array, this one is in blocks
-            block[row] = owned(values[k]) if isinstance(block, list) else values[k]
+            if isinstance(block, list):
+                block[row] = owned(values[k])
+            else:
+                block[row] = values[k]
             if np.ndim(values[k]) and self.holds_all_states:
                 values[k] = block[row]
         return state.with_values(values)
@@ -154,7 +162,10 @@ class SelectedStates(LastState):
                 arrays += block
             else:
                 self._places.append(len(arrays))
-                arrays.append(stacked(block) if isinstance(block, list) else block)
+                if isinstance(block, list):
+                    arrays.append(stacked(block))
+                else:
+                    arrays.append(block)
         self._blocks = []
         for block in arrays:
             if type(block) is np.ndarray:
@@ -165,7 +176,10 @@ class SelectedStates(LastState):
         """Return for each variable its stack, or the tuple of its states."""
         groups: list = []
         for place in self._places:
-            groups.append(arrays[place] if isinstance(place, int) else tuple(arrays[place]))
+            if isinstance(place, int):
+                groups.append(arrays[place])
+            else:
+                groups.append(tuple(arrays[place]))
         return groups
 
     def tree(self, arrays: Sequence) -> Any:
@@ -179,7 +193,9 @@ class SelectedStates(LastState):
 
         def source(state: State) -> list | None:
             row = self._rows.get(state.i)
-            return None if row is None else [block[row] for block in blocks]
+            if row is None:
+                return None
+            return [block[row] for block in blocks]
 
         return source
 
@@ -192,7 +208,9 @@ class AllStates(SelectedStates):
 
 def _along_trajectory(leaf: tuple) -> Any:
     """Stack the numbers and arrays of a static leaf in all states; take the first one of anything else."""
-    return np.stack(leaf) if isinstance(leaf[0], (bool, int, np.ndarray, np.generic)) else leaf[0]
+    if isinstance(leaf[0], (bool, int, np.ndarray, np.generic)):
+        return np.stack(leaf)
+    return leaf[0]
 
 
 class _StackedResult:
@@ -205,7 +223,9 @@ class _StackedResult:
     def of(self, stacks: Sequence) -> Any:
         """Return the result itself, or its cotangent."""
         stack = stacks[self.stack]
-        return stack if self.row is None else stack[self.row]
+        if self.row is None:
+            return stack
+        return stack[self.row]
 
 
 class FunctionOfStates(LastState):
@@ -259,11 +279,14 @@ class FunctionOfStates(LastState):
                 "keep uses a traced value that is not part of the state, and its derivative would be lost; "
                 "return what it needs of the state, and combine the two outside of rollout"
             )
-        is_alone = is_distributed(leaf)  # a field on ranks has a stack of its own
-        key = len(self._stacks) if is_alone else (np.shape(leaf), dtype_of(leaf).char)
+        if is_distributed(leaf):  # a field on ranks has a stack of its own
+            place = len(self._stacks)
+            self._stacks[place] = [owned(leaf)]
+            return _StackedResult(place, None)
+        key = (np.shape(leaf), dtype_of(leaf).char)
         stack = self._stacks.setdefault(key, [])
         stack.append(owned(leaf))
-        return _StackedResult(list(self._stacks).index(key), None if is_alone else len(stack) - 1)
+        return _StackedResult(list(self._stacks).index(key), len(stack) - 1)
 
     def _compare(self, i: int, results: Sequence) -> None:
         """Refuse a function that returns something else for a state than before."""
@@ -278,7 +301,10 @@ class FunctionOfStates(LastState):
         """End a run; return one array for each shape and dtype."""
         arrays = []
         for key, stack in self._stacks.items():
-            arrays.append(stack[0] if isinstance(key, int) else stacked(stack))
+            if isinstance(key, int):
+                arrays.append(stack[0])
+            else:
+                arrays.append(stacked(stack))
         self._stacks = {}
         return tuple(arrays)
 
@@ -286,7 +312,9 @@ class FunctionOfStates(LastState):
         """Return the tuple of what the function returned."""
 
         def take(leaf: Any) -> Any:
-            return leaf.of(arrays) if isinstance(leaf, _StackedResult) else leaf
+            if isinstance(leaf, _StackedResult):
+                return leaf.of(arrays)
+            return leaf
 
         return tuple(mapped(take, tree) for tree in self._trees)
 
@@ -304,7 +332,10 @@ class FunctionOfStates(LastState):
             self._compare(state.i, results)
             entering = []
             for leaf in leaves(first):
-                entering.append(leaf.of(cotangents) if isinstance(leaf, _StackedResult) else None)
+                if isinstance(leaf, _StackedResult):
+                    entering.append(leaf.of(cotangents))
+                else:
+                    entering.append(None)
             pulled = pull(entering)
             return [pulled[place] for place in self.layout.places]
 

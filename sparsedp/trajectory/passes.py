@@ -50,7 +50,10 @@ def run_forward(
     for i in shown_steps(progress, range(plan.n), "forward"):
         start = state
         is_taped = is_differentiated and (i == 0 or tape_bytes <= room)
-        recorder.bytes = 0 if i < 2 else None
+        if i < 2:
+            recorder.bytes = 0
+        else:
+            recorder.bytes = None
         state = runner.step(start, is_taped)
         if not runner.copies and True in map(is_, state.values, start.values) and _share_an_array(state, start):
             runner.copies = True  # run from the start again: this step may have read an array that it wrote into
@@ -125,17 +128,29 @@ def run_backward(
     sums: dict = {}  # root of params: (sum so far, whether it may be written to)
     rows: list[list] = []  # cotangents of the rows of each block of inputs
     for block, root in zip(runner.inputs, runner.input_roots, strict=True):
-        rows.append(list(zero_like(block)) if root else [])
+        if root:
+            rows.append(list(zero_like(block)))
+        else:
+            rows.append([])
     recomputed = 0
     state = kept.pop()
-    last = state if plan.is_reversing else None
+    if plan.is_reversing:
+        last = state
+    else:
+        last = None
     total = source(state)
-    norms = [] if total is None else [(n, largest(total))]
+    if total is None:
+        norms = []
+    else:
+        norms = [(n, largest(total))]
     for i in shown_steps(progress, range(n - 1, -1, -1), "backward"):
         if total is None and not outputs.enters_everywhere:
             break  # cut by truncation
         is_taped = kept and kept[-1].tape
-        fingerprint = [] if is_taped else state.fingerprint()
+        if is_taped:
+            fingerprint = []
+        else:
+            fingerprint = state.fingerprint()
         if plan.is_reversing:
             state = runner.reversed_step(state)
         else:
@@ -158,10 +173,19 @@ def run_backward(
         runner.check_drift(state, last)
     backs = list(total or [None] * len(specification.state.places))
     for root, value in zip(runner.param_roots, runner.params, strict=True):
-        back = sums[root][0] if root in sums else None
-        backs.append(None if back is None else fit("the step", value, back, back))
+        if root in sums:
+            back = sums[root][0]
+        else:
+            back = None
+        if back is None:
+            backs.append(None)
+        else:
+            backs.append(fit("the step", value, back, back))
     for row in rows:
-        backs.append(stacked(row) if row else None)
+        if row:
+            backs.append(stacked(row))
+        else:
+            backs.append(None)
     return backs, norms, recomputed
 
 
@@ -173,7 +197,10 @@ def _pulled_back(g: list, runner: StepRunner, state: State, sums: dict, rows: li
     backs: list = []
     is_reached = False
     for root, value in zip(roots, state.values):
-        back = sums.pop(root)[0] if root in sums else None
+        if root in sums:
+            back = sums.pop(root)[0]
+        else:
+            back = None
         if back is not None:
             back = fit("the step", value, back, back)
             is_reached = True
@@ -183,7 +210,9 @@ def _pulled_back(g: list, runner: StepRunner, state: State, sums: dict, rows: li
             row[state.i] = sums.pop(root)[0]
     if not sums.keys() <= runner.lasting_nodes:  # a node of another step
         refuse_foreign_trace("the step")
-    return backs if is_reached else None
+    if is_reached:
+        return backs
+    return None
 
 
 def _state_at(i: int, runner: StepRunner, plan: CheckpointPlan, kept: list[State]) -> tuple[State, int]:
@@ -209,7 +238,10 @@ def _sum(total: list | None, entering: list | None) -> list | None:
     sums = []
     for a, b in zip(total, entering, strict=True):
         if a is None or b is None:
-            sums.append(b if a is None else a)
+            if a is None:
+                sums.append(b)
+            else:
+                sums.append(a)
         else:
             sums.append(a + b)
     return sums
@@ -265,7 +297,10 @@ class RolloutRule(Rule):
         self.outputs = outputs
         self.progress = progress
         self.record = record
-        self.stored = plan.stored_indices() if specification.differentiated else {0}
+        if specification.differentiated:
+            self.stored = plan.stored_indices()
+        else:
+            self.stored = {0}
         self._runs: list[tuple[StepRunner, list[State]]] = []  # for the backward pass
         self._last_fingerprint: list = []
 
@@ -289,7 +324,9 @@ class RolloutRule(Rule):
             self.record(Record("forward", specification.n, n_kept, 0))
         results = self.outputs.finish(last)
         self.count = len(results)
-        return results if self.count != 1 else results[0]
+        if self.count != 1:
+            return results
+        return results[0]
 
     def again(self, *args: Any) -> Any:
         """Run the same steps from other values, which may be on any trace, without `progress` and `record`."""
@@ -356,5 +393,8 @@ class RolloutRule(Rule):
         cotangents = []
         for position in specification.differentiated:
             back = backs[position]
-            cotangents.append(zero_like(args[position]) if back is None else back)
+            if back is None:
+                cotangents.append(zero_like(args[position]))
+            else:
+                cotangents.append(back)
         return tuple(cotangents)

@@ -118,5 +118,8 @@ def largest(arrays: Any) -> float:
             size = float(np.max(np.abs(array)))
         else:  # without a temporary array
             size = max(float(np.maximum.reduce(array, axis=None)), -float(np.minimum.reduce(array, axis=None)))
-        total = size if size > total or size != size else total
+        if size > total or size != size:
+            total = size
+        else:
+            total = total
     return total

@@ -288,8 +288,14 @@ class RolloutSpecification:
     def __post_init__(self) -> None:
         self.state = self.layouts[0]
         self.params = self.layouts[1]
-        self.inputs = self.layouts[2] if len(self.layouts) == 3 else None
-        self.cuts = range(self.n - self.truncate, 0, -self.truncate) if self.truncate else range(0)
+        if len(self.layouts) == 3:
+            self.inputs = self.layouts[2]
+        else:
+            self.inputs = None
+        if self.truncate:
+            self.cuts = range(self.n - self.truncate, 0, -self.truncate)
+        else:
+            self.cuts = range(0)
         self.state.rounds = False
         for layout in self.layouts:
             self.is_open = self.is_open or layout.is_open
@@ -342,7 +348,10 @@ def fingerprint(values: Sequence, statics: Sequence = ()) -> list:
     marks = []
     for value in values:
         value = plain(value)
-        marks.append(value.fingerprint() if is_distributed(value) else hash(folded(contiguous(value))))
+        if is_distributed(value):
+            marks.append(value.fingerprint())
+        else:
+            marks.append(hash(folded(contiguous(value))))
     for leaf in statics:
         if isinstance(leaf, (int, str)):
             marks.append(hash(leaf))
@@ -355,7 +364,10 @@ def folded(value: Any) -> bytes:
     """Return bytes that depend on all bits of an array; a large one is cut into lines, added as whole numbers."""
     if value.nbytes < WHOLE:
         return value.tobytes()
-    fold = OTHER_FOLD if any(size % FOLD == 0 for size in value.shape) else FOLD
+    if any(size % FOLD == 0 for size in value.shape):
+        fold = OTHER_FOLD
+    else:
+        fold = FOLD
     flat = value.reshape(-1).view(np.uint8)
     end = flat.size - flat.size % (8 * fold)
     return flat[:end].view(np.uint64).reshape(-1, fold).sum(axis=0).tobytes() + flat[end:].tobytes()
@@ -389,7 +401,9 @@ def _is_open(tree: Any) -> bool:
 
 
 def _brief(value: Any) -> str:
-    return f"an array of dtype {value.dtype}" if isinstance(value, np.ndarray) else repr(value)
+    if isinstance(value, np.ndarray):
+        return f"an array of dtype {value.dtype}"
+    return repr(value)
 
 
 def _changed(name: str, expected: str, result: str, origin: str) -> str:

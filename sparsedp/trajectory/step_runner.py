@@ -146,9 +146,15 @@ class StepRunner:
             if specification.differentiated:
                 roots = self._new_roots(state, is_taped)
                 values = boxed(values, roots, number)
-        params = self._taped_params if is_taped else self._untaped_params
+        if is_taped:
+            params = self._taped_params
+        else:
+            params = self._untaped_params
         arguments = self._arguments(state, values, params)
-        entries = [leaves(argument) for argument in arguments] if specification.is_open else None
+        if specification.is_open:
+            entries = [leaves(argument) for argument in arguments]
+        else:
+            entries = None
         result = specification.step(*arguments)
         if entries is not None:
             _check_entries(arguments, entries)
@@ -183,7 +189,10 @@ class StepRunner:
 
     def state_tree(self, state: State) -> Any:
         """Return the tree of a state, for a function that is called again on a tape."""
-        root = self._untaped if state.i >= self.specification.first_traced else None
+        if state.i >= self.specification.first_traced:
+            root = self._untaped
+        else:
+            root = None
         values = boxed(map(frozen, state.values), [root] * len(state.values), self.number)
         return self.specification.state.build(values, state.statics)
 
@@ -194,12 +203,14 @@ class StepRunner:
             depends: list = [None] * len(state.values)
         else:
             depends = state.depends or [True] * len(state.values)
-        roots = []
+        roots: list = []
         for is_traced in (*depends, *self.input_roots):
-            if is_traced:
-                roots.append(self.recorder.root() if is_taped else self._untaped)
-            else:
+            if not is_traced:
                 roots.append(None)
+            elif is_taped:
+                roots.append(self.recorder.root())
+            else:
+                roots.append(self._untaped)
         return roots
 
     def _build_params(self, roots: list) -> Any:
@@ -215,7 +226,9 @@ class StepRunner:
 
     def _step_values(self, state: State) -> list:
         """Return the variables of state and inputs that a step gets; constants where the derivative is cut."""
-        values = map(plain, state.values) if state.i in self.specification.cuts else state.values
+        values = state.values
+        if state.i in self.specification.cuts:
+            values = list(map(plain, values))
         values = list(map(frozen, values))
         for block in self.inputs:
             values.append(frozen(block[state.i]))

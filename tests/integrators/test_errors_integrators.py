@@ -114,7 +114,7 @@ TABLE = [
     (
         lambda: dp.stepper("imex", lambda u, p: u, 0.1, linear={"a": (L, -1.0)})({"a": U}),
         VALUE,
-        "the coefficient of laplacian['a'] must be >= 0, got -1; write a number >= 0, the sign is that of the operator",
+        "the coefficient of laplacian['a'] must be >= 0, got -1; write a number >= 0, the sign belongs to the operator",
     ),
     (
         lambda: dp.stepper("euler", None, 0.1),
@@ -140,7 +140,7 @@ TABLE = [
     (
         lambda: dp.stepper("backward_euler", L, 0.1)(U, -1.0),
         VALUE,
-        "the coefficient of laplacian must be >= 0, got -1; write a number >= 0, the sign is that of the operator",
+        "the coefficient of laplacian must be >= 0, got -1; write a number >= 0, the sign belongs to the operator",
     ),
     (
         lambda: dp.stepper("backward_euler", None, 0.1, linear=(L, np.nan))(U),
@@ -328,7 +328,7 @@ def test_an_operator_of_the_wrong_sign_is_refused(method, grid):
     assert np.all(np.isfinite(stepped(L, 0.5))) and np.all(np.isfinite(stepped(-L, 1e-5)))
 
 
-def test_growth_that_is_meant_is_taken():
+def test_intended_growth_is_allowed():
     """Swift and Hohenberg's operator, with waves that grow; a growth of its own; one that is not symmetric."""
     grid = dp.Grid(32, size=20.0, periodic=True)
     one = dp.identity(grid.cells)
@@ -368,6 +368,6 @@ def test_a_stage_without_a_root_says_what_to_change():
         (lambda: dp.projection(dp.Grid(4), foo=1), "got 'foo'"),
     ],
 )
-def test_an_option_that_nobody_takes_is_refused_at_once(make, message):
+def test_an_unused_option_is_refused(make, message):
     with pytest.raises(TypeError, match=message):
         make()

@@ -254,7 +254,7 @@ def test_adjoint_of_a_step_is_its_transpose():
     assert np.sum(g * step(u, 0.7)) == pytest.approx(np.sum(back * u), rel=1e-12)
 
 
-def test_a_step_says_what_it_is():
+def test_repr_of_a_step():
     rate = lambda u, p: -p * u
     assert repr(dp.stepper("rk4", rate, 0.25)) == "<stepper(rk4): order 4, dt 0.25>"
     assert repr(dp.stepper("heun", rate, lambda p: 0.1 * p)) == "<stepper(heun): order 2, dt given by the params>"

@@ -233,7 +233,7 @@ def test_events_at_the_same_time_are_all_recorded(events, factor):
     assert value_and_grad(loss)(9.81) == pytest.approx((value, slope), rel=1e-9)
 
 
-def test_an_event_at_the_start_is_left():
+def test_an_event_at_the_start_does_not_count():
     """A ball that starts on the ground, and one that starts there at rest: neither bounces at once."""
     step = dp.stepper("rk4", falling, 0.5, tolerance=1e-6, events=(ground, bounce))
     assert step((np.array([0.0, 5.0]), 0.0), 9.81)[0][0] == pytest.approx(2.5 - 0.5 * 9.81 * 0.25, rel=1e-9)
@@ -275,7 +275,7 @@ def test_a_terminal_event_in_single_precision_ends_one_interval():
 
 
 @pytest.mark.parametrize("method", ["rk4", "radau"])
-def test_a_jump_before_the_end_of_a_step_takes_back_what_lay_behind_it(method):
+def test_a_jump_discards_the_rest_of_its_step(method):
     """A point that turns round at t = 0.4 neither reaches 0.5, nor crosses it upward."""
     level = event(lambda u, p, t: u[0] - 0.5, direction=1)
     turn = (lambda u, p, t: t - 0.4, lambda u, p: anp.array([u[0], -u[1]]))

@@ -306,13 +306,13 @@ def test_a_field_of_none_stays(method):
 
 
 @pytest.mark.parametrize("method", ["euler", "rk4", "imex", "etdrk4"])
-def test_a_field_without_a_term_is_handed_out_afresh(method):
+def test_a_field_without_a_term_is_returned_as_a_copy(method):
     state = {"u": U.copy(), "v": V.copy()}
     found = dp.stepper(method, None, 0.01, linear={"u": L, "v": None})(state)
     assert np.array_equal(found["v"], V) and not np.shares_memory(found["v"], state["v"])
 
 
-def test_the_way_back_of_a_linear_step_has_a_name_of_its_own():
+def test_the_vjp_of_a_linear_step_has_its_own_name():
     step = dp.stepper("heun", dp.laplacian(dp.Grid(5)), 0.1)
     u = np.arange(5.0)
     with recording() as calls:

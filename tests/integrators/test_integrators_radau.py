@@ -216,7 +216,7 @@ def test_all_rows_at_once(rate):
         assert np.array_equal(f, rate(u, p)) and found == pytest.approx(wanted, rel=1e-14, abs=1e-14)
 
 
-def test_points_go_back_together(monkeypatch):
+def test_tapes_of_many_points_are_traversed_together(monkeypatch):
     """Tapes of the same calls do, each branch by itself; what is not known goes back alone."""
     groups = []
     one_by_one = jacobians._rows
@@ -243,7 +243,7 @@ def test_second_derivatives_are_refused():
 
 
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-4, pytest.param(1e-6, marks=pytest.mark.whole)])
-def test_runs_that_meet_in_a_jump(tolerance):
+def test_intervals_that_meet_in_a_jump(tolerance):
     """Terms of the derivative there cancel to a thousandth: right, or refused."""
     slope = -0.6642059117567769 / 20
     for cut in (16.969, 16.9692, 16.9694):

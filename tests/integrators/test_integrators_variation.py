@@ -157,7 +157,7 @@ def test_in_loops(count):
             assert derivative(5.0) == pytest.approx(slope, rel=1e-4)
 
 
-def test_what_cannot_be_trusted_is_refused():
+def test_uncertain_derivatives_are_refused():
     """Two runs that meet in the middle of a jump: the terms of the derivative there cancel to a thousandth."""
     found = solve_ivp(lambda t, u: oscillator(u, 20.0), (0, 20), [2.0, 0.0], "Radau", rtol=1e-8, dense_output=True)
     times = np.linspace(0, 20, 100_001)
@@ -173,7 +173,7 @@ def test_what_cannot_be_trusted_is_refused():
         value_and_grad(loss)(20.0)
 
 
-@pytest.mark.whole  # test_what_cannot_be_trusted_is_refused is one of these
+@pytest.mark.whole  # test_uncertain_derivatives_are_refused is one of these
 @pytest.mark.parametrize("cut", [16.969, 16.9692, 16.9694])
 def test_what_hides_an_error_is_no_evidence(cut):
     """What extrapolation takes away and what errors of the tolerance do have opposite signs: 69 % wrong, and taken."""
@@ -193,7 +193,7 @@ def test_complex_and_single_precision():
 
 
 @pytest.mark.slow
-def test_without_extrapolation_the_way_out_is_another_method():
+def test_without_extrapolation_the_message_names_another_method():
     """Errors of crank_nicolson fall more slowly than its tolerance: a smaller one would be refused, too."""
 
     def prey(u, p):

@@ -111,7 +111,7 @@ def test_nothing_is_lost_in_ten_thousand_steps():
     assert shadow(p, v) == pytest.approx(shadow(*state), rel=1e-9)
 
 
-def test_a_step_back():
+def test_a_reversed_step():
     grid, step = strings(12, 0.03)
     rng = np.random.default_rng(0)
     state = rng.standard_normal(12), rng.standard_normal(12)
@@ -296,7 +296,7 @@ def test_reversed_steps_refuse():
         dp.rollout(lambda u, c: u, 1.0, None, 3, memory="reverse")
 
 
-def test_a_way_back_that_loses_the_start_is_refused():
+def test_reversed_steps_that_miss_the_first_state_are_refused():
     class Wrong:
         def __call__(self, u, c):
             return c * u

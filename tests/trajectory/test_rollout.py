@@ -64,7 +64,7 @@ def test_value_and_gradient(inputs):
 
 
 @pytest.mark.parametrize("memory", MEMORY)
-def test_the_budget_does_not_change_a_bit(memory):
+def test_bits_of_the_gradient_do_not_depend_on_memory(memory):
     x = (START, PARAMS, FORCE)
     value, slope = dp.value_and_grad(by_rollout)(x)
     again, same = dp.value_and_grad(lambda x: by_rollout(x, memory=memory))(x)
@@ -87,7 +87,7 @@ def test_some_states(keep):
     assert some["name"] == "a" and some["u"].flags.writeable
 
 
-def test_a_step_may_hand_out_one_array_again_and_again():
+def test_a_step_may_return_the_same_array_each_time():
     """In every mode: where nothing is traced, forward, back, and both."""
     work = np.zeros(2)
 
@@ -110,7 +110,7 @@ def test_a_step_may_hand_out_one_array_again_and_again():
 
 
 @pytest.mark.parametrize("keep", ["last", "all", lambda i, state: state])
-def test_a_step_that_writes_where_its_state_lies(keep):
+def test_a_step_that_writes_into_the_memory_of_its_state(keep):
     """It reads state[1] after it has written into the array that it returned as such."""
     work = np.zeros(2)
 

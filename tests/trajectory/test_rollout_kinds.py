@@ -363,7 +363,7 @@ def test_jvp_needs_no_kept_state():
 
 
 @pytest.mark.parametrize("memory", [136, None])
-def test_nothing_is_left_behind(memory):
+def test_memory_is_released(memory):
     """Without the cycle collector, all records are freed once the gradient is computed."""
 
     class Step:
@@ -472,7 +472,7 @@ def test_growth_is_the_lyapunov_exponent(step, start, p, n, exponent):
     assert abs(back.growth / exponent - 1) < 0.25
 
 
-def test_a_tame_run_is_not_flagged(recwarn):
+def test_a_stable_run_is_not_flagged(recwarn):
     runs = []
     dp.value_and_grad(lambda u: anp.sum(dp.rollout(bend, u, 1.3, 400, record=runs.append) ** 2))(0.01 * U)
     assert not runs[-1].flagged and not recwarn.list and runs[-1].norms[0][0] == 400

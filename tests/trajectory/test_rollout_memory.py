@@ -198,7 +198,7 @@ SCALED = Rule("scaled", lambda u, c: u * c, lambda nums, ans, u, c: lambda g: tu
 @pytest.mark.parametrize("keep", ["last", "each"])
 @pytest.mark.parametrize("params", [True, False])
 @pytest.mark.parametrize("states", [8, 9, 12, 16, 24, 80])
-def test_the_budget_is_what_a_step_without_needs_of_its_own_takes(states, params, keep):
+def test_peak_memory_of_a_step_without_other_arrays_is_the_budget(states, params, keep):
     """All of it, the result and its cotangent included; the states that are kept fill it."""
     n = 60
     rng = np.random.default_rng(0)
@@ -227,7 +227,7 @@ def test_the_budget_is_what_a_step_without_needs_of_its_own_takes(states, params
     assert peak(gradient) < states * size + entering + 100_000
 
 
-def test_a_budget_that_a_little_more_would_help_says_so():
+def test_a_slightly_small_budget_warns():
     """100 steps: the numbers of runs are those of the formula, the least budget is found by trying."""
     n = 100
     size = U0.nbytes
@@ -252,7 +252,7 @@ def test_a_budget_that_a_little_more_would_help_says_so():
         assert told == (found[0] if found else None)
 
 
-def test_all_states_handed_out_are_states_kept():
+def test_all_returned_states_are_the_kept_states():
     """Whatever the budget: no step is run again."""
     for step in (RULE, plain):
         runs = []

@@ -109,7 +109,7 @@ def test_every_order_is_that_of_the_loop(name, order, options, rng):
             assert np.max(np.abs(one - other)) <= bound * (1 + np.max(np.abs(other)))
 
 
-def test_a_derivative_forward_runs_each_step_once_and_keeps_one_state():
+def test_a_forward_derivative_runs_each_step_once_and_keeps_one_state():
     calls = []
     runs = []
     step = lambda u, p: calls.append(0) or u * p

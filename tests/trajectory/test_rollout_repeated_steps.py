@@ -130,7 +130,7 @@ def test_a_hidden_counter_under_a_budget(memory):
         dp.value_and_grad(lambda p: anp.sum(dp.rollout(Counted("counter"), U, p, 40, memory=memory)))(1.3)
 
 
-def test_a_keep_that_is_called_again():
+def test_a_keep_function_that_is_called_again():
     calls = []
     loss = lambda p: sum(dp.rollout(smooth, U, p, 3, keep=lambda i, u: calls.append(0) or u[0] * len(calls)))
     with pytest.raises(
@@ -147,7 +147,7 @@ def test_a_keep_that_is_called_again():
 
 @pytest.mark.parametrize("keep", ["last", "all"])
 @pytest.mark.parametrize("changed", ["one array", "all arrays", "a number"])
-def test_what_a_step_uses_is_changed_before_the_way_back(changed, keep):
+def test_values_changed_before_the_backward_pass(changed, keep):
     """A list of arrays beside the arguments, and a table that everybody may change."""
     steps = {
         "tree": lambda s, p: (s[0] * p * given[s[1]] + table["k"] * s[0] ** 2, s[1] + 1),
@@ -267,7 +267,7 @@ def test_fingerprints_see_every_bit_and_every_place():
 
 @pytest.mark.filterwarnings("ignore::sparsedp.errors.BudgetWarning")
 @pytest.mark.parametrize("memory", BUDGETS)
-def test_a_step_that_keeps_what_it_made_of_params_is_refused(memory):
+def test_a_step_that_stores_values_computed_from_params_is_refused(memory):
     """Run again on a tape, it would take the plain number for a constant: the same value, another derivative."""
     known = {}
 
@@ -308,7 +308,7 @@ def stored_in(name):
     "name",
     ["params 1", "params 5", "field 1", "field 4", "every 4", "before 0", "params, loss 1", "field, loss 7"],
 )
-def test_what_a_step_stores_is_refused_or_right(name, keep):
+def test_values_stored_by_a_step_are_refused_or_right(name, keep):
     """Used by later steps, or by the loss: a state that is run again knows nothing of the first run's constants."""
 
     def loop(p):
@@ -363,7 +363,7 @@ def stores(where):
 @pytest.mark.filterwarnings("ignore::sparsedp.errors.BudgetWarning")
 @pytest.mark.parametrize("memory", BUDGETS[:3])
 @pytest.mark.parametrize("where", ["keep", "step", "another rollout", "as it is"])
-def test_a_loss_that_uses_what_was_stored_on_the_way_is_refused(where, memory):
+def test_a_loss_that_uses_values_stored_by_a_step_is_refused(where, memory):
     loss = stores(where)
     with pytest.raises(DerivativeError, match="^a traced value was stored"):
         dp.value_and_grad(lambda p: loss(p, memory))(1.3)
