@@ -75,7 +75,7 @@ def test_numbers_linear_losses_and_solves():
     assert AUDIT(lambda b: anp.sum(solve(anp.exp(b)) ** 2), np.sin(np.arange(30.0)).reshape(6, 5)).digits >= 6
 
 
-def test_what_is_judged_is_not_recorded():
+def test_the_audited_loss_is_not_recorded():
     """A ledger that is open may change how things are called; one run on its own tells which solves there are."""
     solve = dp.inverse(-dp.laplacian(GRID, dp.dirichlet), "krylov", rtol=1e-9)
     seen = []

@@ -39,7 +39,7 @@ def test_the_culprit_of_random_scenes(error, seeds):
 
 
 @pytest.mark.parametrize("seeds", [(8, 9), pytest.param((10, 11, 12, 13), marks=pytest.mark.whole)])
-def test_right_scenes_have_none(seeds):
+def test_right_scenes_have_no_culprit(seeds):
     assert named(seeds, 0.0) == {("agrees", True): len(seeds)}
 
 
@@ -63,7 +63,7 @@ def test_every_kind_of_call(kind, rng):
     assert f"culprit: {name}, its" in str(result) and result.to_dict()["culprit"] == name
 
 
-def test_what_is_wrong_is_said(rng):
+def test_the_note_says_what_is_wrong(rng):
     act = call("inverse", "diffusion", GRID, rng, 1e-3, False)[0]
     assert "which it inverts" in str(AUDIT(lambda u: anp.sum(act(u) ** 2), X))
     act = rule("law", rng, 1e-3, jvp=True)
@@ -279,7 +279,7 @@ def test_a_ripple_is_inconclusive(frequency):
     assert smooth.verdict == "disagrees"
 
 
-def test_a_call_that_refuses_other_cotangents_is_passed_over():
+def test_a_call_that_refuses_other_cotangents_is_skipped():
     """As a step with error control may: it ends no search, the call at fault comes after it."""
 
     def pull(nums, ans, u):

@@ -90,7 +90,7 @@ def test_a_new_operator_in_five_lines():
     assert dp.check.operator(blur)
 
 
-def test_the_card_as_text_and_data():
+def test_the_summary_as_text_and_data():
     card = dp.check.operator(RIGHT["gradient"])
     text = str(card)
     for word in ("gradient: cells(6, 5) -> faces(6, 5): agrees", "form: explicit", "nnz: 120", "second order"):

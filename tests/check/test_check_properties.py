@@ -23,7 +23,7 @@ def test_laplacian():
     assert CARD(-dp.laplacian(GRID, dp.dirichlet)).facts["definite"] == "positive definite"
 
 
-def test_large_ones_know_the_ends_of_their_spectrum():
+def test_large_operators_report_the_ends_of_their_spectrum():
     facts = CARD(dp.laplacian(dp.Grid((40, 30)), dp.dirichlet), seeds=1).facts
     assert facts["spectral radius"] == pytest.approx(8.0, rel=0.01) and facts["stable step"] == pytest.approx(
         0.25, rel=0.01
@@ -46,7 +46,7 @@ def test_the_stable_step_of_transport_is_its_cfl_number():
     assert CARD(dp.from_matrix(np.zeros((2, 2)))).facts["stable step"] == np.inf
 
 
-def test_what_is_not_known_is_left_out():
+def test_unknown_facts_are_omitted():
     blur = dp.from_functions(lambda u: u + np.roll(u, 1), lambda g: g + np.roll(g, -1), 600, 600, name="blur")
     facts = CARD(blur, seeds=1).facts
     assert "spectral radius" not in facts and "symmetric" not in facts

@@ -24,7 +24,7 @@ def counted(loss):
     return told, calls
 
 
-def test_a_quick_audit_takes_a_third_and_says_what_it_did_not_look_at():
+def test_a_quick_audit_needs_a_third_and_lists_what_it_did_not_examine():
     x = {"a": np.linspace(1.0, 2.0, 5), "b": np.linspace(-1.0, 1.0, 4)}
 
     def loss(x):
@@ -59,7 +59,7 @@ class Terminal(io.StringIO):
 
 
 @pytest.mark.parametrize("quick", [False, True])
-def test_a_terminal_is_told_how_many_evaluations_come(quick, monkeypatch):
+def test_a_terminal_shows_the_expected_number_of_evaluations(quick, monkeypatch):
     told, calls = counted(lambda x: np.sum(np.sin(x)))
     screen = Terminal()
     monkeypatch.setattr(sys, "stderr", screen)
@@ -86,7 +86,7 @@ def test_with_tqdm_there_is_a_bar(monkeypatch):
     assert "evaluation/s" in screen.getvalue()
 
 
-def test_nothing_is_shown_where_nobody_watches(capsys):
+def test_nothing_is_shown_without_a_terminal(capsys):
     dp.check.gradient(lambda x: np.sum(np.sin(x)), np.linspace(1.0, 2.0, 5))
     assert capsys.readouterr() == ("", "")
 

@@ -99,7 +99,7 @@ def test_exact_solves():
     assert without.gradient_error == without.value_error == 0.0 and without.solves == []
 
 
-def test_parallel_branches_are_not_mistaken():
+def test_solves_of_parallel_branches_are_not_confused():
     """Solves of one inverse on two branches: y and r cannot be paired by order, and the value is right still."""
     exact, loose = (dp.inverse(-L, "krylov", rtol=rtol) for rtol in (1e-13, 1e-3))
 

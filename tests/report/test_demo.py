@@ -56,7 +56,7 @@ def finished(request, tmp_path_factory):
     return folder / "sparsedp-demo", done
 
 
-def test_it_ends_well(finished):
+def test_the_demo_succeeds(finished):
     folder, done = finished
     assert done.returncode == 0, done.stderr
     assert sorted(os.listdir(folder)) == sorted(WRITTEN)

@@ -175,7 +175,7 @@ def skipped(plan, words):
     return [sentence for sentence in plan.skipped if words in sentence]
 
 
-def test_what_a_scene_does_not_need_is_left_out():
+def test_what_a_scene_does_not_need_is_skipped():
     plan = plan_of("one operator")
     assert plan.totals["hierarchies built"] == plan.totals["set-ups built"] == plan.totals["forward solves"] == 0
     assert skipped(plan, "solves: none") and skipped(plan, "JVPs")
@@ -231,7 +231,7 @@ def test_newton():
     assert "Newton's method, Jacobian given" in str(plan)
 
 
-def test_others_report_through_the_ledger():
+def test_other_libraries_report_through_the_counters():
     """A time loop, or any rule, adds its own counts and reasons."""
 
     def advance(u):

@@ -51,7 +51,7 @@ def test_comparisons_and_shapes_in_a_loss():
     assert list(untraced) == kinds  # none stays behind
 
 
-def test_each_scene_leaves_out_what_it_does_not_need():
+def test_each_scene_skips_what_it_does_not_need():
     """By the public steps alone: what is not needed is not built, not solved, not taped, and a line says so."""
     n = 4
     move = dp.transport(GRID, "upwind")

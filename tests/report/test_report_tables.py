@@ -55,7 +55,7 @@ def test_a_limit_of_zero_is_a_limit():
     assert [cells[2] for cells in table.rows] == ["<= 0", ""]
 
 
-def test_a_failure_is_one_line_of_what_is_there():
+def test_a_failure_is_one_line_of_its_nonempty_cells():
     names = ("group", "parameter", "case", "outcome", "figure", "note")
     case = ("", "value and gradient", "FAILED", 1.0, "")
     rows = [dict(zip(names, ("as given", *case))), dict(zip(names, ("x", "dt", "low", "FAILED", 1.0, "grows")))]
@@ -84,7 +84,7 @@ def test_an_audit_is_a_table_in_markdown_too():
     assert "\n- verdict: agrees to" in text
 
 
-def test_what_a_result_draws():
+def test_curves_of_results():
     lines, across, up = dp.check.gradient(lambda x: x**2, 1.5).curves()
     assert list(lines)[0] == "random 1" and (across, up) == ("step", "|difference - gradient| / |derivative|")
     assert dp.explain(lambda x: x**2, 1.5).curves() == ({}, "", "")

@@ -50,7 +50,7 @@ def test_what_is_missing_or_wrong_is_named_with_a_command(wrong, told, monkeypat
         ("", "exit code 1"),
     ],
 )
-def test_what_fails_is_told_in_one_line(said, told):
+def test_failures_are_reported_in_one_line(said, told):
     script = f"import sys; print('Python'); sys.stderr.write({said!r}); sys.exit(1)"
     assert selftest.run([sys.executable, "-c", script]) == (["Python"], told)
 
@@ -73,7 +73,7 @@ def test_two_processes(monkeypatch, capsys):
 
 
 @on_ranks
-def test_a_wrong_gradient_is_told(monkeypatch):
+def test_a_wrong_gradient_is_reported(monkeypatch):
     monkeypatch.setattr(selftest, "WITHIN", -1.0)
     with pytest.raises(ArithmeticError, match=r"^a gradient is off by 0.0e\+00 from one process$"):
         next(selftest.compare())

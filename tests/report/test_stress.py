@@ -237,7 +237,7 @@ def test_implicit_diffusion_passes_and_has_a_map():
 
 
 @shared
-def test_what_it_is_as_data_and_text(stable):
+def test_the_result_as_data_and_text(stable):
     result = stable
     data = stable.to_dict()
     assert data["counts"] == result.counts and len(data["rows"]) == len(result.rows)

@@ -1,4 +1,4 @@
-"""What an audit must not decide: kinks, noise and ripples; and the orders of a Hessian product."""
+"""Kinks, noise, ripples and losses that are rounding, which an audit must not decide; orders of Hessian products."""
 
 import json
 from collections import Counter
@@ -6,7 +6,7 @@ from collections import Counter
 import autograd.numpy as anp
 import numpy as np
 import pytest
-from doubtful import kinked, noisy
+from undecidable_losses import kinked, noisy
 
 import sparsedp as dp
 
@@ -33,13 +33,13 @@ def test_100_scenes_at_a_kink_or_in_noise(make):
     assert not found["agrees"] and found["inconclusive"] >= (87 if make is kinked else 99), found
 
 
-def test_noise_is_said_in_digits():
+def test_noise_is_reported_in_digits():
     staircase = AUDIT(lambda u: float(np.float32(np.sum(u**2))), X, gradient=lambda u: 2 * u)
     assert staircase.verdict == "inconclusive" and "of the loss leaves" in staircase.reason
     assert AUDIT(lambda u: float(np.float32(np.sum(u**2))), X, gradient=lambda u: 2.02 * u).verdict == "disagrees"
 
 
-def test_stairs_that_the_steps_of_the_sweep_cannot_see():
+def test_staircase_losses_that_the_steps_of_the_sweep_cannot_see():
     """Powers of two meet a loss in single precision at one place of its stairs; the table of differences does not."""
     loss, x = noisy(6)
     assert AUDIT(loss, x).verdict == "inconclusive"
@@ -48,7 +48,7 @@ def test_stairs_that_the_steps_of_the_sweep_cannot_see():
 
 
 @pytest.mark.parametrize("size", [1e-6, 1e-8, 1e-10])
-def test_a_right_gradient_is_not_accused_for_noise_of_any_size(size):
+def test_a_right_gradient_is_not_called_wrong_for_noise_of_any_size(size):
     """Noise that is new at every point: a table of differences measures it, wherever the steps of the sweep are."""
     rng = np.random.default_rng(1)
     for scale in (0.1, 1.0, 10.0, 1.0, 0.1, 10.0):
@@ -139,7 +139,7 @@ def test_a_wrong_rule_that_a_large_constant_hides_is_found_by_itself():
 
 
 @pytest.mark.parametrize("size, frequency", [(1e-12, 1e9), (1e-14, 1e11), (1e-10, 1e9), (1e-11, 1e11)])
-def test_a_ripple_decides_nothing(size, frequency):
+def test_a_ripple_is_inconclusive_for_any_gradient(size, frequency):
     """The loss moves by its ripple no more than by rounding (or by little more), its derivative by far more."""
     x = X[:3]
     slope = lambda u: size * frequency * np.cos(frequency * u)
@@ -152,7 +152,7 @@ def test_a_ripple_decides_nothing(size, frequency):
 
 
 @pytest.mark.parametrize("size, frequency", [(1e-12, 1e6), (1e-13, 1e7), (1e-15, 1e8), (1e-10, 1e5)])
-def test_a_right_gradient_is_not_accused_for_a_ripple_that_its_curvature_hides(size, frequency):
+def test_a_right_gradient_is_not_called_wrong_for_a_ripple_that_its_curvature_hides(size, frequency):
     """Within a step that shows the ripple the gradient changes more by its curvature; both sides tell them apart."""
     assert AUDIT(lambda u: anp.sum(u**2) + size * anp.sum(anp.sin(frequency * u)), X).verdict == "inconclusive"
 
@@ -175,7 +175,7 @@ def test_a_wrong_gradient_is_no_ripple():
 
 
 @pytest.mark.parametrize("scale", [1e-200, 1e200])
-def test_any_size_is_judged_the_same(scale):
+def test_the_verdict_does_not_depend_on_the_size_of_the_loss(scale):
     """A right gradient, one three times too large, one off by 1e-7, a kink: with a Hessian product of that size."""
     smooth = lambda u: scale * anp.sum(anp.sin(u) * u**2)
     assert AUDIT(smooth, X).to_dict()["hessian"] == "agrees"
@@ -210,7 +210,7 @@ def plain(u):
     return getattr(u, "_value", u)
 
 
-def test_hessians_that_are_not_known():
+def test_unavailable_hessian_products():
     bent = AUDIT(lambda u: anp.sum(u**2) + anp.sum(anp.abs(u - X) ** 2.5), X)
     assert bent and bent.hessian == "inconclusive" and "not three times differentiable" in str(bent)
     assert AUDIT(lambda u: np.sum(u**2), X, gradient=2 * X).hessian is None
@@ -239,7 +239,7 @@ def test_a_hessian_product_that_is_no_number_does_not_agree():
 
 
 @pytest.mark.slow
-def test_a_right_gradient_among_kinks_is_not_accused_and_a_wrong_one_is():
+def test_a_right_gradient_among_kinks_is_not_called_wrong_and_a_wrong_one_is():
     """Clamped MacCormack on a field with ties: along one of the directions the kinks lie too close to be split."""
     grid = dp.Grid((24, 24), size=1.0, periodic=True)
     x, y = grid.centres()
@@ -277,7 +277,7 @@ def with_controlled_steps(error):
 
 
 @pytest.mark.parametrize("error", [0.0, *(pytest.param(share, marks=pytest.mark.whole) for share in (1e-3, 0.1))])
-def test_what_the_tolerance_of_steps_leaves_is_inconclusive(error):
+def test_gaps_within_the_tolerance_of_steps_are_inconclusive(error):
     """The gap is below the tolerance; a wrong rule of the same size is found by itself."""
     found = dp.check.gradient(with_controlled_steps(error), RATE, directions=1, quick=True)
     if error:

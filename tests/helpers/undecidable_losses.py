@@ -37,7 +37,7 @@ def kinked(seed):
 
 
 def bits(u):
-    """A number between -1 and 1 that is another one wherever u is another one."""
+    """Return a number between -1 and 1 that differs wherever u differs."""
     return zlib.crc32(np.asarray(u).tobytes()) / 2**31 - 1
 
 

@@ -1,4 +1,4 @@
-"""Attacks on the audit of a gradient: a table of wrong and awkward gradients, and right ones of random scenes."""
+"""Wrong and awkward gradients in a table with the verdicts of the audit, and right ones of random scenes."""
 
 import math
 import zlib
@@ -51,7 +51,7 @@ def noisy(size, factor=1.0):
     return lambda u: np.sum(u**2) * (1 + size * bits(u)), lambda u: 2 * factor * u
 
 
-ATTACKS = {
+GRADIENTS = {
     "right": (stepped, pulled(right), "agrees"),
     "A for the transpose": (stepped, pulled(lambda g: g + DT * WIND.apply(g)), "disagrees"),
     "one sign": (stepped, pulled(lambda g: g - DT * WIND.T.apply(g)), "disagrees"),
@@ -87,9 +87,9 @@ ATTACKS = {
 }
 
 
-@pytest.mark.parametrize("name", ATTACKS)
-def test_attack(name):
-    loss, grad, verdict = ATTACKS[name]
+@pytest.mark.parametrize("name", GRADIENTS)
+def test_verdict_on_wrong_and_awkward_gradients(name):
+    loss, grad, verdict = GRADIENTS[name]
     result = AUDIT(loss, U if loss is stepped else X, gradient=grad)
     assert result.verdict == verdict, result
     assert verdict == "agrees" or result.reason
@@ -102,13 +102,13 @@ def test_a_cubic_that_is_off_by_nine_parts_in_ten_million():
 
 def test_taylor_orders_are_gates():
     """Agreement means: order 1 is 1, order 2 is 1.95 or more; or there is none, in the two cases of the notes."""
-    for name, (loss, grad, verdict) in ATTACKS.items():
+    for name, (loss, grad, verdict) in GRADIENTS.items():
         lines = AUDIT(loss, U if loss is stepped else X, gradient=grad).lines if verdict == "agrees" else ()
         for line in lines:
             assert line.rate2 >= 1.95, name
             assert line.word == "vanishes" or math.isnan(line.rate1) or abs(line.rate1 - 1) <= 0.05, name
             assert not math.isnan(line.rate1) or line.word == "vanishes" or line.note.startswith("flat"), name
-    linear = AUDIT(*ATTACKS["linear"][:1], X, gradient=ATTACKS["linear"][1])
+    linear = AUDIT(*GRADIENTS["linear"][:1], X, gradient=GRADIENTS["linear"][1])
     assert all(math.isinf(line.rate2) and abs(line.rate1 - 1) <= 0.05 for line in linear.lines)
 
 
