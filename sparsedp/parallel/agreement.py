@@ -75,7 +75,7 @@ class Agreement:
                 self.tell(f"{name} of {what}", folded(np.asarray(value)))
 
     def meet(self, label, content=b""):
-        """One message from each rank to all -> the bytes `content` of each, one after the other.
+        """Send one message from each rank to all; return the bytes `content` of all ranks, in their order.
 
         Raises
         ------
@@ -133,7 +133,7 @@ class Agreement:
         return act.reduce(np.ndarray((self.comm.size, *number.shape), number.dtype, found), axis=0)[()]
 
     def gathered(self, value, label="gather"):
-        """A value of each rank -> the list of all, on every rank."""
+        """Return the values of all ranks as a list, on every rank."""
         self.meet(label)
         return self.comm.allgather(value)
 
@@ -180,7 +180,7 @@ class Agreement:
 
 
 def _marked(error):
-    """An error that all ranks raise: on its way out nobody asks the others again."""
+    """Mark an error that all ranks raise: callers on the stack do not exchange it again."""
     error.on_all_ranks = True
     return error
 
@@ -195,7 +195,7 @@ def _packed(error, where):
 
 
 def end_all(kind, error, trace):
-    """An error that ends one rank ends all: nobody waits for a message that never comes."""
+    """End all ranks with the error of one, so that no rank waits for its messages."""
     comm = MPI.COMM_WORLD
     told = "".join(traceback.format_exception(kind, error, trace))
     sys.stderr.write(f"rank {comm.rank} of {comm.size}: {told}")

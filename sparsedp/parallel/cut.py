@@ -30,13 +30,13 @@ NOTHING = np.iinfo(int).max  # as an end of a side: there is none
 
 
 def localized(structure, given, made):
-    """Structure of whole fields -> Structure of blocks.
+    """Return the structure on blocks of a structure on whole fields.
 
     Parameters
     ----------
     structure : Structure
     given, made : (layout, parts) or None
-        Where the field and the result lie; None: every rank has all of it.
+        Where the field and the result are stored; None: every rank has all of it.
 
     Raises
     ------
@@ -160,7 +160,7 @@ def _of_matrix(matrix, shape, given, made):
 
 
 def reads(entries, layout, parts):
-    """Numbers of entries of a whole field that a rank reads -> where each is in what is read, the Exchange."""
+    """Return the Exchange that reads some entries of a whole field, and the place of each entry in its result."""
     entries, places = np.unique(entries, return_inverse=True)
     return places.reshape(-1), Exchange(layout, parts, entries.size, np.arange(entries.size), entries)
 

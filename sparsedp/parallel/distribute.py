@@ -1,20 +1,23 @@
-"""distribute: a grid whose fields lie on the ranks of a communicator. gather: a field as one array again."""
+"""Store the fields of a grid on the ranks of a communicator (`distribute`), and collect them (`gather`)."""
+
+from __future__ import annotations
 
 import os
 import sys
+from typing import Any
 
 import numpy as np
 
 from sparsedp.errors import ShapeError
-from sparsedp.grid.grid import check_grid
+from sparsedp.grid.grid import Grid, check_grid
 
 __all__ = ["distribute", "gather"]
 
-SIZES = "OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE"  # what launchers tell: how many processes there are
+SIZES = "OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE"  # set by launchers: the number of processes
 
 
-def distribute(grid, comm=None):
-    """Grid -> the same grid, its fields laid out over the processes that run this program.
+def distribute(grid: Grid, comm: Any = None) -> Grid:
+    """Return a grid whose fields are stored in blocks by the processes that run this program.
 
     Parameters
     ----------
@@ -25,10 +28,10 @@ def distribute(grid, comm=None):
     Returns
     -------
     Grid
-        Where there is one process, the grid itself, and nothing is imported. Else every rank holds a block of each
-        field: arithmetic is local, sums, means, maxima and norms are those of the whole field, with the same bits
-        on every rank, and all else is refused by name. A plain array of the whole shape is a field that every rank
-        knows; its gradient is one too.
+        With one process, the grid itself, and nothing is imported. Otherwise every rank holds a block of each field:
+        arithmetic is local; sums, means, maxima and norms are computed over the whole field, with the same bits on
+        every rank; all other functions raise TypeError. A plain array of the whole shape is a field that every rank
+        holds, and so is its gradient.
 
     Raises
     ------
@@ -71,8 +74,8 @@ def distribute(grid, comm=None):
     return laid(grid, MPI.COMM_WORLD if comm is None else comm)
 
 
-def gather(u):
-    """Field, on ranks or not -> one plain array, which every rank has: for pictures and small files.
+def gather(u: Any) -> np.ndarray:
+    """Return a field, on ranks or not, as one plain array that every rank holds: for pictures and small files.
 
     Parameters
     ----------

@@ -29,7 +29,7 @@ def hold(comm):
 
 
 class Exchange:
-    """Flat block -> the numbers that this rank reads, a linear map. Made by all ranks together.
+    """The linear map from a flat block to the numbers that this rank reads. Built by all ranks together.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ class Exchange:
             self._forest.setUp()
 
     def forward(self, flat):
-        """Flat block -> what is read, flat."""
+        """Return the numbers that are read, flat, for a flat block."""
         return self._sent("bcast", MPI.REPLACE, flat, self.placed(flat))
 
     def backward(self, read):
@@ -67,7 +67,7 @@ class Exchange:
         return self._sent("reduce", MPI.SUM, read, self.taken(read))
 
     def placed(self, flat):
-        """Flat block -> what is read of it on this rank, zeros elsewhere."""
+        """Return the numbers that are read from the block of this rank itself, zeros elsewhere."""
         return _copied(flat, self.block, self.read)
 
     def taken(self, read):
@@ -88,7 +88,7 @@ class Exchange:
 
 
 def _copied(flat, given, made):
-    """Windows of a flat array -> those of another one, with zeros in between; an array that fills it is it."""
+    """Copy windows of a flat array into windows of another, zero elsewhere; without a copy if one fills the other."""
     (_, shapes, windows), (size, others, places) = given, made
     pieces = [part[window] for part, window in zip(components(flat, shapes), windows)]
     if len(pieces) == 1 and pieces[0].size == size and pieces[0].flags.c_contiguous:

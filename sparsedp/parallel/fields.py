@@ -45,7 +45,7 @@ class DistributedField(np.lib.mixins.NDArrayOperatorsMixin):
         return DistributedField(np.ascontiguousarray(flat), self.space)
 
     def copy(self):
-        """Itself: nobody can write into it."""
+        """Return the field itself: it is read-only."""
         return self
 
     def astype(self, dtype, copy=True):
@@ -69,7 +69,7 @@ class DistributedField(np.lib.mixins.NDArrayOperatorsMixin):
         return f"<field on {self.space}, on rank {self.layout.comm.rank} of {self.layout.comm.size}>"
 
     def block_of(self, value):
-        """Another operand -> its flat block; numbers as they are."""
+        """Return the flat block of another operand; numbers are returned unchanged."""
         if np.ndim(value):
             return block(value, self.space).flat
         self.layout.tell(value)
@@ -100,7 +100,7 @@ for name, what in {
 
 
 def block(value, space):
-    """A field in any form -> one on ranks: such a field, a number, or what every rank has whole (or broadcasts)."""
+    """Return a field on ranks, from such a field, a number, or an array that every rank holds and that broadcasts."""
     if isinstance(value, DistributedField):
         if value.space.parts != space.parts or value.layout != space.grid.backend:
             raise ShapeError(f"a field on {space.described} is needed, got one on {value.space.described}")
@@ -249,7 +249,7 @@ def _spread(shape, space):
 
 
 def everywhere(x, space):
-    """A number, or what every rank has whole -> a field on ranks; on the tape too."""
+    """Return a field on ranks, from a number or an array that every rank holds, traced or not."""
     if not isbox(x):
         return block(x, space)
     value = plain(x)
@@ -274,7 +274,7 @@ def total(x):
 
 
 def formulas(fun, value, args, nums):
-    """A call ``value = fun(*args)`` of autograd.numpy -> its two formulas, as those of shortcuts.FORMULAS; else None.
+    """Return the VJP and JVP of a call ``value = fun(*args)`` of autograd.numpy, as in FORMULAS; None if unknown.
 
     Numbers and whole arrays are made fields first; then every function entry by entry has the derivatives that
     autograd knows, to every order, and what spreads them adds up what comes back.

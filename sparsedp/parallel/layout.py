@@ -1,4 +1,4 @@
-"""Layout: what the core asks of a grid whose fields lie on ranks. It calls the methods, and imports nothing here."""
+"""Layout: the backend of grids whose fields are stored in blocks on the ranks of MPI; see autodiff/backend.py."""
 
 from functools import cache, cached_property, reduce
 from operator import add
@@ -30,14 +30,14 @@ from sparsedp.solvers.system import System
 
 __all__ = ["Layout"]
 
-# What asks by `check_grid` or `check_operator`, and is known to be right on ranks; all others are refused by name.
+# The functions that call `check_grid` or `check_operator` and work on ranks; all others raise TypeError.
 RIGHT = {
     "component", "curl", "distribute", "divergence", "flow_step", "flux", "harmonic_average", "interior", "inverse",
     "laplacian", "projection", "prolong", "restrict", "sample", "sponge", "transport", "upwind",
 }  # fmt: skip
 
 
-ENTRIES = 1000  # of an array that meets a field, so many are compared between ranks: it takes 5 us
+ENTRIES = 1000  # of an array beside a field that are compared between ranks, in 5 us
 
 
 class Layout(Partition, Backend):
@@ -56,7 +56,7 @@ class Layout(Partition, Backend):
     __repr__ = __str__
 
     def check(self, name):
-        """Refuse what is not known to be right on ranks."""
+        """Raise TypeError if a function does not work on ranks."""
         if name not in RIGHT:
             raise TypeError(f"{name} does not work on ranks yet; give it the grid from before dp.distribute")
 
@@ -158,7 +158,7 @@ class Layout(Partition, Backend):
         return tuple(DistributedField(np.array(full).reshape(-1), space) for full in np.meshgrid(*lines, indexing="ij"))
 
     def _beside(self, part, lines):
-        """Arrays along the axes -> what lies beside the block of this rank."""
+        """Return the parts of arrays along the axes that belong to the block of this rank."""
         return [line[start:stop] for line, (start, stop) in zip(lines, self.box(part))]
 
     def flat(self, field):
@@ -206,7 +206,7 @@ def method_and_carry(settings):
 
 
 def laid(grid, comm):
-    """Grid -> the same with its fields on the ranks of a communicator."""
+    """Return a grid whose fields are on the ranks of a communicator."""
     made = object.__new__(type(grid))
     vars(made).update(grid.__getstate__(), backend=Layout(grid.shape, grid.periodic, comm))
     return made
@@ -231,7 +231,7 @@ class Joint(Space):
 
 
 def _pieces(space):
-    """Space -> for each component, or field that it holds: its space, and the rules from all to it and back."""
+    """Return the space of each component (or field) of a space, with the rules from the whole to it and back."""
     layout, made, start = space.backend, [], 0
     for inner in getattr(space, "spaces", None) or [
         Space(part, f"components of {space.kind}", space.grid) for part in space.parts
@@ -255,5 +255,5 @@ def _piece(space, inner, here):
 
 
 def _side(space):
-    """Where fields on a space lie: (layout, components), or None where every rank has all of it."""
+    """Return where fields on a space are stored: (layout, components), or None if every rank has all of it."""
     return None if space.backend.whole_fields else (space.backend, space.parts)

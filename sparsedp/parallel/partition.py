@@ -52,7 +52,7 @@ class Partition:
     # ------------------------------------------------------------ blocks
 
     def lines(self, axis, length):
-        """Cuts along one axis of a component with so many entries: cells, nodes, or any other count."""
+        """Return the cuts along one axis of a component with `length` entries: cells, nodes, or any other number."""
         return np.append(self.cuts[axis][:-1] * length // max(self.shape[axis], 1), length)
 
     @cached_property
@@ -79,11 +79,11 @@ class Partition:
         return [field[slices(self.box(part, rank))] for field, part in zip(components(whole, parts), parts)]
 
     def take(self, values, parts):
-        """A whole flat field -> the flat block of this rank, a copy."""
+        """Return the flat block of this rank of a whole flat field, a copy."""
         return np.concatenate([values[:0], *(block.reshape(-1) for block in self.blocks(values, parts))])
 
     def gather(self, flat, parts):
-        """The flat block of this rank -> the whole flat field, on every rank."""
+        """Return the whole flat field on every rank, from the flat block of this rank."""
         whole = np.empty(sum(map(prod, parts)), flat.dtype)
         for rank, given in enumerate(self.agreement.gathered(flat)):
             for block, values in zip(self.blocks(whole, parts, rank), components(given, self.shapes(parts, rank))):
@@ -91,7 +91,7 @@ class Partition:
         return whole
 
     def owners(self, parts, entries):
-        """Numbers of entries of a whole flat field -> the rank that holds each, and where in its flat block."""
+        """Return the rank that holds each of some entries of a whole flat field, and the places in its flat block."""
         ranks, places = np.zeros((2, entries.size), np.int64)
         first, starts = 0, np.zeros(self.comm.size, np.int64)
         for part in parts:
@@ -127,13 +127,13 @@ def lengths(box):
 
 
 def slices(box, origin=None):
-    """A box -> one slice for each axis, counted from the starts of another box."""
+    """Return one slice for each axis of a box, relative to the start of another box."""
     starts = [0] * len(box) if origin is None else [start for start, _ in origin]
     return tuple(slice(a - start, b - start) for (a, b), start in zip(box, starts))
 
 
 def _arrangement(shape, count):
-    """So many ranks -> how many along each axis: that which cuts through the fewest cells, the first axes first."""
+    """Return the number of ranks along each axis for which the fewest cells are cut; ties prefer the first axes."""
     divisors = [p for p in range(count, 0, -1) if count % p == 0]
     found = [ranks for ranks in product(divisors, repeat=len(shape)) if prod(ranks) == count]
     return min(found, key=lambda ranks: sum((p - 1) * prod(shape) / max(n, 1) for p, n in zip(ranks, shape)))

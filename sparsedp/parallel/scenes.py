@@ -1,9 +1,11 @@
 """One loss over many scenes: its weighted sum and the derivatives of it, computed by the workers of any executor."""
 
+from __future__ import annotations
+
 import os
 import pickle
 from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from hashlib import sha256
 from platform import node
 from threading import RLock
@@ -26,17 +28,24 @@ __all__ = ["Ensemble", "ensemble"]
 CACHED = 128  # scenes and losses that a worker keeps as they were unpacked, with all that they have set up since
 
 
-def ensemble(loss, scenes, executor=None, weights=None, chunk=None, progress=False):
-    """Loss of (x, scene), scenes -> total(x): the weighted sum of loss(x, scene) over all scenes, differentiable in x.
+def ensemble(
+    loss: Callable,
+    scenes: Iterable,
+    executor: Any = None,
+    weights: Any = None,
+    chunk: int | None = None,
+    progress: bool | str = False,
+) -> Ensemble:
+    """Return the function total(x), the weighted sum of loss(x, scene) over all scenes, differentiable in x.
 
     Parameters
     ----------
     loss : callable
-        ``loss(x, scene) -> real scalar``; `x` is any nesting of arrays, tuples, lists and dicts.
+        ``loss(x, scene)``, a real scalar; `x` is any nesting of arrays, tuples, lists and dicts.
     scenes : iterable
         Whatever the loss takes: observations, initial states, grids, solvers.
     executor : concurrent.futures.Executor, optional
-        Who computes: ``ProcessPoolExecutor``, Dask's ``client.get_executor()``, mpi4py's ``MPIPoolExecutor``.
+        Such as ``ProcessPoolExecutor``, Dask's ``client.get_executor()``, mpi4py's ``MPIPoolExecutor``.
         Default: this process, one scene after the other. The caller starts it and shuts it down.
     weights : array (number of scenes,), optional
         Default: ones.
@@ -269,7 +278,7 @@ def _curvature(of, values, tangents):
 
 
 def _placed(x, moving, values):
-    """A tree -> the same one with other values at the leaves that move."""
+    """Return a tree with other values at its variable leaves."""
     entries, rebuild = flatten(x)
     return rebuild(placed(entries, moving, values))
 
@@ -279,7 +288,7 @@ def _added(total, parts):
 
 
 def _packed(thing):
-    """Anything -> (a key for its bytes, these)."""
+    """Return a key for the pickled bytes of an object, and these bytes."""
     data = _pickled(thing)
     return sha256(data).hexdigest(), data
 

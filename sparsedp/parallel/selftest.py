@@ -48,7 +48,7 @@ def report():
 
 
 def run(command):
-    """A command -> (lines that it prints, what went wrong in a few words or nothing)."""
+    """Run a command; return the lines that it prints, and a few words on its error (empty without one)."""
     settings = {"OMPI_MCA_rmaps_base_oversubscribe": "1", "OMP_NUM_THREADS": "1", **os.environ}
     try:
         done = subprocess.run(command, env=settings, capture_output=True, text=True, timeout=SECONDS, check=False)

@@ -43,7 +43,7 @@ TIGHT = 1e-14  # least relative residual that PETSc is asked for; the contract r
 
 
 def assembled(block, layout):
-    """Structure of blocks -> PETSc's matrix of it: products are PETSc's own."""
+    """Return a structure of blocks as a matrix of PETSc, which computes the products."""
     if isinstance(block, Chain):
         return reduce(PETSc.Mat.matMult, [assembled(member, layout) for member in block.members])
     if isinstance(block, Sum):

@@ -34,7 +34,7 @@ COLOURS = 8  # times the entries of the fullest row: more are no stencil's
 
 
 def stencil_of(name, space, products, lacking=None):
-    """Products with one Jacobian at several points -> its Stencil; with all that one has in which entries are lacking.
+    """Return the Stencil of a Jacobian from products with it at several points; `lacking`: a Stencil to extend.
 
     Raises
     ------

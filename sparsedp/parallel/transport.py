@@ -94,7 +94,7 @@ def velocity_space(setting, shape):
 
 
 class Block:
-    """The step on blocks that are so many cells wider, for velocities and inflow values of these shapes."""
+    """The step on blocks that are widened by some cells, for velocities and inflow values of given shapes."""
 
     def __init__(self, setting, width, shape, inflows, unstable):
         grid, layout = setting.grid, setting.grid.backend
@@ -172,7 +172,7 @@ def widened(space, boxes, shape, places=None):
 
 
 def last(act):
-    """A function of a field -> the same, which still knows what it gave last: a velocity often stays for many steps."""
+    """Return a function of a field that reuses its last result: many steps have the same velocity."""
     held = [None, None]
 
     def known(x):
@@ -184,7 +184,7 @@ def last(act):
 
 
 def on_blocks(agreement, local, ins, crop):
-    """The Rule of what a rank works on -> that of fields on ranks. Its derivatives are made of rules, to any order.
+    """Return the Rule of fields on ranks, from the Rule on blocks; its derivatives consist of rules, to any order.
 
     Parameters
     ----------
