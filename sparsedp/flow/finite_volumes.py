@@ -132,7 +132,7 @@ def conservation_law(
     Notes
     -----
     Order: 2 where the solution is smooth and has no extremum (van_leer), 1 at shocks.
-    Time steps: "ssprk3" of `stepper` with a dt of `law.time_step` preserves what one Euler step preserves; dt is not
+    Time steps: "ssprk3" of `stepper` with a dt of `law.time_step` preserves the properties of an Euler step; dt is not
     checked otherwise.
     Derivatives: limiters, shocks and the larger of two speeds have kinks, where `check.gradient` returns
     "inconclusive".

@@ -148,7 +148,7 @@ class Side(NamedTuple):
     shown: float  # 0.0 at a wall with an inflow value; else 1.0
 
 
-def tile_of(axes, part):
+def tile_of(axes: NDArray, part: int) -> tuple[Any, ...]:
     """Return the row of a tile, its first cell and its number of cells; the latter two also as unsigned numbers."""
     length = axes[-1, N]
     tiles = -(-length // TILE)
@@ -159,7 +159,7 @@ def tile_of(axes, part):
     return row, first, size, uint64(first), uint64(size)
 
 
-def side_of(axes, a, piece, upper, tile):
+def side_of(axes: NDArray, a: int, piece: int, upper: Any, tile: tuple[Any, ...]) -> Side:
     """Return the lower or the upper side of the cells of a piece of a tile along axis `a`.
 
     Along the last axis the pieces are the inner cells (0), the lower end (1) and the upper end (2) of a row.
@@ -222,12 +222,24 @@ def side_of(axes, a, piece, upper, tile):
     )
 
 
-def share(flow):
+def share(flow: float) -> float:
     """Return the share of the cell beyond a side in the value there, by the velocity into the cell; 1/2 at rest."""
     return 0.5 * (flow > 0.0) + 0.5 * (flow >= 0.0)
 
 
-def weigh(lines, line, x, start, table, row, axes, a, side, free, c):
+def weigh(
+    lines: NDArray,
+    line: Any,
+    x: NDArray,
+    start: Any,
+    table: NDArray,
+    row: Any,
+    axes: NDArray,
+    a: int,
+    side: Side,
+    free: NDArray,
+    c: Any,
+) -> None:
     """Set a line buffer to x times a row of the table for the cells of a piece, and to 0 on closed sides."""
     b = side.begin
     e = side.end
@@ -243,7 +255,22 @@ def weigh(lines, line, x, start, table, row, axes, a, side, free, c):
             lines[line + j] *= free[2 * a + row % 2, c + j]
 
 
-def to_velocity(w, gw, fresh, u, inflow, slopes, given, ratio, flux, a, on_sides, c, sides, places):
+def to_velocity(
+    w: NDArray,
+    gw: NDArray,
+    fresh: bool,
+    u: NDArray,
+    inflow: NDArray,
+    slopes: NDArray,
+    given: NDArray,
+    ratio: float,
+    flux: float,
+    a: int,
+    on_sides: Any,
+    c: Any,
+    sides: tuple[Side, Side],
+    places: tuple[Any, ...],
+) -> Any:
     """Set (`fresh`) or add the cotangent of w for the sides of a piece, and return how many of them are not finite.
 
     `given` holds the cotangents of the cells for their lower and upper sides and of the cells beyond, from the indices

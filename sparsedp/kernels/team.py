@@ -206,7 +206,9 @@ class Kernel:
         *args
             Arguments of the loop except the last two.
         """
-        parts = min(threads, rows) if work >= SERIAL else 1
+        parts = 1
+        if work >= SERIAL:
+            parts = min(threads, rows)
         if parts <= 1:
             self.compiled(*args, 0, rows)
             return
