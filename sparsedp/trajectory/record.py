@@ -112,14 +112,13 @@ def largest(arrays: Any) -> float:
     """Return the largest entry of some arrays, plain or traced; None counts as empty, NaN and infinity as they are."""
     total = 0.0
     for array in arrays:
-        if array is None or not np.size(array := plain(array)):
+        if array is None or not np.size(plain(array)):
             continue
-        if np.iscomplexobj(array):
-            size = float(np.max(np.abs(array)))
+        values = plain(array)
+        if np.iscomplexobj(values):
+            size = float(np.max(np.abs(values)))
         else:  # without a temporary array
-            size = max(float(np.maximum.reduce(array, axis=None)), -float(np.minimum.reduce(array, axis=None)))
-        if size > total or size != size:
+            size = max(float(np.maximum.reduce(values, axis=None)), -float(np.minimum.reduce(values, axis=None)))
+        if size > total or np.isnan(size):
             total = size
-        else:
-            total = total
     return total
