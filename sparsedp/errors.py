@@ -1,8 +1,12 @@
-"""The tree of typed errors: what can go wrong, and what the caller can do about it.
+"""The errors and warnings of this library.
 
-Every class also derives from a built-in exception, so ``except ValueError`` keeps working.
-The message is one sentence: what was given, what is needed, what to write instead.
+Every error also derives from a built-in exception, so that ``except ValueError`` works too. A message says what was
+given, what is expected and what to write instead.
 """
+
+from __future__ import annotations
+
+from typing import Any
 
 __all__ = [
     "BudgetWarning",
@@ -19,11 +23,11 @@ __all__ = [
 
 
 class SparsedpError(Exception):
-    """Base of all errors of this library."""
+    """Base class of the errors of this library."""
 
 
 class ShapeError(SparsedpError, ValueError):
-    """An array or an operator does not fit the space it is used on."""
+    """An array or an operator does not fit the space on which it is used."""
 
 
 class NonFiniteError(SparsedpError, ValueError):
@@ -35,19 +39,19 @@ class UnstableStepError(SparsedpError, ValueError):
 
 
 class DerivativeError(SparsedpError, TypeError):
-    """A derivative was asked of something that has none, or a rule returned a wrong one."""
+    """A derivative does not exist, or a rule returned one of the wrong form."""
 
 
 class GrowthWarning(UserWarning):
-    """A gradient through a long run grew so much that it is exact and of little use."""
+    """A gradient through many steps grew so much that it is of little use, although it is exact."""
 
 
 class BudgetWarning(UserWarning):
-    """A memory budget with which a run takes three times as long as with at most twice as much."""
+    """A run would take a third of the time with at most twice its memory budget."""
 
 
 class NonFiniteGradientWarning(UserWarning):
-    """A derivative that is returned holds NaN or infinity; the message names the call it comes from.
+    """A returned derivative holds NaN or infinity; the message names the call that caused it.
 
     `grad`, `value_and_grad`, `vjp`, `jvp` and `hvp` warn. Turn it into an error by
     ``warnings.filterwarnings("error", category=sparsedp.errors.NonFiniteGradientWarning)``.
@@ -62,10 +66,10 @@ class ConvergenceError(SparsedpError, RuntimeError):
     info : SolveInfo or None
         The record of the solve: status word, iterations, residual.
     best : ndarray or None
-        The best iterate that was reached.
+        The best iterate.
     """
 
-    def __init__(self, message, info=None, best=None):
+    def __init__(self, message: str, info: Any = None, best: Any = None):
         super().__init__(message)
         self.info = info
         self.best = best

@@ -54,8 +54,8 @@ FAULTS = {
     ),
     "a gradient in another precision than its argument": Bug(
         "autodiff/derivative.py",
-        'return _as_given(fit("the gradient", leaf, cotangent, cotangent), leaf)',
-        "return _as_given(cotangent, leaf)",
+        'return _as_leaf(fit("the gradient", leaf, cotangent, cotangent), leaf)',
+        "return _as_leaf(cotangent, leaf)",
         "",
     ),
     "entries of dicts paired by their place": Bug(

@@ -1,30 +1,39 @@
-"""Memory for large fresh results: that of results which nobody sees any more serves again.
+"""Memory for large results: the buffers of garbage-collected results are recycled.
 
-A new large array costs more than the arithmetic that fills it, for the system hands out its pages one by one, at the
-first touch. The memory of a result comes back when the array and all its views are gone, not before.
+A new large array costs more than the arithmetic that fills it, because the system provides its pages one by one, at the
+first access. The buffer of a result is free again once the array and all its views are deleted.
 """
+
+from __future__ import annotations
 
 import weakref
 from math import prod
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+if TYPE_CHECKING:
+    from numpy.typing import DTypeLike
+
 __all__ = ["empty"]
 
-LARGE = 1 << 18  # bytes: what is smaller, the C library itself keeps when it is freed, and hands out again as fast
-SPARE = 1 << 30  # most bytes that wait for later results: a field of 256^3 cells and its faces take half of that
+LARGE = 1 << 18  # bytes: the C library itself recycles smaller arrays as fast
+SPARE = 1 << 30  # largest total of free buffers in bytes: a field of 256^3 cells and its faces takes half of it
 
 
-class _Memory(np.ndarray):
-    """Bytes of a result. A type of its own: NumPy lets a view of a view of an array hold the array alone, and the
-    result in between would be gone while its views are still seen."""
+class _Buffer(np.ndarray):
+    """The bytes of a result.
+
+    It needs a type of its own: the base of a view of a result would otherwise be the array of bytes, and the result
+    could be deleted while views of it exist.
+    """
 
 
-_spare: dict[int, _Memory] = {}  # by identity, the oldest first; single steps are safe among threads
+_free: dict[int, _Buffer] = {}  # by identity, the oldest first; each operation on it is atomic
 
 
-def empty(shape, dtype):
-    """Shape, dtype -> an array that nobody else sees, its numbers not set; like np.empty.
+def empty(shape: tuple[int, ...], dtype: DTypeLike) -> np.ndarray:
+    """Return an uninitialised array of its own memory, like np.empty.
 
     Examples
     --------
@@ -34,25 +43,27 @@ def empty(shape, dtype):
     size = prod(shape) * np.dtype(dtype).itemsize
     if size < LARGE:
         return np.empty(shape, dtype)
-    memory = _taken(size)
-    result = np.ndarray(shape, dtype, memory)
-    weakref.finalize(result, _give_back, memory).atexit = False
+    buffer = _take(size)
+    result: np.ndarray = np.ndarray(shape, dtype, buffer)
+    weakref.finalize(result, _release, buffer).atexit = False
     return result
 
 
-def _taken(size):
-    for key, memory in _spare.copy().items():
-        if memory.size == size and _spare.pop(key, None) is not None:  # else another thread was first
-            return memory
-    return _Memory(size, np.uint8)
+def _take(size):
+    """Return a free buffer of this size, or a new one."""
+    for key, buffer in _free.copy().items():
+        if buffer.size == size and _free.pop(key, None) is not None:  # else another thread was first
+            return buffer
+    return _Buffer(size, np.uint8)
 
 
-def _give_back(memory):
-    _spare[id(memory)] = memory
-    waiting = _spare.copy()
-    total = sum(other.size for other in waiting.values())
-    for key, oldest in waiting.items():
+def _release(buffer):
+    """Keep a buffer for later results, and delete the oldest ones if they exceed SPARE."""
+    _free[id(buffer)] = buffer
+    buffers = _free.copy()
+    total = sum(other.size for other in buffers.values())
+    for key, oldest in buffers.items():
         if total <= SPARE:
             return
         total -= oldest.size
-        _spare.pop(key, None)
+        _free.pop(key, None)

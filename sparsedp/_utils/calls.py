@@ -3,6 +3,8 @@
 ``SPARSEDP_TRACEBACK=full`` in the environment keeps every frame.
 """
 
+from __future__ import annotations
+
 import os
 import sys
 import warnings
@@ -11,7 +13,10 @@ from functools import wraps
 from inspect import Parameter, signature
 from pathlib import Path
 from types import FunctionType, ModuleType, TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Container, Sequence
 
 __all__ = [
     "advice_near",
@@ -79,20 +84,22 @@ EXAMPLES = {
 }
 
 
-def nearest(word, words):
+def nearest(word: Any, words: Sequence[str]) -> str | None:
     """Return the one of some words that is most similar to a word which is none of them; None if none is similar."""
     word = str(word).lower()
-    similar = [one for one in words if word and one.startswith(word)] or get_close_matches(word, words)
+    similar = [other for other in words if word and other.startswith(word)]
+    if not similar:
+        similar = get_close_matches(word, words)
     return similar[0] if similar else None
 
 
-def advice_near(word, words):
+def advice_near(word: Any, words: Sequence[str]) -> str:
     """Return the end of a message that proposes the most similar of some words; empty if none is similar."""
     near = nearest(word, words)
     return f"; write {near!r}" if near else ""
 
 
-def public(written, advice=None):
+def public(written: str, advice: Callable | None = None) -> Callable:
     """Decorate a public function: add advice to calls that do not fit, and remove internal frames from tracebacks.
 
     Parameters
@@ -166,7 +173,7 @@ def _misfit(form, written, advice, args, options):
     return TypeError(f"{written} was given an argument twice, by position and by name; write {example}")
 
 
-def foreign_keyword_advice(name, parameters):
+def foreign_keyword_advice(name: str, parameters: Container[str]) -> str | None:
     """Return what to write for a keyword argument that other libraries have, or None.
 
     Parameters
@@ -203,7 +210,7 @@ def _is_required(parameter):
     )
 
 
-def shortened(error):
+def shortened(error: Exception) -> Exception:
     """Remove internal frames from the traceback of an error and of its causes; the frame that raised it stays.
 
     Returns
@@ -214,7 +221,7 @@ def shortened(error):
     if os.environ.get("SPARSEDP_TRACEBACK") == "full":
         return error
     seen: set = set()
-    link = error
+    link: Any = error
     while link is not None and id(link) not in seen:
         seen.add(id(link))
         link.__traceback__ = _without_internal_frames(link.__traceback__)
@@ -239,7 +246,7 @@ def _is_of_the_user(frame):
     return frame.f_globals.get("__name__", "").partition(".")[0] not in HIDDEN
 
 
-def frames_inside():
+def frames_inside() -> int:
     """Return how many frames of this package lie between the caller of this function, included, and the user's code.
 
     A warning with one more as its `stacklevel` names the line of the user.
@@ -264,7 +271,7 @@ class _CallableModule(ModuleType):
         raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}{advice_near(name, self.__all__)}")
 
 
-def describe_module(name, example):
+def describe_module(name: str, example: str) -> None:
     """Let the errors of calls of a module, and of its public functions, say what to write.
 
     Parameters
@@ -274,16 +281,16 @@ def describe_module(name, example):
     example : str
         What to write in place of a call of the module.
     """
-    module = sys.modules[name]
+    module: Any = sys.modules[name]
     module.__class__ = _CallableModule
-    vars(module)["_example"] = example
+    module._example = example
     for word in module.__all__:
         function = vars(module).get(word)  # some modules import a function when it is first used
         if type(function) is FunctionType:
             setattr(module, word, public_name(function, name, word))
 
 
-def public_name(function, module, name):
+def public_name(function: Callable, module: str, name: str) -> Callable:
     """Wrap a function for the public module that shows it under a name."""
     written = f"{module.replace('sparsedp', 'dp', 1)}.{name}"
     wrapped = public(written)(function)

@@ -1,71 +1,89 @@
-"""The ledger: how often each rule, operator and solve was called, and what was noted of it. `explain` prints it.
+"""Counters: how often each rule, operator and solve was called, and facts about it. `explain` prints them.
 
 Kinds of calls: forward, vjp, jvp; of solves: solve, adjoint, iterations, setup, reused, hierarchy, skipped
 (nothing to solve); of operators: assembled (its matrix was built). A time loop counts its steps as forward, vjp
-and recomputed (run again for the backward pass), and the bytes it keeps beside the tape.
+and recomputed (computed again for the backward pass), and the bytes it keeps beside the tape.
 
-Each thread has a ledger of its own: what other threads do at the same time is neither counted nor changed.
+Each thread has counters of its own: simultaneous calls of other threads are neither counted nor changed.
 """
+
+from __future__ import annotations
 
 from collections import Counter
 from contextlib import contextmanager
 from threading import local
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
 
 __all__ = ["Calls", "active", "count", "recording", "note", "spent", "thread", "timed"]
 
 
 class Thread(local):
-    """The ledger of the thread that asks.
+    """Counters and hooks of the current thread.
 
     Attributes
     ----------
     calls : list of Calls
         The open `recording()` blocks.
     solve_hooks : list
-        Who takes part in every solve, the last one first.
+        Objects that take part in every solve, the last one first.
     loop_hooks : list of callables
         Called for every time loop before it runs, with (step, state, params, inputs, n).
     witnesses : list of callables
-        Called for every node of a tape when it is made: see `Recorder`.
+        Called for every new node of a tape: see `Recorder`.
     solves : int
-        Since the thread began, forward and adjoint: counted always, for one addition a solve.
+        Number of solves of the thread, forward and adjoint, also without an open block.
     controlled : int
-        Intervals under error control since the thread began.
+        Number of intervals under error control.
     grown : int
-        Warnings of cotangents that grew, since the thread began; what warnings do is one for all threads.
+        Number of warnings of growing cotangents; whether Python shows a warning is decided for all threads together.
     quiet : int
-        Open blocks whose caller refuses derivatives that are not finite: no warning is needed.
+        Number of open blocks whose caller handles derivatives that are not finite: no warning is needed.
     inner : list of float
-        For each timed call that is under way, the seconds of the calls inside it.
+        For each open timed call, the seconds of the calls inside it.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.calls: list[Calls] = []
         self.solve_hooks: list[Any] = []
         self.loop_hooks: list[Any] = []
         self.witnesses: list[Any] = []
         self.inner: list[float] = []
-        self.solves = self.controlled = self.grown = self.quiet = 0
+        self.solves = 0
+        self.controlled = 0
+        self.grown = 0
+        self.quiet = 0
 
 
 thread = Thread()
-active: list[None] = []  # one for each open block of any thread: while it is empty, nobody need look at `thread`
+active: list[None] = []  # an entry for each open block of any thread: if it is empty, there is nothing to count
 
 
 class Calls(Counter):
-    """Counts by (name, kind). `seconds` by the same keys, without the calls inside; `notes` and `actors` by name."""
+    """Counts by (name, kind).
 
-    def __init__(self, *counts):
+    Attributes
+    ----------
+    seconds : Counter
+        By the same keys, without the calls inside.
+    notes : dict of Counter
+        Noted values by (name, fact).
+    actors : dict of dict
+        By name, the objects whose methods were called, by identity.
+    """
+
+    def __init__(self, *counts: Any) -> None:
         super().__init__(*counts)
-        self.seconds: Counter = Counter()
+        self.seconds: Any = Counter()
         self.notes: dict[tuple, Counter] = {}
         self.actors: dict[str, dict] = {}
 
 
 @contextmanager
-def recording():
+def recording() -> Iterator[Calls]:
     """Count the calls of every rule and operator inside a `with` block.
 
     Yields
@@ -91,21 +109,23 @@ def recording():
         active.pop()
 
 
-def count(name, kind, times=1):
-    """Add a call of `name`, or several, to every open block. While none is open it takes a function call."""
+def count(name: str, kind: str, times: int = 1) -> None:
+    """Add a call of `name`, or several, to every open block. Without an open block it costs one function call."""
     if active and times:
         for calls in thread.calls:
             calls[name, kind] += times
 
 
-def note(name, what, value):
-    """Note a fact about `name`, such as the method that was chosen."""
-    for calls in thread.calls if active else ():
-        calls.notes.setdefault((name, what), Counter())[value] += 1
+def note(name: str, fact: str, value: Any) -> None:
+    """Note a fact about `name`, such as the chosen method."""
+    if not active:
+        return
+    for calls in thread.calls:
+        calls.notes.setdefault((name, fact), Counter())[value] += 1
 
 
-def timed(name, kind, function, *args):
-    """Run a call; where somebody records, count it and add its seconds. Of a method, its object is noted too."""
+def timed(name: str, kind: str, function: Callable, *args: Any) -> Any:
+    """Call a function; if a block is open, count the call, add its seconds, and note the object of a method."""
     if not active:
         return function(*args)
     actor = getattr(function, "__self__", None)
@@ -118,12 +138,13 @@ def timed(name, kind, function, *args):
     try:
         return function(*args)
     finally:
-        whole = perf_counter() - clock
-        spent(name, kind, whole - thread.inner.pop(), whole)
+        inclusive = perf_counter() - clock
+        exclusive = inclusive - thread.inner.pop()
+        spent(name, kind, exclusive, inclusive)
 
 
-def spent(name, kind, exclusive, inclusive):
-    """Add the seconds of a call: without those of the calls inside it, and with them."""
+def spent(name: str, kind: str, exclusive: float, inclusive: float) -> None:
+    """Add the seconds of a call, without and with those of the calls inside it."""
     if thread.inner:
         thread.inner[-1] += inclusive
     for calls in thread.calls:

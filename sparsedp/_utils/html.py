@@ -1,21 +1,30 @@
 """Values as HTML, for notebooks and for the page of a report: tables, curves and the entries of a matrix.
 
-What stands here needs no other package and no network: tables are plain HTML, pictures are SVG. It looks right on
-light and dark pages, for it takes their colour of text.
+Tables are plain HTML and pictures are SVG, without other packages and without a network. They use the text colour of
+the page, light or dark.
 """
+
+from __future__ import annotations
 
 from html import escape
 from math import isnan
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
 __all__ = ["Markup", "cell", "curves", "facts", "folded", "paragraphs", "spy", "table", "text_of"]
 
-# Of Okabe and Ito: safe for all eyes.
+# Of Okabe and Ito, for readers with any colour vision.
 COLOURS = "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#999999"
-WIDTH, HEIGHT, LEFT, BELOW = 420, 260, 60, 40  # of a picture, and of what is left for its labels [pixels]
-SHORT = 20  # letters of a cell that stay on one line
-SPOTS = 48  # a matrix is drawn as at most so many squares a side
+WIDTH = 420  # of a picture [pixels]
+HEIGHT = 260
+LEFT = 60  # margins for labels [pixels]
+BELOW = 40
+SHORT = 20  # characters of a cell that stay on one line
+SPOTS = 48  # largest number of squares a side in the picture of a matrix
 
 
 class Markup(str):
@@ -27,21 +36,25 @@ class Markup(str):
         return self
 
 
-def text_of(value, digits):
-    """A value in words: so many digits of a float, nothing for NaN and None."""
-    if isinstance(value, (float, np.floating)):
-        return "" if isnan(value) else f"{value:.{digits}g}"
-    return "" if value is None else str(value)
+def text_of(value: Any, digits: int) -> str:
+    """Return a value as text: a float with this number of digits, an empty text for NaN and None."""
+    if value is None:
+        return ""
+    if not isinstance(value, (float, np.floating)):
+        return str(value)
+    return "" if isnan(value) else f"{value:.{digits}g}"
 
 
-def cell(value):
-    """A value as HTML: three digits of a float, nothing for NaN and None."""
+def cell(value: Any) -> str:
+    """Return a value as HTML: a float with three digits, an empty text for NaN and None."""
     return value if isinstance(value, Markup) else escape(text_of(value, 3))
 
 
-def table(rows, head=(), title=""):
-    """Rows of values, names of the columns -> a table."""
-    lines = [f"<caption>{cell(title)}</caption>"] if title else []
+def table(rows: Iterable[Iterable], head: Sequence = (), title: str = "") -> Markup:
+    """Return a table of rows of values, with the names of the columns as its head."""
+    lines = []
+    if title:
+        lines.append(f"<caption>{cell(title)}</caption>")
     if head:
         lines.append(f"<thead><tr>{''.join(f'<th>{cell(name)}</th>' for name in head)}</tr></thead>")
     body = (f"<tr>{''.join(map(_in_table, row))}</tr>" for row in rows)
@@ -49,58 +62,73 @@ def table(rows, head=(), title=""):
 
 
 def _in_table(value):
-    """A cell of a table; a number or a word is not broken."""
+    """Return a value as a cell of a table; a number or a word is not broken into lines."""
     text = cell(value)
-    return f'<td nowrap="nowrap">{text}</td>' if len(text) <= SHORT else f"<td>{text}</td>"
+    if len(text) <= SHORT:
+        return f'<td nowrap="nowrap">{text}</td>'
+    return f"<td>{text}</td>"
 
 
-def facts(title, entries):
-    """A title and a dict -> a table of two columns, without the entries that are None."""
-    return table([line for line in entries.items() if line[1] is not None], title=title)
+def facts(title: str, entries: dict) -> Markup:
+    """Return a dict as a table of two columns, without the entries that are None."""
+    rows = [(name, value) for name, value in entries.items() if value is not None]
+    return table(rows, title=title)
 
 
-def paragraphs(lines, tag="p"):
-    """Lines -> a paragraph of each, or another element."""
+def paragraphs(lines: Iterable, tag: str = "p") -> Markup:
+    """Return lines as paragraphs, or as elements of another kind."""
     return Markup("\n".join(f"<{tag}>{cell(line)}</{tag}>" for line in lines))
 
 
-def folded(title, lines):
-    """Lines that are seen after a click on the title, as a list; nothing without any."""
-    body = f"<details><summary>{cell(title)}</summary><ul>\n{paragraphs(lines, 'li')}\n</ul></details>"
-    return Markup(body if lines else "")
+def folded(title: str, lines: Sequence) -> Markup:
+    """Return a list of lines that a click on the title shows; an empty text without lines."""
+    if not lines:
+        return Markup("")
+    return Markup(f"<details><summary>{cell(title)}</summary><ul>\n{paragraphs(lines, 'li')}\n</ul></details>")
 
 
-def spy(matrix):
-    """Sparse matrix -> a picture of where its entries are: a dark square holds many."""
+def spy(matrix: Any) -> Markup:
+    """Return a picture of the places of the entries of a sparse matrix: a dark square holds many."""
     rows, columns = matrix.shape
-    many = matrix.tocoo()
+    entries = matrix.tocoo()
     size = max(rows, columns, 1)
     side = min(size, SPOTS)
-    places = np.stack([many.row, many.col]).astype(np.int64) * side // size
+    places = np.stack([entries.row, entries.col]).astype(np.int64) * side // size
     spots, counts = np.unique(places, axis=1, return_counts=True)
     squares = (
         f'<rect x="{column}" y="{row}" width="1" height="1" opacity="{0.3 + 0.7 * count / counts.max():.2f}"/>'
         for (row, column), count in zip(spots.T.tolist(), counts)
     )
-    width, height = (max(1, -(-length * side // size)) for length in (columns, rows))
+    width = max(1, -(-columns * side // size))
+    height = max(1, -(-rows * side // size))
     return Markup(
         f'<svg viewBox="0 0 {width} {height}" width="{3 * width}" height="{3 * height}" fill="currentColor" role="img" '
         f'style="border: 1px solid"><title>entries</title>{"".join(squares)}</svg>'
     )
 
 
-def curves(lines, across, up, *, log=(False, True)):
-    """Lines {name: points (x, y)} -> a picture of them; empty where nothing can be drawn.
+def curves(lines: dict, across: str, up: str, *, log: tuple[bool, bool] = (False, True)) -> Markup:
+    """Return a picture of curves; an empty text if no point can be drawn.
 
-    across, up: names of the axes; log: whether each is logarithmic. Points that are not finite, or not positive on such
-    an axis, are left out.
+    Parameters
+    ----------
+    lines : dict
+        By the name of each curve, its points (x, y). Points that are not finite, or not positive on a logarithmic axis,
+        are not drawn.
+    across, up : str
+        Names of the axes.
+    log : (bool, bool)
+        Whether each axis is logarithmic.
     """
     shown = {name: _points(line, log) for name, line in lines.items()}
     every = np.concatenate([np.empty((0, 2)), *shown.values()])
     if not len(every):
         return Markup("")
-    low, high = every.min(axis=0), every.max(axis=0)
-    low, high = np.where(high > low, (low, high), (low - 0.5, high + 0.5))
+    low = every.min(axis=0)
+    high = every.max(axis=0)
+    is_flat = high <= low
+    low = np.where(is_flat, low - 0.5, low)
+    high = np.where(is_flat, high + 0.5, high)
     floor = HEIGHT - BELOW
     box = np.array([WIDTH - LEFT - 10, 10 - floor])
     parts = [f'<path d="M{LEFT} 10V{floor}H{WIDTH - 10}" stroke="currentColor" fill="none"/>']
@@ -111,13 +139,16 @@ def curves(lines, across, up, *, log=(False, True)):
         parts.append(f'<polyline points="{path}" stroke="{colour}" fill="none"><title>{cell(name)}</title></polyline>')
         if len(lines) > 1:
             parts.append(_text(WIDTH + 5, 20 + 16 * number, name, "start", colour))
-    ends = [[cell(float(10.0**end if scale else end)) for end, scale in zip(corner, log)] for corner in (low, high)]
+    first_x, first_y = _end_labels(low, log)
+    last_x, last_y = _end_labels(high, log)
     parts += [
-        _text(LEFT, floor + 16, ends[0][0], "start"), _text(WIDTH - 10, floor + 16, ends[1][0], "end"),
-        _text(LEFT - 5, floor, ends[0][1], "end"), _text(LEFT - 5, 18, ends[1][1], "end"),
+        _text(LEFT, floor + 16, first_x, "start"),
+        _text(WIDTH - 10, floor + 16, last_x, "end"),
+        _text(LEFT - 5, floor, first_y, "end"),
+        _text(LEFT - 5, 18, last_y, "end"),
         _text((LEFT + WIDTH) / 2, HEIGHT - 6, across, "middle"),
         f'<g transform="translate(16 {floor / 2}) rotate(-90)">{_text(0, 0, up, "middle")}</g>',
-    ]  # fmt: skip
+    ]
     wide = WIDTH + 150 * (len(lines) > 1)
     return Markup(
         f'<svg viewBox="0 0 {wide} {HEIGHT}" width="{wide}" height="{HEIGHT}" font-size="12" role="img" '
@@ -125,8 +156,13 @@ def curves(lines, across, up, *, log=(False, True)):
     )
 
 
+def _end_labels(corner, log):
+    """Return the labels of both axes at a corner of the picture."""
+    return [cell(float(10.0**end if is_log else end)) for end, is_log in zip(corner, log)]
+
+
 def _points(line, log):
-    """The points of a line that can be drawn, as rows."""
+    """Return the points of a curve that can be drawn, as rows."""
     points = np.array(list(line), float).reshape(-1, 2)
     points[~((points > 0) | ~np.array(log))] = np.nan
     points = points[np.isfinite(points).all(axis=1)]
@@ -134,4 +170,5 @@ def _points(line, log):
 
 
 def _text(x, y, words, anchor, colour="currentColor"):
+    """Return a label of a picture."""
     return f'<text x="{x}" y="{y}" text-anchor="{anchor}" stroke="none" fill="{colour}">{cell(words)}</text>'

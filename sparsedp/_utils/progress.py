@@ -1,10 +1,25 @@
-"""Progress bars: the only file that asks for tqdm, and only when a bar is wanted."""
+"""Progress bars. Only this module imports tqdm, and only if a bar is asked for."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 __all__ = ["bar", "shown_steps"]
 
 
-def bar(steps=None, needed=True, **options):
-    """Steps -> a bar of tqdm over them, on standard error; the steps as they are where it is neither there nor needed.
+def bar(steps: Any = None, needed: bool = True, **options: Any) -> Any:
+    """Return a progress bar of tqdm over some steps, on standard error.
+
+    Parameters
+    ----------
+    steps : iterable, optional
+    needed : bool
+        Whether a missing tqdm is an error; if not, the steps are returned as they are.
+    **options
+        Of tqdm.
 
     Raises
     ------
@@ -20,8 +35,9 @@ def bar(steps=None, needed=True, **options):
     return tqdm(steps, **options)
 
 
-def shown_steps(wanted, steps, label):
-    """Step numbers -> the same, with a bar when one is wanted (True, or its label)."""
-    if not wanted:
+def shown_steps(progress: bool | str, steps: Iterable, label: str) -> Iterable:
+    """Return the numbers of steps, with a progress bar if `progress` is True or the title of a bar."""
+    if not progress:
         return steps
-    return bar(steps, desc=f"{wanted} {label}" if isinstance(wanted, str) else label, leave=False)
+    title = f"{progress} {label}" if isinstance(progress, str) else label
+    return bar(steps, desc=title, leave=False)

@@ -1,138 +1,160 @@
-"""How objects travel to other processes, and are copied: as the call that makes them again. Caches stay behind."""
+"""How objects are pickled and copied: as the call that constructs them again. Caches are not included."""
+
+from __future__ import annotations
 
 import pickle
 from copy import deepcopy
 from functools import cached_property, update_wrapper
 from threading import local
 from types import MethodType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sparsedp._utils.calls import shortened
 
-__all__ = ["Frozen", "Made", "Remade", "Uncached", "Value"]
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+__all__ = ["Frozen", "Reconstructible", "ReconstructibleFunction", "Uncached", "Value"]
 
 
-class Remade:
-    """An object that is pickled, and copied, as the call that makes it: its attribute `made`, or ``recipe()``.
+class Reconstructible:
+    """An object that is pickled and copied as a call: a function or class of a module, and its arguments.
 
-    These are the function or class of a module, and its arguments.
+    Attributes
+    ----------
+    made : (callable, tuple)
+        The call, unless the class overrides `recipe`.
     """
 
     __slots__ = ()
     made: Any
 
-    def recipe(self):
-        """The call that makes it again."""
+    def recipe(self) -> tuple[Callable, tuple]:
+        """Return the function and the arguments that construct the object again."""
         return self.made
 
-    def __reduce__(self):
+    def __reduce__(self) -> Any:
         build, arguments = self.recipe()
-        _check_named(getattr(self, "name", type(self).__name__), arguments)
+        _check_importable(getattr(self, "name", type(self).__name__), arguments)
         return build, arguments
 
-    def __copy__(self):
+    def __copy__(self) -> Any:
         build, arguments = self.recipe()
         return build(*arguments)
 
-    def __deepcopy__(self, memo):
+    def __deepcopy__(self, memo: dict) -> Any:
         build, arguments = self.recipe()
         return build(*deepcopy(arguments, memo))
 
 
-_busy = local()  # .parts: what this thread is looking at, for objects that hold what holds them
+class _Visits(local):
+    """The functions that the current thread is checking, for objects that contain themselves."""
+
+    def __init__(self):
+        self.functions: set[int] = set()
 
 
-def _check_named(owner, part):
+_visits = _Visits()
+
+
+def _check_importable(owner, part):
     """Refuse functions that another process cannot import.
 
-    Of a method only the class is looked at: its object may hold `owner`, and pickle itself follows such circles.
+    Of a method only the class is checked: its object may hold `owner`, and pickle itself follows such cycles.
     """
-    if isinstance(part, (tuple, list, dict)):
-        for one in part.values() if isinstance(part, dict) else part:
-            _check_named(owner, one)
-    elif callable(part) and not isinstance(part, Remade):
-        parts = vars(_busy).setdefault("parts", set())
-        if id(part) in parts:
-            return
-        parts.add(id(part))
-        method = isinstance(part, MethodType) and not isinstance(part.__self__, type)
-        try:
-            pickle.dumps(type(part.__self__) if method else part)
-        except Exception as error:
-            raise TypeError(
-                f"{owner} cannot be pickled with {getattr(part, '__qualname__', repr(part))}, which other processes "
-                f"cannot import; write {'its class' if method else 'it as a def'} at the top level of a module"
-            ) from error
-        finally:
-            parts.discard(id(part))
+    if isinstance(part, dict):
+        part = list(part.values())
+    if isinstance(part, (tuple, list)):
+        for entry in part:
+            _check_importable(owner, entry)
+        return
+    if not callable(part) or isinstance(part, Reconstructible) or id(part) in _visits.functions:
+        return
+    _visits.functions.add(id(part))
+    is_bound_method = isinstance(part, MethodType) and not isinstance(part.__self__, type)
+    try:
+        pickle.dumps(type(part.__self__) if is_bound_method else part)
+    except Exception as error:
+        definition = "its class" if is_bound_method else "it as a def"
+        raise TypeError(
+            f"{owner} cannot be pickled with {getattr(part, '__qualname__', repr(part))}, which other processes "
+            f"cannot import; write {definition} at the top level of a module"
+        ) from error
+    finally:
+        _visits.functions.discard(id(part))
 
 
-class Made(Remade):
-    """A function that a builder has made; it travels as the call of the builder.
+class ReconstructibleFunction(Reconstructible):
+    """A function that is pickled and copied as the call that returned it.
 
     Parameters
     ----------
-    function, build : callable
+    function : callable
+    build : callable
+        ``build(*arguments)`` returns such a function.
     *arguments
         Of `build`.
     """
 
-    def __init__(self, function, build, *arguments):
+    def __init__(self, function: Callable, build: Callable, *arguments: Any):
         update_wrapper(self, function)
-        self.name, self._function, self.made = build.__name__, function, (build, arguments)
+        self.name = build.__name__
+        self.made = build, arguments
+        self._function = function
 
-    def __call__(self, *args, **options):
+    def __call__(self, *args: Any, **options: Any) -> Any:
         try:
             return self._function(*args, **options)
         except Exception as error:
             raise shortened(error)  # noqa: B904 SPARSEDP_TRACEBACK=full keeps all frames
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"<function of {self.name}>"
 
 
 class Uncached:
-    """An object whose cached properties do not travel."""
+    """An object whose cached properties are not pickled."""
 
-    def __getstate__(self):
-        values = vars(self).items()
-        return {
-            name: value for name, value in values if not isinstance(getattr(type(self), name, None), cached_property)
-        }
+    def __getstate__(self) -> dict[str, Any]:
+        state = {}
+        for name, value in self.__dict__.items():
+            if not isinstance(getattr(type(self), name, None), cached_property):
+                state[name] = value
+        return state
 
 
 class Frozen:
-    """An object whose attributes are the values it is made with.
+    """An object whose attributes cannot be set after its construction.
 
     Attributes
     ----------
     meant : dict
-        What people write, coming from elsewhere: what to write here.
+        For attribute names of other libraries, what to write instead.
     """
 
     meant: Any = {}
 
-    def __init__(self, **values):
-        vars(self).update(values)
+    def __init__(self, **values: Any):
+        self.__dict__.update(values)
 
-    def __getattr__(self, name):
+    def __getattr__(self, name: str) -> Any:
         if name in self.meant:
             raise AttributeError(f"{type(self).__name__} has no attribute {name!r}; write {self.meant[name]}")
-        return object.__getattribute__(self, name)  # in Python's own words
+        return object.__getattribute__(self, name)  # raises Python's own error
 
-    def __setattr__(self, name, value):
+    def __setattr__(self, name: str, value: Any) -> None:
         raise AttributeError(f"{type(self).__name__} is frozen; make a new one instead of setting {name}")
 
 
 class Value(Frozen):
-    """A frozen object that equals every other of its class with the same `_key`."""
+    """A frozen object that equals every other object of its class with the same `_key`."""
 
     _key: Any
 
-    def __eq__(self, other):
+    def __eq__(self, other: object) -> Any:
         if type(other) is not type(self):
             return NotImplemented
         return self is other or self._key == other._key
 
-    def __hash__(self):
+    def __hash__(self) -> int:
         return hash(self._key)

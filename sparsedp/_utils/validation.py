@@ -1,4 +1,6 @@
-"""What may be given: the checks of fields, of numbers and of reused result arrays."""
+"""Validation of arguments: fields, numbers, functions and result arrays."""
+
+from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
@@ -6,13 +8,16 @@ from decimal import ROUND_FLOOR, Context
 from inspect import CO_VARARGS
 from math import isfinite
 from types import FunctionType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sparsedp._utils.calls import advice_near
 from sparsedp._utils.pytree import labels, leaves
 from sparsedp.errors import NonFiniteError, ShapeError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
 
 __all__ = [
     "BLOCK",
@@ -46,22 +51,36 @@ __all__ = [
 ]
 
 FLOAT = np.dtype(float)
-EPS = np.finfo(float).eps  # between 1 and the next number; what is `ROUNDING` to whom stands there
+EPS = np.finfo(float).eps  # between 1 and the next number
 WRAP = "{0}; wrap what is computed in dp.interop.to_{0}(f), which keeps gradients"
 # By the package that the type of an array comes from: which library that is, and what to write instead.
 LIBRARIES = {
-    "torch": WRAP.format("torch"), "jax": WRAP.format("jax"), "jaxlib": WRAP.format("jax"),
+    "torch": WRAP.format("torch"),
+    "jax": WRAP.format("jax"),
+    "jaxlib": WRAP.format("jax"),
     "xarray": "xarray, whose coordinates would be lost; write dp.interop.from_xarray(grid, u)",
-}  # fmt: skip
+}
 PRECISIONS = "fdFD"  # characters of the dtypes that fields and trees may have, see `check_precision`
 PLAIN_LEAVES = {float, complex, int, bool, str, type(None)}
-BLOCK = 8192  # numbers of which one product of BLAS is taken: it uses one thread up to 10000, and wakes no others
+BLOCK = 8192  # entries of one product of BLAS: up to 10000 it uses one thread
 
 
-def field_array(op, u, batch=False):
-    """Argument of an operator -> contiguous native array of float32, float64 or a complex kind.
+def field_array(op: Any, u: Any, batch: bool = False) -> np.ndarray:
+    """Return the argument of an operator as a contiguous native array of float32, float64 or a complex dtype.
 
-    batch: leading axes are allowed, one field for each of their entries.
+    Parameters
+    ----------
+    op : Operator
+    u : array_like
+    batch : bool
+        Whether leading axes are allowed, one field for each of their entries.
+
+    Raises
+    ------
+    ShapeError
+        If it is not a field on the domain.
+    TypeError
+        If it holds no numbers.
     """
     if type(u) is not np.ndarray:
         check_plain(op.name, u)
@@ -99,6 +118,7 @@ def _in_shape(op, u):
 
 
 def _array(op, u):
+    """Return an argument of an operator as an array."""
     try:
         return np.asarray(u)
     except ValueError:  # a list of arrays of different shapes
@@ -108,28 +128,31 @@ def _array(op, u):
         ) from None
 
 
-def check_plain(name, *values):
-    """Refuse masked arrays: NumPy would drop the mask without a word; and those of torch, jax and xarray."""
+def check_plain(name: str, *values: Any) -> None:
+    """Refuse masked arrays, whose mask NumPy would drop silently, and those of torch, jax and xarray."""
     if any(isinstance(value, np.ma.MaskedArray) for value in values):
         raise TypeError(f"{name} takes plain arrays, got a masked array; fill it first")
     check_native(name, *values)
 
 
-def check_native(name, *values):
-    """Refuse tensors of torch and arrays of jax: NumPy would drop their gradients, or they ours."""
+def check_native(name: str, *values: Any) -> None:
+    """Refuse tensors of torch and arrays of jax and xarray, whose gradients or coordinates would be lost."""
     for value in values:
         kind = type(value)
-        if kind is not np.ndarray and (library := kind.__module__.partition(".")[0]) in LIBRARIES:
+        if kind is np.ndarray:
+            continue
+        library = kind.__module__.partition(".")[0]
+        if library in LIBRARIES:
             raise TypeError(f"{name} needs arrays of NumPy, got a {kind.__name__} of {LIBRARIES[library]}")
 
 
-def check_precision(name, value):
+def check_precision(name: str, value: Any) -> None:
     """Refuse arrays of half and of extended precision.
 
     The library computes with float32, float64, complex64 and complex128. Fields and trees of other precisions
-    (float16, longdouble, clongdouble) are refused by name, where they are given: a longdouble would lose its digits
-    silently, and its bytes cannot be viewed as doubles. Integers and booleans are not concerned. Numbers that are
-    settings, such as dt, and derivatives that a user's own function returns are rounded to double precision instead.
+    (float16, longdouble, clongdouble) are refused: a longdouble would lose its digits
+    silently, and its bytes cannot be viewed as doubles. Integers and booleans are accepted. Settings such as dt, and
+    derivatives that a user's own function returns, are rounded to double precision instead.
     """
     dtype: Any = getattr(value, "dtype", None)
     if is_other_precision(dtype):
@@ -139,14 +162,14 @@ def check_precision(name, value):
         )
 
 
-def is_other_precision(dtype):
+def is_other_precision(dtype: Any) -> bool:
     """Return whether a dtype of NumPy holds floating numbers that are neither of single nor of double precision."""
     if not isinstance(dtype, np.dtype) or dtype.char in PRECISIONS:
         return False
     return dtype.kind in "fc" or dtype.name == "bfloat16"
 
 
-def check_leaves(name, tree, containers=True):
+def check_leaves(name: str, tree: Any, containers: bool = True) -> None:
     """Refuse leaves that are arrays of half or extended precision, or containers that are not trees.
 
     Parameters
@@ -155,8 +178,8 @@ def check_leaves(name, tree, containers=True):
         Root of the paths in messages.
     tree : tree
     containers : bool
-        Whether a leaf is refused that is a dataclass, or a Mapping that is not a dict, and holds floating numbers:
-        these would silently be constants.
+        Whether a leaf is refused that is a container, a dataclass that is not a tree or a Mapping that is not a dict,
+        and holds floating numbers: these would silently be constants.
 
     Raises
     ------
@@ -177,9 +200,9 @@ def check_leaves(name, tree, containers=True):
             )
 
 
-def hidden_leaves(value):
-    """Return the leaves inside a container that is not a tree: a dataclass, or a Mapping that is not a dict."""
-    found: list = []
+def hidden_leaves(value: Any) -> list:
+    """Return the leaves inside a container that is not a tree: some dataclasses, and Mappings that are not dicts."""
+    hidden: list = []
     pending = [value]
     seen = set()  # a dataclass may hold itself
     while pending:
@@ -188,9 +211,9 @@ def hidden_leaves(value):
             continue
         seen.add(id(container))
         inside = leaves(_entries_of(container))
-        found += inside
+        hidden += inside
         pending += inside
-    return found
+    return hidden
 
 
 def _entries_of(container):
@@ -204,11 +227,14 @@ def _entries_of(container):
 
 def _is_floating(leaf):
     """Whether a leaf is a floating number or array, traced or not."""
-    return isinstance(leaf, (float, complex)) or getattr(getattr(leaf, "dtype", None), "kind", None) in ("f", "c")
+    if isinstance(leaf, (float, complex)):
+        return True
+    dtype = getattr(leaf, "dtype", None)
+    return getattr(dtype, "kind", None) in ("f", "c")
 
 
-def check_out(op, out, u, dtype, shape):
-    """Refuse a result array of another shape or dtype, or one that shares memory with `u`."""
+def check_out(op: Any, out: Any, u: np.ndarray, dtype: np.dtype, shape: tuple[int, ...]) -> None:
+    """Refuse a result array of another shape or dtype, or one that shares memory with the argument `u`."""
     wanted = f"out=np.empty({shape}, {dtype.name!r})"
     check_type(f"{op.name}, as out,", out, np.ndarray, "an array", wanted)
     if out.shape != shape:
@@ -219,23 +245,43 @@ def check_out(op, out, u, dtype, shape):
         raise ValueError(f"{op.name} needs an out that is contiguous, writeable and apart from u; write {wanted}")
 
 
-def check_finite(name, values, needs="must be finite", where=None, advice=""):
-    """Refuse NaN and infinity in plain numbers: say how many there are, where the first one is, and what to do.
+def check_finite(
+    name: Any,
+    values: Any,
+    needs: str = "must be finite",
+    where: Callable[[int], Any] | None = None,
+    advice: str = "",
+) -> None:
+    """Refuse NaN and infinity in plain numbers; the message has their count and the place of the first one.
 
-    `where` turns the number of a flat entry into words; default: its index in `values`.
+    Parameters
+    ----------
+    name : str
+    values : number or array
+    needs : str
+        What the values must be.
+    where : callable, optional
+        ``where(number)`` describes the place of a flat entry; default: its index in `values`.
+    advice : str
+        Ends the message.
+
+    Raises
+    ------
+    NonFiniteError
     """
     finite = np.isfinite(values)
     if np.all(finite):
         return
     if finite.ndim == 0:
         raise NonFiniteError(f"{name} {needs}, got {values}; write a finite number")
-    index, many = int(np.argmin(finite)), finite.size - np.count_nonzero(finite)
+    index = int(np.argmin(finite))
+    count = finite.size - np.count_nonzero(finite)
     first = place(index, finite.shape) if where is None else where(index)
-    raise NonFiniteError(f"{name} {needs}, got {many} that are NaN or infinite, the first at {first}{advice}")
+    raise NonFiniteError(f"{name} {needs}, got {count} that are NaN or infinite, the first at {first}{advice}")
 
 
-def surely_finite(value):
-    """One pass without a temporary array; False also when a finite sum is too large."""
+def surely_finite(value: Any) -> bool:
+    """Whether a value is finite, in one pass without a temporary array; False also if its sum overflows."""
     if type(value) is np.float64:
         return isfinite(value)
     if type(value) is np.ndarray and value.size <= BLOCK and value.dtype == FLOAT and value.flags.c_contiguous:
@@ -246,67 +292,70 @@ def surely_finite(value):
         return bool(np.isfinite(np.sum(value)))
 
 
-def place(index, shape):
-    """Number of an entry in C order -> its index: a number in 1-D, else a tuple."""
+def place(index: int, shape: tuple[int, ...]) -> Any:
+    """Return the index of an entry from its number in C order: a number in 1-D, else a tuple."""
     indices = tuple(map(int, np.unravel_index(index, shape)))
     return indices[0] if len(indices) == 1 else indices
 
 
-def check_function(name, thing, example, count=None):
-    """Refuse what cannot be called, or does not take this many arguments."""
+def check_function(name: str, thing: Any, example: str, count: int | None = None) -> None:
+    """Refuse a value that is not callable, or does not take this number of arguments."""
     if not callable(thing):
         raise TypeError(f"{name} takes a function, got {type(thing).__name__}; write {example}")
     if count is not None:
         check_takes(name, thing, count, example)
 
 
-def check_type(name, thing, kind, wanted, example):
-    """Refuse what is not of a type; `wanted`: the type with its article."""
+def check_type(name: str, thing: Any, kind: Any, wanted: str, example: str) -> None:
+    """Refuse a value that is not of a type; `wanted` is the type with its article."""
     if not isinstance(thing, kind):
         raise TypeError(f"{name} takes {wanted}, got {type(thing).__name__}; write {example}")
 
 
-def check_shape(what, given, shape, advice=""):
-    """Refuse what has another shape."""
-    if np.shape(given) != shape:
-        raise ShapeError(f"{what} must have shape {shape}, got {np.shape(given)}{advice}")
+def check_shape(what: str, value: Any, shape: tuple[int, ...], advice: str = "") -> None:
+    """Refuse a value of another shape."""
+    if np.shape(value) != shape:
+        raise ShapeError(f"{what} must have shape {shape}, got {np.shape(value)}{advice}")
 
 
-def check_on(name, given, space, advice=""):
-    """Refuse what is no field on a space."""
-    if np.shape(given) != space.shape:
-        raise ShapeError(f"{name} takes a field on {space.described}, got an array of shape {np.shape(given)}{advice}")
+def check_on(name: str, value: Any, space: Any, advice: str = "") -> None:
+    """Refuse a value that is not a field on a space."""
+    if np.shape(value) != space.shape:
+        raise ShapeError(f"{name} takes a field on {space.described}, got an array of shape {np.shape(value)}{advice}")
 
 
 KINDS = {"numbers": "biufc", "real numbers": "biuf", "integers": "iu", "True or False": "b"}
 
 
-def check_kind(what, dtype, needs, advice=""):
-    """Refuse arrays of a dtype that does not hold what is needed, in the words of `KINDS`."""
+def check_kind(what: str, dtype: np.dtype, needs: str, advice: str = "") -> None:
+    """Refuse a dtype that is not of the needed kind, a key of `KINDS`."""
     if dtype.kind not in KINDS[needs]:
         raise TypeError(f"{what} must hold {needs}, got dtype {dtype}{advice}")
 
 
-def check_choice(name, word, choices, advice=""):
-    """Refuse what is none of some words; where these are True and False, 1 is none of them."""
-    if not any(isinstance(word, type(one)) and word == one for one in choices):
-        words = ", ".join(str(one) for one in choices if one is not None)
-        advice = advice or advice_near(word, words.split(", "))
-        raise ValueError(f"{name} must be {'one of ' if ', ' in words else ''}{words}, got {_shown(word)}{advice}")
+def check_choice(name: str, word: Any, choices: Iterable, advice: str = "") -> None:
+    """Refuse a value that is not one of some choices; 1 does not count as True."""
+    choices = list(choices)
+    if any(isinstance(word, type(choice)) and word == choice for choice in choices):
+        return
+    words = ", ".join(str(choice) for choice in choices if choice is not None)
+    advice = advice or advice_near(word, words.split(", "))
+    expected = f"one of {words}" if ", " in words else words
+    raise ValueError(f"{name} must be {expected}, got {_shown(word)}{advice}")
 
 
-def advise(error, params=(), example="rollout(step, start, params, n)"):
-    """Add to the words of an error what to write, where a list or the params None met arithmetic."""
-    said = str(error)
-    if isinstance(error, TypeError) and "; write" not in said:
-        if "'list'" in said or "multiply sequence" in said:
-            error.args = (f"{said}; write np.asarray(x) for an array: a list is a tree of numbers",)
-        elif params is None and "NoneType" in said:
-            error.args = (f"{said}; write {example}: the params given are None",)
+def advise(error: Exception, params: Any = (), example: str = "rollout(step, start, params, n)") -> None:
+    """Add advice to the message of an error of arithmetic with a list, or with params that are None."""
+    text = str(error)
+    if isinstance(error, TypeError) and "; write" not in text:
+        if "'list'" in text or "multiply sequence" in text:
+            error.args = (f"{text}; write np.asarray(x) for an array: a list is a tree of numbers",)
+        elif params is None and "NoneType" in text:
+            error.args = (f"{text}; write {example}: the params given are None",)
 
 
-def check_takes(name, fun, count, example):
-    """Refuse a function written in Python that does not take this many arguments."""
+def check_takes(name: str, fun: Any, count: int, example: str) -> None:
+    """Refuse a function written in Python that does not take this number of arguments."""
     if type(fun) is not FunctionType or fun.__code__.co_flags & CO_VARARGS:
         return
     most = fun.__code__.co_argcount
@@ -324,10 +373,17 @@ RANGES = {
 }
 
 
-def check_number(name, value, needs="", advice="", kind=""):
-    """One finite real number -> a float. Refuse all else, and what is not in the range that is needed, in words.
+def check_number(name: str, value: Any, needs: str = "", advice: str = "", kind: str = "") -> float:
+    """Return a finite real number as a float; refuse all other values.
 
-    `advice`: what to write where the number is out of range; `kind`: where it is no number.
+    Parameters
+    ----------
+    name : str
+    value : Any
+    needs : str
+        The range in which it must be, a key of `RANGES`.
+    advice, kind : str
+        Ends of the messages for a number out of range, and for a value that is not a number.
     """
     if not is_number(value):
         raise TypeError(f"{name} must be one real number, got {_shown(value)}{kind}")
@@ -340,31 +396,31 @@ def check_number(name, value, needs="", advice="", kind=""):
 
 
 def _shown(value):
-    """An argument in a message: an array by its shape."""
+    """Return an argument as text for a message, an array by its shape."""
     return f"an array of shape {value.shape}" if isinstance(value, np.ndarray) else repr(value)
 
 
-def check_whole(name, value, least, advice=""):
-    """One whole number from `least` on -> an int; all else is refused."""
+def check_whole(name: str, value: Any, least: int, advice: str = "") -> int:
+    """Return a whole number >= `least` as an int; refuse all other values."""
     if not is_whole(value, least):
         raise ValueError(f"{name} must be a whole number >= {least}, got {_shown(value)}{advice}")
     return int(value)
 
 
-def is_number(value):
-    """Whether a value is one real number, NaN and infinity included; a flag is none."""
+def is_number(value: Any) -> bool:
+    """Whether a value is one real number, including NaN and infinity; True and False are not."""
     if type(value) is float:
         return True
     array = np.asarray(value)
     return array.ndim == 0 and array.dtype.kind in "iuf"
 
 
-def is_whole(value, least):
-    """Whether a value is a whole number from `least` on; 2.0 counts."""
+def is_whole(value: Any, least: int) -> bool:
+    """Whether a value is a whole number >= `least`, such as 2 or 2.0."""
     return bool(is_number(value) and value % 1 == 0 and value >= least)  # the rest of NaN and infinity is NaN
 
 
-def number_beside(number, *limits, digits=6, style="g"):
+def number_beside(number: Any, *limits: float, digits: int = 6, style: str = "g") -> str:
     """Format a number with enough digits to show on which side of some limits it lies.
 
     Parameters
@@ -396,7 +452,7 @@ def number_beside(number, *limits, digits=6, style="g"):
     return repr(float(number))
 
 
-def rounded_down(number):
-    """A bound > 0 as a text of six digits that keeps it: rounded to nearest it would be refused when it is written."""
+def rounded_down(number: float) -> str:
+    """Return an upper bound > 0 as text with six digits, rounded down: rounded to nearest it could exceed the bound."""
     near = float(number) * (1 + 4 * EPS)
     return f"{float(Context(prec=6, rounding=ROUND_FLOOR).create_decimal(near)):.6g}"

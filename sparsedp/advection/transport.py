@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sparsedp._utils.calls import public
-from sparsedp._utils.reconstruction import Frozen, Remade
+from sparsedp._utils.reconstruction import Frozen, Reconstructible
 from sparsedp._utils.validation import check_choice
 from sparsedp.advection.arguments import check_step, flatten_array
 from sparsedp.advection.eulerian import Eulerian
@@ -207,7 +207,7 @@ def method_and_rule(settings: TransportSettings) -> tuple[TransportMethod, Any]:
     return method, rule_of(method)
 
 
-class Transport(Frozen, Remade):
+class Transport(Frozen, Reconstructible):
     """One time step of transport, ``move(u, v, dt, inflow=0.0)``, built by `transport`. Frozen.
 
     Parameters

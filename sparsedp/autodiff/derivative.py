@@ -1,8 +1,10 @@
 """Derivatives of whole programs: any function of a tree of arrays, forward and backward."""
 
+from __future__ import annotations
+
 import warnings
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import autograd.numpy as anp
 import numpy as np
@@ -10,7 +12,7 @@ import numpy as np
 from sparsedp._utils.calls import frames_inside, public
 from sparsedp._utils.counters import thread
 from sparsedp._utils.pytree import copied, described, flatten, is_branch, labels, leaves, mapped, paired
-from sparsedp._utils.reconstruction import Made
+from sparsedp._utils.reconstruction import ReconstructibleFunction
 from sparsedp._utils.validation import (
     advise,
     check_function,
@@ -37,25 +39,47 @@ from sparsedp.autodiff.tape import (
     new_trace,
     plain,
     split_boxes,
-)  # fmt: skip
+)
 from sparsedp.autodiff.tape_constants import is_fixed
 from sparsedp.errors import DerivativeError, NonFiniteError, NonFiniteGradientWarning, ShapeError, SparsedpError
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Sequence
+
 __all__ = [
-    "NO_JVP", "check_loss", "entrywise", "grad", "gradient_of", "hvp", "is_finite", "judged",
-    "jvp", "linearised", "name_of", "of_argument", "pullback", "push", "pushforward", "taped", "traced",
-    "unwarned", "value_and_grad", "vjp", "witnessed", "zero_like",
-]  # fmt: skip
+    "NO_JVP",
+    "check_loss",
+    "checking_derivatives",
+    "entrywise",
+    "grad",
+    "gradient_of",
+    "hvp",
+    "is_finite",
+    "jvp",
+    "linearised",
+    "name_of",
+    "of_argument",
+    "pullback",
+    "push",
+    "pushforward",
+    "taped",
+    "traced",
+    "unwarned",
+    "value_and_grad",
+    "vjp",
+    "witnessed",
+    "zero_like",
+]
 
-# What `pushforward` raises where one of our rules, or of autograd's, has none.
+# What `pushforward` raises where a rule of this library or of autograd has no JVP.
 NO_JVP = (DerivativeError, NotImplementedError)
+# Advice for a gradient of the wrong shape.
 SPREAD = ": autograd's np.where does not add up what it spreads; multiply by the condition instead, a * c + b * (1 - c)"
+LARGE = 1e100  # cotangents above this overflow in other calls, whose own derivatives are finite
 
-LARGE = 1e100  # a cotangent that makes others overflow, through derivatives that do not
 
-
-def pullback(fun, x):
-    """Function of a tree -> its value, and the function from a cotangent to the VJP.
+def pullback(fun: Callable, x: Any) -> tuple[Any, Callable]:
+    """Return the value of a function of a tree, and the function from a cotangent to the VJP.
 
     Parameters
     ----------
@@ -88,7 +112,7 @@ def pullback(fun, x):
     (5.0, 2.0)
     """
     entries, rebuild = flatten(x)
-    moving = list(map(is_variable, entries))
+    moving = [is_variable(leaf) for leaf in entries]
     check_native("a gradient", *entries)
     check_leaves("x", x)
     if not any(moving):
@@ -110,16 +134,34 @@ def pullback(fun, x):
 
     def pull(g):
         check_shape("the cotangent", g, np.shape(value), "; give one like the value")
-        slopes = zip(entries, moving, back([g]), strict=True)
-        return rebuild(_apart([gradient_of(leaf, slope) if moves else None for leaf, moves, slope in slopes], g))
+        gradients = []
+        for leaf, moves, slope in zip(entries, moving, back([g]), strict=True):
+            gradients.append(gradient_of(leaf, slope) if moves else None)
+        return rebuild(_without_shared_memory(gradients, g))
 
     return _apart_from_caller(value), pull
 
 
-def linearised(fun, tree, moving):
-    """A function at a tree, of whose leaves some move -> (leaves of its result, how to build it, pull).
+def linearised(fun: Callable, tree: Any, moving: Iterable) -> tuple[list, Callable, Callable]:
+    """Evaluate a function of a tree and record it.
 
-    ``pull(cotangents)``: of the leaves of the result -> of the leaves of the tree; None where there is none.
+    Parameters
+    ----------
+    fun : callable
+        ``fun(tree) -> tree``.
+    tree : tree
+    moving : sequence of bool
+        For each leaf of the tree, whether it is a variable.
+
+    Returns
+    -------
+    values : list
+        Leaves of the result.
+    rebuild : callable
+        Builds the result from its leaves.
+    pull : callable
+        ``pull(cotangents)`` returns a cotangent for each leaf of the tree from those of the leaves of the result; None
+        where there is none.
     """
     tape = taped(fun, tree, moving)
 
@@ -132,7 +174,21 @@ def linearised(fun, tree, moving):
 
 
 class Tape(NamedTuple):
-    """A function at a tree: leaves of its result, how to build it, their nodes; all calls; roots of leaves."""
+    """The recorded evaluation of a function of a tree.
+
+    Attributes
+    ----------
+    values : list
+        Leaves of the result.
+    rebuild : callable
+        Builds the result from its leaves.
+    ends : list
+        Nodes of the leaves of the result, or None.
+    nodes : list
+        Of all calls.
+    roots : list
+        Nodes of the leaves of the tree, or None.
+    """
 
     values: list
     rebuild: Any
@@ -141,24 +197,29 @@ class Tape(NamedTuple):
     roots: list
 
 
-def taped(fun, tree, moving, *witnesses):
-    """A function at a tree, of whose leaves some move -> Tape, whose calls the witnesses see."""
+def taped(fun: Callable, tree: Any, moving: Iterable, *witnesses: Callable) -> Tape:
+    """Record a function of a tree, see `linearised`; the witnesses are called for every node, see `Recorder`."""
     recorder = Recorder(*witnesses)
     roots = [recorder.root() if moves else None for moves in moving]
     try:
         values, ends, rebuild = traced(fun, tree, roots)
-    finally:  # a witness that keeps nodes would be a circle
-        nodes, recorder.ended, recorder.witnesses = recorder.taken(), True, ()
+    finally:
+        nodes = recorder.taken()
+        recorder.ended = True
+        recorder.witnesses = ()  # a witness that keeps nodes would be a reference cycle
     return Tape(values, rebuild, ends, nodes, roots)
 
 
 @contextmanager
-def witnessed(see):
-    """A `with` block in which ``see(node, function, value, arguments, options, numbers)`` gets each node of a tape.
+def witnessed(see: Callable) -> Iterator[None]:
+    """Call a function for each node of a reverse-mode trace that is created inside a `with` block.
 
-    Nodes of every reverse-mode trace, when they are made; `numbers`: those of the arguments that are differentiated.
+    Parameters
+    ----------
+    see : callable
+        ``see(node, function, value, arguments, options, numbers)``; `numbers` are the positions of the arguments that
+        are differentiated.
     """
-
     thread.witnesses.append(see)
     try:
         yield
@@ -167,26 +228,22 @@ def witnessed(see):
 
 
 @contextmanager
-def judged():
-    """A `with` block in which a call is refused by name whose own derivative is NaN or infinite.
+def checking_derivatives() -> Iterator[None]:
+    """Raise NonFiniteError inside a `with` block for the first call whose own derivative is NaN or infinite.
 
-    Not one whose cotangent is LARGE or NaN. For a second run, when a gradient was not finite.
+    A call whose cotangent is NaN or LARGE is not to blame. For a second run, after a gradient was not finite.
     """
 
     def see(node, fun, value, args, options, nums):
-        pull, name = node.vjp, name_of(called(fun, args))
+        pull = node.vjp
+        name = name_of(called(fun, args))
 
         def checked(g, *held):
-            backs = list(pull(g, *held))
+            cotangents = list(pull(g, *held))
             if all(np.all(np.abs(plain(part)) < LARGE) for part in leaves(g)):
-                for num, back in zip(nums, backs, strict=True):
-                    if is_variable(back) and not np.all(finite := np.isfinite(plain(back))):
-                        met = np.ravel(plain(args[num]))[np.argmin(finite)]
-                        raise NonFiniteError(
-                            f"the derivative of {name} is NaN or infinite where its argument is {met:.6g}; "
-                            "keep it away from there"
-                        )
-            return backs
+                for num, cotangent in zip(nums, cotangents, strict=True):
+                    _check_derivative(name, args[num], cotangent)
+            return cotangents
 
         node.vjp = checked
 
@@ -194,9 +251,21 @@ def judged():
         yield
 
 
+def _check_derivative(name, argument, cotangent):
+    """Refuse a cotangent of an argument of a call that is not finite."""
+    if not is_variable(cotangent):
+        return
+    finite = np.isfinite(plain(cotangent))
+    if not np.all(finite):
+        first = np.ravel(plain(argument))[np.argmin(finite)]
+        raise NonFiniteError(
+            f"the derivative of {name} is NaN or infinite where its argument is {first:.6g}; keep it away from there"
+        )
+
+
 @contextmanager
-def unwarned():
-    """Within the block derivatives that are not finite raise no warning: the caller refuses them itself."""
+def unwarned() -> Iterator[None]:
+    """Suppress warnings of derivatives that are not finite inside a `with` block: the caller handles them."""
     thread.quiet += 1
     try:
         yield
@@ -216,8 +285,10 @@ def _warn_unless_finite(name, derivative, again):
     again : callable
         ``again()`` computes the derivative once more in reverse mode.
     """
-    found = [leaf for leaf in leaves(derivative) if is_variable(leaf)]
-    if thread.quiet or any(map(isbox, found)) or all(map(is_finite, found)):
+    if thread.quiet:
+        return
+    variables = [leaf for leaf in leaves(derivative) if is_variable(leaf)]
+    if any(map(isbox, variables)) or all(map(is_finite, variables)):
         return
     reason = _cause_of_non_finite(again) or "dp.check.gradient(loss, x) shows where it comes from"
     warnings.warn(
@@ -237,7 +308,7 @@ def _cause_of_non_finite(again):
     if process_count() > 1:
         return None
     try:
-        with unwarned(), judged():
+        with unwarned(), checking_derivatives():
             again()
     except NonFiniteError as error:
         return str(error)
@@ -246,24 +317,37 @@ def _cause_of_non_finite(again):
     return None
 
 
-def name_of(subject):
-    """How the user knows a rule, an Operator or a function of autograd."""
+def name_of(subject: Any) -> Any:
+    """Return the name under which a user knows a rule, an Operator or a function of autograd."""
     return getattr(subject, "name", None) or getattr(subject, "__name__", type(subject).__name__)
 
 
-def traced(fun, tree, roots):
-    """fun(tree) with a box for every root -> (leaves of the result, their nodes or None, how to build it).
+def traced(fun: Callable, tree: Any, roots: Sequence) -> tuple[list, list, Callable]:
+    """Evaluate ``fun(tree)`` with traced values for the leaves that have a root.
 
-    With a word of advice where NumPy, math or Python refuse a traced value.
+    Returns
+    -------
+    values : list
+        Leaves of the result.
+    nodes : list
+        Of the leaves of the result, or None.
+    rebuild : callable
+        Builds the result from its leaves.
+
+    Raises
+    ------
+    DerivativeError
+        If NumPy, math or Python refuse a traced value.
     """
     entries, rebuild = flatten(tree)
     number = new_trace()
     try:
         ends, build = flatten(fun(rebuild(boxed(entries, roots, number))))
-        return *split_boxes(ends, number), build
+        values, nodes = split_boxes(ends, number)
+        return values, nodes, build
     except (TypeError, ValueError, AttributeError) as error:
-        said = str(error), str(error.__cause__)  # u[0] = traced: NumPy hides the reason in the cause
-        if isinstance(error, SparsedpError) or not any("ArrayBox" in words for words in said):
+        texts = str(error), str(error.__cause__)  # u[0] = traced: NumPy hides the reason in the cause
+        if isinstance(error, SparsedpError) or not any("ArrayBox" in text for text in texts):
             advise(error)
             raise
         raise DerivativeError(
@@ -272,43 +356,49 @@ def traced(fun, tree, roots):
         ) from error
 
 
-def _apart(gradients, g):
-    """autograd hands one array to both terms of a sum, and g on; a caller may write into the one without the other."""
-    seen = {id(_owner(g))}
-    for number, back in enumerate(gradients):
-        if isinstance(back, np.ndarray) and (id(_owner(back)) in seen or not back.flags.writeable):
-            gradients[number] = back.copy()
-        seen.add(id(_owner(back)))
+def _without_shared_memory(gradients, g):
+    """Copy gradients that share memory with each other or with the cotangent g: the caller may write into one.
+
+    autograd returns one array for both terms of a sum, and g itself.
+    """
+    owners = {id(_owner(g))}
+    for number, gradient in enumerate(gradients):
+        if isinstance(gradient, np.ndarray) and (id(_owner(gradient)) in owners or not gradient.flags.writeable):
+            gradients[number] = gradient.copy()
+        owners.add(id(_owner(gradient)))
     return gradients
 
 
 def _apart_from_caller(value):
-    """An array as it is now: pullbacks need it, and the caller may write into it before they run."""
+    """Return an array as it is now: pullbacks need it, and the caller may write into it before they run."""
     return value if not isinstance(value, np.ndarray) or is_fixed(value) else value.copy("K")
 
 
 def _owner(value):
-    """The array whose memory an array shows."""
+    """Return the array that owns the memory of an array."""
     return _owner(value.base) if isinstance(value, np.ndarray) and value.base is not None else value
 
 
-def gradient_of(leaf, cotangent):
-    """The gradient in a leaf: of its shape and dtype, zero where no cotangent arrived."""
+def gradient_of(leaf: Any, cotangent: Any) -> Any:
+    """Return a cotangent as the gradient in a leaf, of its shape and dtype; zeros if there is no cotangent."""
     if cotangent is None:
         return 0.0 if isinstance(leaf, float) else anp.zeros_like(plain(leaf))
     check_shape("the gradient", cotangent, np.shape(leaf), SPREAD)
-    return _as_given(fit("the gradient", leaf, cotangent, cotangent), leaf)
+    return _as_leaf(fit("the gradient", leaf, cotangent, cotangent), leaf)
 
 
-def _as_given(derivative, leaf):
-    """A derivative of a number of Python as such a number, where it is not traced."""
+def _as_leaf(derivative, leaf):
+    """Return a derivative of a number of Python as such a number, unless it is traced."""
     return float(derivative) if isinstance(leaf, float) and not isbox(derivative) else derivative
 
 
-def pushforward(fun, x, tangent):
-    """`jvp` in forward mode alone: raises one of NO_JVP where a part of `fun` has no forward derivative.
+def pushforward(fun: Callable, x: Any, tangent: Any) -> tuple:
+    """Return what `jvp` returns, in forward mode only, and without copies.
 
-    The results are not copied.
+    Raises
+    ------
+    DerivativeError
+        Or another type of NO_JVP, if a part of `fun` has no forward derivative.
 
     Examples
     --------
@@ -319,49 +409,50 @@ def pushforward(fun, x, tangent):
     return forward(fun, x, _directions(x, tangent))
 
 
-def forward(fun, x, tangents):
-    """fun, its argument, a tangent or None for each leaf -> (value, tangent of it as a tree, None at constants)."""
+def forward(fun: Callable, x: Any, tangents: Sequence) -> tuple:
+    """Return the value of a function and its tangent in forward mode, see `push`."""
     roots = [None if tangent is None else forward_root(tangent) for tangent in tangents]
     values, nodes, rebuild = traced(fun, x, roots)
     slopes = [tangent_of(value, node and node.g) for value, node in zip(values, nodes, strict=True)]
     return rebuild(values), rebuild(slopes)
 
 
-def tangent_of(value, slope):
-    """The tangent of a result: of its dtype; 0 where it does not depend on what moves; None where it has none."""
+def tangent_of(value: Any, slope: Any) -> Any:
+    """Return the tangent of a result in its dtype: zero for a constant result, None if it is not floating."""
     if not is_variable(value):
         return None
     return zero_like(value) if slope is None else fit("a rule", value, slope, slope)
 
 
-def is_finite(value):
+def is_finite(value: Any) -> bool:
     """Whether an array or number, plain or traced, holds neither NaN nor infinity."""
     value = plain(value)
     return surely_finite(value) or bool(np.all(np.isfinite(value)))
 
 
-def zero_like(value):
-    """A plain zero of the shape and dtype of a value, traced or not."""
+def zero_like(value: Any) -> Any:
+    """Return plain zeros of the shape and dtype of a value, traced or not."""
     return np.zeros(np.shape(plain(value)), dtype_of(value))[()]
 
 
 def _random_like(value):
-    """Plain numbers of the shape and dtype of a value, the same in every run."""
-    return np.asarray(np.random.default_rng(0).uniform(0.5, 1.5, np.shape(plain(value))), dtype_of(value))[()]
+    """Return plain numbers of the shape and dtype of a value, the same in every run."""
+    numbers = np.random.default_rng(0).uniform(0.5, 1.5, np.shape(plain(value)))
+    return np.asarray(numbers, dtype_of(value))[()]
 
 
 def _directions(x, tangent):
-    """The tangent of each leaf of `x`, None where it is not floating."""
+    """Return the tangent of each leaf of `x`, None where the leaf is not floating."""
     entries = leaves(x)
     tangents = paired(tangent, x, "tangent", advice="; give a tangent like x")
     for number, leaf in enumerate(entries):
         if not is_variable(leaf):
             tangents[number] = None
             continue
-        given = tangents[number]
-        if not (_is_array(given) and np.shape(given) == np.shape(leaf)):
-            place = labels(x, "tangent")[number]
-            raise ShapeError(f"{place}: expected {described(leaf)}, got {described(given)}; give a tangent like x")
+        direction = tangents[number]
+        if not (_is_array(direction) and np.shape(direction) == np.shape(leaf)):
+            path = labels(x, "tangent")[number]
+            raise ShapeError(f"{path}: expected {described(leaf)}, got {described(direction)}; give a tangent like x")
     return tangents
 
 
@@ -370,8 +461,8 @@ def _is_array(value):
     return isbox(value) or is_field(value)
 
 
-def jvp(fun, x, tangent):
-    """Function of a tree -> its value and its directional derivative.
+def jvp(fun: Callable, x: Any, tangent: Any) -> tuple:
+    """Return the value of a function of a tree and its directional derivative.
 
     Parameters
     ----------
@@ -382,7 +473,9 @@ def jvp(fun, x, tangent):
 
     Returns
     -------
-    (value, tangent of value)
+    value : tree
+    tangent : tree
+        Of the value.
 
     Raises
     ------
@@ -398,7 +491,7 @@ def jvp(fun, x, tangent):
 
     Notes
     -----
-    Forward mode; by two reverse passes where a part of `fun` has no forward derivative.
+    Forward mode, or two reverse passes if a part of `fun` has no forward derivative.
 
     Examples
     --------
@@ -411,7 +504,7 @@ def jvp(fun, x, tangent):
 
 
 def _jvp(name, fun, x, tangent):
-    """Value and directional derivative, with a warning where the derivative is not finite."""
+    """Return what `jvp` returns; the public function of this name warns if the derivative is not finite."""
     check_native("jvp", *leaves((x, tangent)))
     check_leaves("x", x)
     check_leaves("tangent", tangent)
@@ -427,8 +520,8 @@ def _jvp(name, fun, x, tangent):
     return copied(results)  # the caller may write into x, the tangent and the results
 
 
-def hvp(loss, x, tangent):
-    """Scalar loss of a tree, a direction -> the Hessian of the loss times the direction.
+def hvp(loss: Callable, x: Any, tangent: Any) -> Any:
+    """Return the Hessian of a scalar loss of a tree times a direction.
 
     Parameters
     ----------
@@ -457,13 +550,25 @@ def hvp(loss, x, tangent):
     >>> hvp(lambda x: x[0] ** 2 * x[1], (2.0, 5.0), (1.0, 0.0))
     (10.0, 4.0)
     """
-    return mapped(_as_given, _jvp("hvp", grad(loss), x, tangent)[1], x)
+    return mapped(_as_leaf, _jvp("hvp", grad(loss), x, tangent)[1], x)
 
 
-def push(fun, tree, tangents):
-    """fun, its argument, a tangent or None for each leaf -> (value, tangent of it as a tree, None at constants).
+def push(fun: Callable, tree: Any, tangents: Sequence) -> tuple:
+    """Return the value of a function of a tree, and its tangent.
 
-    Forward, or by two reverse passes where a part of `fun` has no JVP.
+    Forward mode, or two reverse passes if a part of `fun` has no JVP.
+
+    Parameters
+    ----------
+    fun : callable
+    tree : tree
+    tangents : sequence
+        For each leaf of the tree, or None.
+
+    Returns
+    -------
+    value, tangent : trees
+        The tangent is None at leaves that are not floating.
     """
     try:
         return forward(fun, tree, tangents)
@@ -474,24 +579,29 @@ def push(fun, tree, tangents):
 
 
 def _twice_reverse(fun, tree, tangents):
-    """The pullback z -> J^T z is linear, so the gradient in z of <J^T z, tangent> is J tangent.
+    """Return the value of a function, and its tangent by two reverse passes.
 
-    It is taken at random z: a rule may branch on a cotangent of zero, and then has no derivative there.
+    The pullback of a cotangent z, J^T z, is linear, so the gradient in z of <J^T z, tangent> is J tangent. It is
+    evaluated at random z: a rule may branch on a cotangent of zero, and then has no derivative there.
     """
     values, rebuild, pull = linearised(fun, tree, [tangent is not None for tangent in tangents])
-    moving = list(map(is_variable, values))
+    moving = [is_variable(value) for value in values]
 
-    def paired(z):
-        pairs = zip(pull(z), tangents, strict=True)
-        return sum((anp.sum(back * tangent) for back, tangent in pairs if back is not None), 0.0)
+    def product(z):
+        total = 0.0
+        for cotangent, tangent in zip(pull(z), tangents, strict=True):
+            if cotangent is not None:
+                total = total + anp.sum(cotangent * tangent)
+        return total
 
     z = [_random_like(value) if moves else None for value, moves in zip(values, moving, strict=True)]
-    slopes = linearised(paired, z, moving)[2]([1.0])
+    _, _, pull_product = linearised(product, z, moving)
+    slopes = pull_product([1.0])
     return rebuild(values), rebuild(map(tangent_of, values, slopes))
 
 
-def vjp(fun, *x):
-    """Function and its arguments -> its value, and the function from a cotangent to the VJP.
+def vjp(fun: Callable, *x: Any) -> tuple[Any, Callable]:
+    """Return the value of a function, and the function from a cotangent to the VJP.
 
     Parameters
     ----------
@@ -531,26 +641,30 @@ def vjp(fun, *x):
     (5.0, 2.0)
     """
     check_function("vjp", fun, "lambda u: ...")
-    value, pull = collectively("vjp", x, pullback, lambda parts: fun(*parts), x)
+
+    def of_tuple(parts):
+        return fun(*parts)
+
+    value, pull = collectively("vjp", x, pullback, of_tuple, x)
 
     def back(g):
         check_precision("the cotangent", g)
         slopes = collectively("the function of vjp", (g,), pull, g)
         if is_finite(g):
-            _warn_unless_finite("vjp", slopes, lambda: pullback(lambda parts: fun(*parts), x)[1](g))
+            _warn_unless_finite("vjp", slopes, lambda: pullback(of_tuple, x)[1](g))
         return slopes[0] if len(x) == 1 else slopes
 
     return value, public("pull")(back)
 
 
-def grad(loss, argnum=0):
-    """Scalar loss of a tree -> function that returns the gradient; see `value_and_grad`.
+def grad(loss: Callable, argnum: int = 0) -> Callable:
+    """Return the function that returns the gradient of a scalar loss of a tree; see `value_and_grad`.
 
     Parameters
     ----------
     loss : callable
     argnum : int
-        Which of its arguments is `x`.
+        Position of the argument `x`.
 
     Returns
     -------
@@ -562,7 +676,7 @@ def grad(loss, argnum=0):
     TypeError
         If `loss` is not a function.
     ValueError
-        If `argnum` is no whole number >= 0.
+        If `argnum` is not a whole number >= 0.
     ShapeError, DerivativeError
         On use, as `value_and_grad`.
 
@@ -577,32 +691,33 @@ def grad(loss, argnum=0):
     6.0
     """
     both = value_and_grad(loss, argnum)
-    return Made(lambda *args: both(*args)[1], grad, loss, argnum)
+    return ReconstructibleFunction(lambda *args: both(*args)[1], grad, loss, argnum)
 
 
-def value_and_grad(loss, argnum=0):
-    """Scalar loss of a tree -> function that returns the value and the gradient.
+def value_and_grad(loss: Callable, argnum: int = 0) -> Callable:
+    """Return the function that returns the value and the gradient of a scalar loss of a tree.
 
     Parameters
     ----------
     loss : callable
-        ``loss(x, *rest) -> real scalar``; `x` is any nesting of arrays, tuples, lists and dicts.
+        ``loss(x, *rest) -> real scalar``; `x` is any nesting of tuples, lists, dicts and
+        dataclasses of arrays.
     argnum : int
-        Which of its arguments is `x`; default: the first.
+        Position of the argument `x`; default: the first.
 
     Returns
     -------
     callable
         ``f(*args) -> (value, gradient)``. The gradient has the structure of `x`, each leaf the
-        shape and dtype of its twin. Leaves that are not floating (int, bool, None, str) are passed
-        to the loss unchanged; their place in the gradient holds None.
+        shape and dtype of the leaf of `x`. Leaves that are not floating (int, bool, None, str) are
+        passed to the loss unchanged; their place in the gradient holds None.
 
     Raises
     ------
     TypeError
         If `loss` is not a function; on use, if there is no such argument.
     ValueError
-        If `argnum` is no whole number >= 0.
+        If `argnum` is not a whole number >= 0.
     ShapeError
         If the loss is not a scalar.
     DerivativeError
@@ -616,10 +731,10 @@ def value_and_grad(loss, argnum=0):
     Notes
     -----
     Complex numbers: the gradient in a complex leaf is dL/dRe - i dL/dIm, see "Complex numbers" in docs/ideas.md.
-    `x` and the constant arrays that the loss uses in calls may be written into at once after a call (``work[:] = c`` in
-    a loop): what the backward pass needs is copied. An array that is read-only with all its memory is not copied;
-    ``mask.flags.writeable = False`` saves the time, that of one product with the mask for each call. Other objects,
-    sparse matrices too, must stay as they are until the gradient is there.
+    The caller, and the loss between two calls, may write into `x` and into constant arrays (``work[:] = c`` in a loop):
+    what the backward pass needs is copied. An array that is read-only with all its memory is not copied;
+    ``mask.flags.writeable = False`` saves the time of one product with the mask for each call. Other objects,
+    sparse matrices too, must not be changed until the gradient is computed.
 
     Examples
     --------
@@ -635,12 +750,16 @@ def value_and_grad(loss, argnum=0):
             raise TypeError(f"the gradient in argument {argnum} of the loss needs it, got {len(args)} arguments")
         return collectively("the loss", args, _value_and_gradient, loss, argnum, args)
 
-    return Made(evaluate, value_and_grad, loss, argnum)
+    return ReconstructibleFunction(evaluate, value_and_grad, loss, argnum)
 
 
 def _value_and_gradient(loss, argnum, args):
     """Return the value of a loss, and its gradient in one of its arguments."""
-    value, pull = pullback(lambda x: loss(*args[:argnum], x, *args[argnum + 1 :]), args[argnum])
+
+    def of_argument(x):
+        return loss(*args[:argnum], x, *args[argnum + 1 :])
+
+    value, pull = pullback(of_argument, args[argnum])
     check_loss(value)
 
     def again():
@@ -657,8 +776,8 @@ def _value_and_gradient(loss, argnum, args):
     return value if isbox(value) else float(value), gradient
 
 
-def check_loss(value):
-    """Refuse what a loss returned, traced or not, if it is not one real number."""
+def check_loss(value: Any) -> None:
+    """Refuse the value of a loss, traced or not, if it is not one real number."""
     if is_branch(value):
         raise ShapeError(f"the loss must be a scalar, got a {type(value).__name__}; return one number")
     if np.shape(plain(value)) != ():
@@ -667,16 +786,30 @@ def check_loss(value):
         raise DerivativeError("the loss must be real, got a complex number; take its real part or its absolute value")
 
 
-def of_argument(cotangent, value):
-    """What a product of fields gives for an argument: summed over batches, and for a real argument the real part."""
+def of_argument(cotangent: Any, value: Any) -> Any:
+    """Return a cotangent of a product of fields in the form of an argument.
+
+    It is summed over batches, and for a real argument its real part is taken.
+    """
     cotangent = match_value(cotangent, value)
     while np.ndim(cotangent) > np.ndim(value):
         cotangent = anp.sum(cotangent, axis=0)
-    return cast(cotangent, float) if dtype_of(cotangent).kind == "c" != dtype_of(value).kind else cotangent
+    if dtype_of(cotangent).kind == "c" != dtype_of(value).kind:
+        return cast(cotangent, float)
+    return cotangent
 
 
-def entrywise(name, value, slopes):
-    """Name, ``value(a, b)`` entry by entry, ``slopes(a, b)``: its derivatives in both, on the tape too -> a rule."""
+def entrywise(name: str, value: Callable, slopes: Callable) -> Rule:
+    """Return the rule of a function of two fields that acts entry by entry.
+
+    Parameters
+    ----------
+    name : str
+    value : callable
+        ``value(a, b)``.
+    slopes : callable
+        ``slopes(a, b)``: the derivatives in both arguments, also for traced values.
+    """
 
     def vjp(nums, ans, a, b):
         pair = slopes(a, b)

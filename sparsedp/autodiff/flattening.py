@@ -10,7 +10,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp._utils.pytree import Structure, copied, leaves
-from sparsedp._utils.reconstruction import Made
+from sparsedp._utils.reconstruction import ReconstructibleFunction
 from sparsedp._utils.validation import check_finite, check_leaves, check_native, check_shape
 from sparsedp.autodiff.tape import cast, is_variable, isbox
 from sparsedp.errors import DerivativeError
@@ -73,7 +73,7 @@ def flatten(tree: Any) -> tuple[np.ndarray, Callable]:
             return packing.unpack(np.asarray(vector, dtype=float))
         return packing.tree(map(_traced_leaf, packing.split(vector), packing.values))
 
-    return packing.pack(tree), Made(unflatten, _unflatten, tree)
+    return packing.pack(tree), ReconstructibleFunction(unflatten, _unflatten, tree)
 
 
 def _unflatten(tree):

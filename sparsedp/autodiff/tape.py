@@ -26,7 +26,7 @@ from autograd.tracer import Node, box_types, getval, isbox, new_box, notrace_pri
 
 from sparsedp._utils.counters import active, count, note, thread, timed
 from sparsedp._utils.pytree import copied, is_branch, leaves
-from sparsedp._utils.reconstruction import Remade
+from sparsedp._utils.reconstruction import Reconstructible
 from sparsedp.autodiff.backend import ARRAY_KINDS, BOX, match_value
 from sparsedp.autodiff.fast_derivatives import (
     ARRAY,
@@ -789,7 +789,7 @@ def _isolated_jvp(jvp):
     return _isolated(on_frozen_tangents)
 
 
-class Rule(Remade):
+class Rule(Reconstructible):
     """A function with hand-written derivatives that returns fresh arrays. Users create one with `differentiable`.
 
     Parameters

@@ -33,7 +33,7 @@ import numpy as np
 
 from sparsedp._utils.calls import public
 from sparsedp._utils.pytree import mapped
-from sparsedp._utils.reconstruction import Remade
+from sparsedp._utils.reconstruction import Reconstructible
 from sparsedp._utils.validation import (
     check_choice,
     check_finite,
@@ -199,7 +199,7 @@ def _momentum_fields(grid: Grid, momentum: Any) -> tuple[int, ...]:
     return tuple(map(int, fields))
 
 
-class ConservationLaw(Remade):
+class ConservationLaw(Reconstructible):
     """The rate of change of a conservation law, ``law(u, params=None)``, built by `conservation_law`.
 
     Parameters

@@ -33,7 +33,7 @@ import numpy as np
 
 from sparsedp._utils.calls import deprecated_attribute, public
 from sparsedp._utils.pytree import copied, mapped
-from sparsedp._utils.reconstruction import Remade
+from sparsedp._utils.reconstruction import Reconstructible
 from sparsedp._utils.validation import (
     check_choice,
     check_finite,
@@ -260,7 +260,7 @@ def _rebuild(arguments: dict[str, Any]) -> FlowStep:
     return flow_step(**arguments)
 
 
-class FlowStep(Remade):
+class FlowStep(Reconstructible):
     """A step of incompressible flow, built by `flow_step`. Operators that the scene does not need are None.
 
     Parameters

@@ -20,7 +20,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp._utils.pytree import copied
-from sparsedp._utils.reconstruction import Made
+from sparsedp._utils.reconstruction import ReconstructibleFunction
 from sparsedp._utils.validation import check_on
 from sparsedp.flow.projection_setup import faces_that
 from sparsedp.grid.boundary_conditions import dirichlet, free_slip, no_slip, outflow, resolve
@@ -216,7 +216,7 @@ def convection(grid: Grid, boundary: Any = no_slip, solid: ArrayLike | None = No
         # On walls where the carrying velocity w needs a wall velocity, the faces are not free: C drops the flux.
         return C(fluxes.carried(v, walls) * fluxes.carrier(w))
 
-    return Made(convect, convection, *copied((grid, boundary, solid)))
+    return ReconstructibleFunction(convect, convection, *copied((grid, boundary, solid)))
 
 
 # ---- stresses and fluxes on all faces, walls and obstacles included --------------------------------------------------

@@ -27,7 +27,7 @@ import scipy.sparse as sp
 
 from sparsedp._utils.calls import public
 from sparsedp._utils.pytree import copied
-from sparsedp._utils.reconstruction import Made, Remade
+from sparsedp._utils.reconstruction import Reconstructible, ReconstructibleFunction
 from sparsedp._utils.validation import check_finite, check_kind, check_number, field_array
 from sparsedp.autodiff.tape import plain
 from sparsedp.flow.momentum import (
@@ -198,7 +198,7 @@ def brinkman(grid: Grid) -> Callable[[Any], Any]:
             terms.append(anp.log1p((mean_cosh - 1) / (1 + anp.cosh(s))) * inverse_square)
         return anp.where(plain(s) <= DEEPEST, in_obstacle, reduce(add, terms) / anp.log1p(anp.exp(s)))
 
-    return Made(friction, brinkman, grid)
+    return ReconstructibleFunction(friction, brinkman, grid)
 
 
 def _difference(grid: Grid, axis: int, back: bool) -> Operator:
@@ -220,7 +220,7 @@ def _difference(grid: Grid, axis: int, back: bool) -> Operator:
     return kronecker_operator(grid.faces, grid.faces, blocks, "brinkman")
 
 
-class Forces(Remade):
+class Forces(Reconstructible):
     """Force and torque on an obstacle, built by `forces`.
 
     Parameters

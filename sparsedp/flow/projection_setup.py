@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sparsedp._utils.reconstruction import Remade
+from sparsedp._utils.reconstruction import Reconstructible
 from sparsedp._utils.validation import check_finite, place
 from sparsedp.errors import NonFiniteError
 from sparsedp.flow.projection_passes import CompiledPasses, OperatorPasses, compiled_passes
@@ -39,7 +39,7 @@ __all__ = ["ProjectionSetup", "faces_that", "pressure_conditions"]
 FEW_CELLS = 1024  # below, transforms are tried even where `inverse` would factor
 
 
-class ProjectionSetup(Remade):
+class ProjectionSetup(Reconstructible):
     """The closed faces, D, G and the inverse of A = -D G of a projection.
 
     The operators belong to a grid with lengths near 1: P does not depend on the unit of length, but squares of lengths

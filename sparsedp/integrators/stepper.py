@@ -9,7 +9,7 @@ from scipy.sparse.linalg import ArpackError, eigsh
 
 from sparsedp._utils.calls import advice_near, public
 from sparsedp._utils.pytree import copied, labels, leaves
-from sparsedp._utils.reconstruction import Remade
+from sparsedp._utils.reconstruction import Reconstructible
 from sparsedp._utils.validation import (
     advise,
     check_choice,
@@ -347,7 +347,7 @@ def _with_interruptions(scheme: Adaptive, arguments: dict) -> Any:
     return Interrupted(scheme, times, event_list([] if events is None else events))
 
 
-class Step(Remade):
+class Step(Reconstructible):
     """A time step, as `stepper` returns it: ``step(state, params)`` is the state after a time dt.
 
     Parameters

@@ -16,7 +16,7 @@ import scipy.sparse as sp
 from sparsedp._utils.calls import public
 from sparsedp._utils.counters import count
 from sparsedp._utils.pytree import norm
-from sparsedp._utils.reconstruction import Remade
+from sparsedp._utils.reconstruction import Reconstructible
 from sparsedp._utils.validation import EPS, check_choice, check_finite, check_function, check_precision, check_shape
 from sparsedp.autodiff.tape import Rule, isbox, plain
 from sparsedp.errors import DerivativeError, ShapeError
@@ -102,7 +102,7 @@ def from_blackbox(f: Callable, sparsity: Any = None, derivative: str = "auto", n
     return Adopted(f, sparsity, derivative, name or getattr(f, "__name__", "simulator"))
 
 
-class Adopted(Remade):
+class Adopted(Reconstructible):
     """A foreign function with a sparse Jacobian, kept for the last two points: see `from_blackbox`.
 
     Attributes

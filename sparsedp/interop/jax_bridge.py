@@ -14,7 +14,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
 from sparsedp._utils.pytree import placed
-from sparsedp._utils.reconstruction import Made
+from sparsedp._utils.reconstruction import ReconstructibleFunction
 from sparsedp._utils.validation import check_function, check_precision
 from sparsedp.autodiff.tape import Rule, dtype_of, plain
 from sparsedp.errors import DerivativeError, ShapeError
@@ -79,7 +79,7 @@ def to_jax(f: Callable, like: Any = None) -> Callable:
         entries = node.applied(*arrays)  # the first call finds the structure
         return jax.tree.unflatten(result.structure, entries)
 
-    return Made(call, to_jax, f, like)
+    return ReconstructibleFunction(call, to_jax, f, like)
 
 
 def _called(f, structure, like):
@@ -276,7 +276,7 @@ def from_jax(function: Callable) -> Callable:
         results = traced.rule(*entries)
         return jax.tree.unflatten(form.structure, parts(results, form.structure.num_leaves))
 
-    return Made(call, from_jax, function)
+    return ReconstructibleFunction(call, from_jax, function)
 
 
 class _Traced:

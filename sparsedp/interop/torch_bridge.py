@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from sparsedp._utils.pytree import flatten, leaves, paired, placed
-from sparsedp._utils.reconstruction import Made
+from sparsedp._utils.reconstruction import ReconstructibleFunction
 from sparsedp._utils.validation import check_function, check_leaves
 from sparsedp.autodiff.tape import Rule, dtype_of, is_variable, isbox
 from sparsedp.autodiff.tape_constants import constant, frozen
@@ -68,7 +68,9 @@ def to_torch(f: Callable) -> Callable:
     tensor([-16.,  -2.,  -4.,  22.])
     """
     check_function("to_torch", f, "dp.interop.to_torch(dp.laplacian(grid))")
-    return Made(lambda *args, **options: _bridged(lambda tree: f(*tree[0], **tree[1]), (args, options)), to_torch, f)
+    return ReconstructibleFunction(
+        lambda *args, **options: _bridged(lambda tree: f(*tree[0], **tree[1]), (args, options)), to_torch, f
+    )
 
 
 def _bridged(fun, tree):
@@ -234,7 +236,7 @@ def from_torch(function: Callable) -> Callable:
         return built[0](parts(results, len(graph.outputs)))
 
     vars(call)["parameters"] = parameters
-    return Made(call, from_torch, function)
+    return ReconstructibleFunction(call, from_torch, function)
 
 
 class _Graph:

@@ -15,7 +15,7 @@ from collections.abc import Callable
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp._utils.reconstruction import Made
+from sparsedp._utils.reconstruction import ReconstructibleFunction
 from sparsedp._utils.validation import check_finite, check_kind, check_native, check_on
 from sparsedp.autodiff.backend import as_field
 from sparsedp.autodiff.derivative import entrywise
@@ -71,7 +71,7 @@ def harmonic_average(grid: Grid) -> Callable:
             raise ValueError(f"harmonic_average needs a coefficient >= 0, got {np.min(values):g}")
         return pair(below(k), above(k))
 
-    return Made(average, harmonic_average, grid)
+    return ReconstructibleFunction(average, harmonic_average, grid)
 
 
 def _lower_share(grid, axis):

@@ -16,7 +16,7 @@ from sparsedp._utils import buffers
 from sparsedp._utils.calls import shortened
 from sparsedp._utils.counters import active
 from sparsedp._utils.html import facts, spy
-from sparsedp._utils.reconstruction import Frozen, Remade
+from sparsedp._utils.reconstruction import Frozen, Reconstructible
 from sparsedp._utils.validation import check_finite, check_native, check_out, check_shape, field_array
 from sparsedp.autodiff.backend import NUMPY, Backend
 from sparsedp.autodiff.tape import apply_operator, isbox
@@ -34,7 +34,7 @@ AS_OPERATOR = "dp.from_matrix(M, A.domain, A.codomain)"  # a sparse matrix M bes
 SPY_BELOW = 20_000  # rows and columns of a matrix that a notebook draws, in 0.1 s
 
 
-class Operator(Frozen, Remade):
+class Operator(Frozen, Reconstructible):
     """A constant linear map from fields on `domain` to fields on `codomain`. Frozen.
 
     Builders such as `gradient` and `from_matrix` return operators; ``@ + - *`` combine them, ``op(u)`` applies one. The

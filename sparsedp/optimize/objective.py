@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sparsedp._utils.pytree import norm, safe_unit
-from sparsedp.autodiff.derivative import check_loss, judged, pullback, unwarned, value_and_grad
+from sparsedp.autodiff.derivative import check_loss, checking_derivatives, pullback, unwarned, value_and_grad
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, UnstableStepError
 from sparsedp.optimize.linearization import Linearization
 from sparsedp.optimize.result import NO_RESIDUALS, Evaluation, Failure, NoStepFound, RoundingReached
@@ -204,7 +204,7 @@ class Objective:
                 return float(value), self._packing.pack_gradient(gradient)
             except NonFiniteError:
                 if self._gradient is None:
-                    with judged():  # a second run raises at the function whose derivative is not finite
+                    with checking_derivatives():  # a second run raises at the function whose derivative is not finite
                         value_and_grad(self._loss)(self._packing.unpack(vector), *batch)
                 raise
 

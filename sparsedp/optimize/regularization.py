@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp._utils.pytree import power_of_two
-from sparsedp._utils.reconstruction import Made
+from sparsedp._utils.reconstruction import ReconstructibleFunction
 from sparsedp._utils.validation import check_finite, check_kind, check_native, is_number
 from sparsedp.autodiff.backend import is_distributed
 from sparsedp.autodiff.tape import dtype_of, plain
@@ -86,7 +86,7 @@ def total_variation(grid: Grid, eps: float, solid: ArrayLike | None = None) -> C
         # The quotient equals sqrt(g^2 + eps^2) - eps and has no cancellation.
         return unit * anp.sum(volumes * square / (anp.sqrt(square + scaled_eps**2) + scaled_eps))
 
-    return Made(integral, total_variation, grid, eps, constant(solid))
+    return ReconstructibleFunction(integral, total_variation, grid, eps, constant(solid))
 
 
 def smoothness(grid: Grid, solid: ArrayLike | None = None) -> Callable[[Any], Any]:
@@ -131,7 +131,7 @@ def smoothness(grid: Grid, solid: ArrayLike | None = None) -> Callable[[Any], An
         square, _ = squared_slope(u)
         return 0.5 * anp.sum(volumes * square)
 
-    return Made(integral, smoothness, grid, constant(solid))
+    return ReconstructibleFunction(integral, smoothness, grid, constant(solid))
 
 
 def _squared_slope(grid, name, solid):

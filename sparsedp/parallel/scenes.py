@@ -17,7 +17,7 @@ import numpy as np
 from sparsedp._utils.calls import public
 from sparsedp._utils.progress import shown_steps
 from sparsedp._utils.pytree import copied, flatten, leaves, mapped, placed
-from sparsedp._utils.reconstruction import Remade
+from sparsedp._utils.reconstruction import Reconstructible
 from sparsedp._utils.validation import check_finite, check_function, check_leaves, check_shape, check_whole, is_whole
 from sparsedp.autodiff.derivative import check_loss, grad, jvp, unwarned, value_and_grad, zero_like
 from sparsedp.autodiff.tape import Rule, isbox
@@ -94,7 +94,7 @@ def ensemble(
     return Ensemble(loss, scenes, executor, weights, chunk, progress)
 
 
-class Ensemble(Remade):
+class Ensemble(Reconstructible):
     """The weighted sum of a loss over scenes. Made by `ensemble`.
 
     Attributes

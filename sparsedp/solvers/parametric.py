@@ -20,7 +20,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp._utils.calls import public
-from sparsedp._utils.reconstruction import Remade
+from sparsedp._utils.reconstruction import Reconstructible
 from sparsedp._utils.validation import check_finite, check_kind, check_plain, check_shape, check_type
 from sparsedp.autodiff.backend import as_field, gathered
 from sparsedp.autodiff.derivative import of_argument
@@ -54,7 +54,7 @@ LARGEST_EXPONENT = 500  # coefficients beyond 2^500 or below 2^-500 are scaled b
 SMALLEST_EXPONENT = -1022  # of a float with all its digits
 
 
-class ParametricSolver(Remade):
+class ParametricSolver(Reconstructible):
     """A solver of (shift - D diag(k) G) x = b, with a derivative rule in (k, b, shift).
 
     A subclass has a `name` and defines ``_operator(k, shift)``, which may keep the arrays.

@@ -20,7 +20,7 @@ import numpy as np
 from sparsedp._utils.calls import public
 from sparsedp._utils.counters import note, thread
 from sparsedp._utils.pytree import mapped, power_of_two
-from sparsedp._utils.reconstruction import Remade
+from sparsedp._utils.reconstruction import Reconstructible
 from sparsedp._utils.validation import check_function, check_takes, check_whole
 from sparsedp.autodiff.backend import collectively, replicated
 from sparsedp.autodiff.derivative import pullback, push
@@ -209,7 +209,7 @@ def steady(residual: Callable[..., Any], guess: Any, *params: Any, **options: An
     return implicit(residual, **options)(guess, *params)
 
 
-class Root(Remade):
+class Root(Reconstructible):
     """The differentiable function root(guess, *params) that `implicit` returns.
 
     Parameters

@@ -23,7 +23,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp._utils.counters import active, count, thread, timed
-from sparsedp._utils.reconstruction import Remade
+from sparsedp._utils.reconstruction import Reconstructible
 from sparsedp._utils.validation import EPS, check_finite, number_beside, place
 from sparsedp.autodiff.tape import plain
 from sparsedp.errors import ConvergenceError, IncompatibleError, NonFiniteError
@@ -116,7 +116,7 @@ class Run:
         )
 
 
-class Solver(Remade):
+class Solver(Reconstructible):
     """A system and an engine that is set up for it: solves to a tolerance, with the matrix and with its transpose.
 
     Parameters

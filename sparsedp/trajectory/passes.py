@@ -15,7 +15,7 @@ import numpy as np
 
 from sparsedp._utils.counters import count
 from sparsedp._utils.progress import shown_steps
-from sparsedp.autodiff.derivative import is_finite, judged, zero_like
+from sparsedp.autodiff.derivative import checking_derivatives, is_finite, zero_like
 from sparsedp.autodiff.tape import Rule, backward, fit, innermost, through
 from sparsedp.errors import DerivativeError, NonFiniteError
 from sparsedp.trajectory.record import Record, backward_record, largest, sampling_interval
@@ -361,7 +361,7 @@ class RolloutRule(Rule):
         backs = self._backward_pass(args, g, runs)
         for position, back in zip(self.specification.differentiated, backs, strict=True):
             if not is_finite(back) and all(map(is_finite, g)):
-                with judged():  # a second run names the call that made it, if one did
+                with checking_derivatives():  # a second run names the call that made it, if one did
                     self._backward_pass(args, g, [])
                 raise NonFiniteError(
                     f"the backward pass through {self.specification.n} steps of rollout makes the gradient in "

@@ -16,9 +16,9 @@ SHAPE = (1 << 15,)
 @pytest.fixture(autouse=True)
 def _nothing_waits(monkeypatch):
     monkeypatch.setattr(results, "LARGE", 8 * SHAPE[0])  # quick to fill
-    results._spare.clear()
+    results._free.clear()
     yield
-    results._spare.clear()
+    results._free.clear()
 
 
 def test_the_memory_of_a_result_that_is_gone_serves_again():
@@ -78,8 +78,8 @@ def test_what_waits_is_bounded(monkeypatch):
     where = last.ctypes.data
     many.clear()
     del last
-    assert sum(memory.size for memory in results._spare.values()) == 2 * results.LARGE
-    assert where in [memory.ctypes.data for memory in results._spare.values()]
+    assert sum(memory.size for memory in results._free.values()) == 2 * results.LARGE
+    assert where in [memory.ctypes.data for memory in results._free.values()]
 
 
 def test_operators_take_it_and_give_right_results(monkeypatch):

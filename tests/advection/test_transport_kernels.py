@@ -155,9 +155,9 @@ def test_recycled_buffers_do_not_change_results():
     v = 0.02 * rng.normal(size=grid.faces.size)
     q = rng.normal(size=move.walls.size)
     first = [x.tobytes() for x in results(move, u, v, q)]
-    for spare in memory._spare.values():
+    for spare in memory._free.values():
         spare[: spare.size // 8 * 8].view(float)[:] = np.nan
-    assert memory._spare and first == [x.tobytes() for x in results(move, u, v, q)]
+    assert memory._free and first == [x.tobytes() for x in results(move, u, v, q)]
 
 
 def test_cotangents_need_not_be_contiguous():

@@ -13,7 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp import kernels
-from sparsedp._utils.reconstruction import Remade
+from sparsedp._utils.reconstruction import Reconstructible
 from sparsedp._utils.validation import check_shape
 from sparsedp.autodiff.tape_constants import frozen
 from sparsedp.errors import DerivativeError
@@ -183,7 +183,7 @@ class Sum(Structure):
         return bound
 
 
-class Functions(Remade, Structure):
+class Functions(Reconstructible, Structure):
     """A linear map given by two functions on fields: the product and the transposed product."""
 
     name = "an operator of two functions"
