@@ -139,9 +139,9 @@ def conservation_law(
 
     References
     ----------
-    A. Harten, P. D. Lax, B. van Leer, SIAM Review 25 (1983) 35-61.
-    B. van Leer, J. Comput. Phys. 32 (1979) 101-136.
-    J. P. Berberich, P. Chandrashekar, C. Klingenberg, Computers & Fluids 219 (2021) 104858 (equilibrium).
+    Harten, Lax, van Leer, SIAM Review 25 (1983) 35-61.
+    van Leer, J. Comput. Phys. 32 (1979) 101-136.
+    Berberich, Chandrashekar, Klingenberg, Computers & Fluids 219 (2021) 104858 (equilibrium).
 
     Examples
     --------
