@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
     from sparsedp.advection.settings import TransportSettings
     from sparsedp.grid.grid import Grid
-    from sparsedp.kernels.team import Kernel
 
 __all__ = ["Component", "Sides", "components"]
 
@@ -95,8 +94,8 @@ class Component(NamedTuple):
         """Number of points."""
         return self.field.stop - self.field.start
 
-    def run(self, loop: Kernel, *args: Any) -> None:
-        """Run a compiled loop over all tiles."""
+    def run(self, loop: Any, *args: Any) -> None:
+        """Run a compiled loop, a `Kernel`, over all tiles."""
         work = self.points * len(self.axes)  # each axis is a pass: 512^2 cells pay for two threads
         loop.run(self.tiles, work, kernels.threads(), *args)
 
