@@ -99,7 +99,7 @@ def from_blackbox(f: Callable, sparsity: Any = None, derivative: str = "auto", n
     """
     check_function("from_blackbox", f, "dp.from_blackbox(lambda x: ...)")
     check_choice("derivative", derivative, WAYS)
-    return Adopted(f, sparsity, derivative, name or getattr(f, "__name__", "simulator"))
+    return Adopted(f, sparsity, derivative, str(name or getattr(f, "__name__", "simulator")))
 
 
 class Adopted(Reconstructible):
@@ -116,7 +116,7 @@ class Adopted(Reconstructible):
     _shapes: Any
     _coloured: Any
 
-    def __init__(self, f, sparsity, derivative, name, jacobian=(None, "", None)):
+    def __init__(self, f: Any, sparsity: Any, derivative: Any, name: str, jacobian: Any = (None, "", None)) -> None:
         self._f, self._derivative, self.name = f, derivative, name
         self._sparsity = None if sparsity is None else pattern_like(sparsity)
         self._shapes, self.way, self._coloured = jacobian
@@ -337,7 +337,7 @@ def _lacks(matrix, v, along, way):
     return wrong
 
 
-def change(run, x, y, v):
+def change(run: Any, x: Any, y: Any, v: Any) -> Any:
     """How much run(x), which is y, changes when x moves along v by a tenth of its size; less where that is refused."""
     for share in SMALLER:
         with suppress(*REFUSED):
@@ -347,6 +347,6 @@ def change(run, x, y, v):
     return np.zeros_like(y)
 
 
-def typical(x):
+def typical(x: Any) -> Any:
     """Root mean square of an array, 1 where that is 0 or the array is empty."""
     return norm(x) / np.sqrt(max(x.size, 1)) or 1.0

@@ -9,6 +9,8 @@ and up to 24 bytes that are reduced. So
 - a reduction takes one message, as it would without all this.
 """
 
+from __future__ import annotations
+
 import pickle
 import sys
 import traceback
@@ -49,7 +51,7 @@ class Agreement:
         What an error says of this rank.
     """
 
-    def __init__(self, comm, where):
+    def __init__(self, comm: Any, where: str) -> None:
         self.comm, self.where, course.last = comm, where, self
         self._mark = 0
         self._log: deque = deque(maxlen=100)  # what was told since the last message: (label, mark)
@@ -58,7 +60,7 @@ class Agreement:
 
     # ------------------------------------------------------------ what must be the same
 
-    def tell(self, label, content):
+    def tell(self, label: str, content: bytes) -> None:
         """Note what this rank does, or was given, in words and as bytes: it is compared with the next message."""
         while course.untold:
             what, given = course.untold.pop(0)
@@ -67,14 +69,14 @@ class Agreement:
         self._mark = crc32(content, self._mark)
         self._log.append((label, self._mark))
 
-    def tell_all(self, root, what, tree):
+    def tell_all(self, root: Any, what: str, tree: Any) -> None:
         """The same for the leaves of a tree, on the tape or not; those on ranks are agreed on already."""
         for name, leaf in zip(labels(tree, root), leaves(tree)):
             value = plain(leaf)
             if isinstance(value, (Number, np.ndarray, np.generic, str)):
                 self.tell(f"{name} of {what}", folded(np.asarray(value)))
 
-    def meet(self, label, content=b""):
+    def meet(self, label: str, content: bytes = b"") -> Any:
         """Send one message from each rank to all; return the bytes `content` of all ranks, in their order.
 
         Raises
@@ -124,7 +126,7 @@ class Agreement:
 
     # ------------------------------------------------------------ numbers
 
-    def reduced(self, number, act):
+    def reduced(self, number: Any, act: Any) -> Any:
         """The numbers of all ranks in one, in the order of the ranks: the same bits on each, whatever MPI does."""
         count("ranks", "reduction")
         number = np.asarray(number)
@@ -132,14 +134,14 @@ class Agreement:
         found = self.meet(label, content) if len(content) <= ROOM else b"".join(self.gathered(content, label))
         return act.reduce(np.ndarray((self.comm.size, *number.shape), number.dtype, found), axis=0)[()]
 
-    def gathered(self, value, label="gather"):
+    def gathered(self, value: Any, label: str = "gather") -> Any:
         """Return the values of all ranks as a list, on every rank."""
         self.meet(label)
         return self.comm.allgather(value)
 
     # ------------------------------------------------------------ errors
 
-    def agreed(self, label, act, *args, at_once=False):
+    def agreed(self, label: str, act: Any, *args: Any, at_once: bool = False) -> Any:
         """act(*args), which may fail on one rank only: then it fails on all.
 
         Inside of `together`, that tells them; `at_once`: they are told here, for the caller goes on in another way.
@@ -157,7 +159,7 @@ class Agreement:
             self.meet(label)
         return result
 
-    def fail(self, error):
+    def fail(self, error: Any) -> None:
         """Raise an error on all ranks: that of the lowest one which has failed, in its words and with its place."""
         if hasattr(error, "on_all_ranks"):
             raise error
@@ -194,7 +196,7 @@ def _packed(error, where):
             continue  # it takes other arguments, or other ranks do not know it
 
 
-def end_all(kind, error, trace):
+def end_all(kind: Any, error: Any, trace: Any) -> None:
     """End all ranks with the error of one, so that no rank waits for its messages."""
     comm = MPI.COMM_WORLD
     told = "".join(traceback.format_exception(kind, error, trace))

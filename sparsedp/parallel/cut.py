@@ -8,7 +8,10 @@ The transpose is the transposed map, cut in the same way: it gathers too, so not
 the bits of the result do not depend on how many there are.
 """
 
+from __future__ import annotations
+
 from math import prod
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -29,7 +32,7 @@ __all__ = ["Columns", "OwnRows", "Rows", "localized", "reads"]
 NOTHING = np.iinfo(int).max  # as an end of a side: there is none
 
 
-def localized(structure, given, made):
+def localized(structure: Any, given: Any, made: Any) -> Any:
     """Return the structure on blocks of a structure on whole fields.
 
     Parameters
@@ -90,13 +93,13 @@ def _between(members, given, made):
 class OnBlocks(Structure):
     """What acts on blocks as it is: a solve on ranks, a projection of its data."""
 
-    def __init__(self, whole, shape):
+    def __init__(self, whole: Any, shape: tuple) -> None:
         self.whole, self.shape = whole, shape
 
-    def apply(self, x, out):
+    def apply(self, x: Any, out: Any) -> None:
         self.whole.apply(x, out)
 
-    def explicit(self):
+    def explicit(self) -> None:
         raise _no_matrix(self.whole)
 
 
@@ -117,12 +120,12 @@ class Rows(Structure):
     windows : list, one for each component of what `inner` makes
     """
 
-    def __init__(self, inner, shape, read, windows=(...,)):
+    def __init__(self, inner: Any, shape: tuple, read: Any, windows: Any = (...,)) -> None:
         self.inner, self.shape, self.read, self.windows = inner, shape, read, windows
         self.parts = getattr(inner, "out_parts", (inner.shape[:1],))
         self.dtype, self.takes_complex = inner.dtype, inner.takes_complex
 
-    def act(self, x, out):
+    def act(self, x: Any, out: Any) -> None:
         blocks = self._own(self.inner.product(self.read(x) if self.read else x))
         for block, target in zip(blocks, components(out, [block.shape for block in blocks])):
             target[...] = block
@@ -130,14 +133,14 @@ class Rows(Structure):
     def _own(self, wide):
         return [part[window] for part, window in zip(components(wide, self.parts), self.windows)]
 
-    def explicit(self):
+    def explicit(self) -> Any:
         """The rows as a csr_array; its columns are what is read."""
         if self.read is None:
             raise _no_matrix(self.inner)
         blocks = self._own(np.arange(self.inner.shape[0]))
         return self.inner.explicit()[np.concatenate([block.reshape(-1) for block in blocks])]
 
-    def magnitude(self):
+    def magnitude(self) -> Any:
         entries = abs(self.explicit())
         return lambda x: entries @ self.read(x)
 
@@ -159,7 +162,7 @@ def _of_matrix(matrix, shape, given, made):
     return Rows(Matrix(inner), shape, exchange.forward)
 
 
-def reads(entries, layout, parts):
+def reads(entries: np.ndarray, layout: Any, parts: Any) -> Any:
     """Return the Exchange that reads some entries of a whole field, and the place of each entry in its result."""
     entries, places = np.unique(entries, return_inverse=True)
     return places.reshape(-1), Exchange(layout, parts, entries.size, np.arange(entries.size), entries)
@@ -177,13 +180,13 @@ class OwnRows(Turning):
 class Columns(Structure):
     """The transpose of Rows: what a structure makes of a block is sent back to where they read it."""
 
-    def __init__(self, inner, shape, back):
+    def __init__(self, inner: Any, shape: tuple, back: Any) -> None:
         self.inner, self.shape, self.back = inner, shape, back
 
-    def act(self, x, out):
+    def act(self, x: Any, out: Any) -> None:
         out[...] = self.back(self.inner.product(x))
 
-    def magnitude(self):
+    def magnitude(self) -> Any:
         entries = abs(self.inner.explicit())
         return lambda x: self.back(entries @ x)
 

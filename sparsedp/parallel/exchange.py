@@ -1,6 +1,9 @@
 """What goes from rank to rank: every rank gathers the numbers that it reads, by a PetscSF."""
 
+from __future__ import annotations
+
 from math import prod
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -18,7 +21,7 @@ KINDS = {"f": MPI.FLOAT, "d": MPI.DOUBLE, "D": MPI.C_DOUBLE_COMPLEX}  # PETSc ad
 HELD = MPI.Comm.Create_keyval()
 
 
-def hold(comm):
+def hold(comm: Any) -> None:
     """Keep PETSc's own copy of a communicator. Called by all ranks together.
 
     Without a holder it is freed with the last object on it, which Python drops sooner on one rank than on another: the
@@ -44,7 +47,16 @@ class Exchange:
         Of what is copied, for each component: the shape of what is read, and where the copy is in it and in the block.
     """
 
-    def __init__(self, layout, parts, size, leaves, entries, shapes=(), windows=()):
+    def __init__(
+        self,
+        layout: Any,
+        parts: Any,
+        size: int,
+        leaves: np.ndarray,
+        entries: np.ndarray,
+        shapes: Any = (),
+        windows: Any = (),
+    ) -> None:
         ranks, places = layout.owners(parts, entries)
         counts = np.array([leaves.size, np.count_nonzero(ranks != layout.comm.rank)])
         self.agreement = layout.agreement
@@ -58,19 +70,19 @@ class Exchange:
             self._forest.setGraph(self.block[0], leaves.astype(PETSc.IntType), remote)
             self._forest.setUp()
 
-    def forward(self, flat):
+    def forward(self, flat: np.ndarray) -> Any:
         """Return the numbers that are read, flat, for a flat block."""
         return self._sent("bcast", MPI.REPLACE, flat, self.placed(flat))
 
-    def backward(self, read):
+    def backward(self, read: Any) -> Any:
         """The transpose: what stands beside the numbers read is added where they came from."""
         return self._sent("reduce", MPI.SUM, read, self.taken(read))
 
-    def placed(self, flat):
+    def placed(self, flat: np.ndarray) -> Any:
         """Return the numbers that are read from the block of this rank itself, zeros elsewhere."""
         return _copied(flat, self.block, self.read)
 
-    def taken(self, read):
+    def taken(self, read: Any) -> Any:
         """The transpose of that."""
         return _copied(read, self.read, self.block)
 
@@ -101,7 +113,7 @@ def _copied(flat, given, made):
     return out
 
 
-def of_boxes(layout, parts, boxes):
+def of_boxes(layout: Any, parts: Any, boxes: Any) -> Any:
     """The Exchange for a box of each component, which may reach into other blocks."""
     leaves, entries, windows = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], []
     start = first = 0

@@ -6,6 +6,8 @@ silently local, no program branches differently on two ranks, and every rank rec
 whole shape is a field that every rank knows: beside a field on ranks, each takes its own block.
 """
 
+from __future__ import annotations
+
 from functools import partial, partialmethod
 from operator import attrgetter
 from typing import Any
@@ -27,7 +29,7 @@ class DistributedField(np.lib.mixins.NDArrayOperatorsMixin):
 
     __slots__ = ("__weakref__", "flat", "space")
 
-    def __init__(self, flat, space):
+    def __init__(self, flat: np.ndarray, space: Any) -> None:
         flat.flags.writeable = False
         self.flat, self.space = flat, space
 
@@ -40,27 +42,27 @@ class DistributedField(np.lib.mixins.NDArrayOperatorsMixin):
     real = property(lambda self: self.like(self.flat.real))
     imag = property(lambda self: self.like(self.flat.imag))
 
-    def like(self, flat):
+    def like(self, flat: np.ndarray) -> Any:
         """Another field on the same space."""
         return DistributedField(np.ascontiguousarray(flat), self.space)
 
-    def copy(self):
+    def copy(self) -> Any:
         """Return the field itself: it is read-only."""
         return self
 
-    def astype(self, dtype, copy=True):
+    def astype(self, dtype: Any, copy: Any = True) -> Any:
         """The same field in another dtype."""
         return self.like(self.flat.astype(dtype))
 
-    def gather(self):
+    def gather(self) -> Any:
         """The whole field on every rank, a plain array."""
         return self.layout.gather(self.flat, self.space.parts).reshape(self.shape)
 
-    def fingerprint(self):
+    def fingerprint(self) -> Any:
         """A whole number for its bits, the same on every rank."""
         return int(self.layout.sum(np.int64(hash(self.flat.tobytes()) >> 16)))
 
-    def refuse(self, what, *args, **options):
+    def refuse(self, what: str, *args: Any, **options: Any) -> None:
         """The answer to all that needs more than the block."""
         name = getattr(what, "__name__", what)
         raise TypeError(f"{name} does not work on a field that lies on ranks; write dp.gather(u) for the whole array")
@@ -68,7 +70,7 @@ class DistributedField(np.lib.mixins.NDArrayOperatorsMixin):
     def __repr__(self):
         return f"<field on {self.space}, on rank {self.layout.comm.rank} of {self.layout.comm.size}>"
 
-    def block_of(self, value):
+    def block_of(self, value: Any) -> Any:
         """Return the flat block of another operand; numbers are returned unchanged."""
         if np.ndim(value):
             return block(value, self.space).flat
@@ -99,7 +101,7 @@ for name, what in {
     setattr(DistributedField, name, partialmethod(DistributedField.refuse, what))
 
 
-def block(value, space):
+def block(value: Any, space: Any) -> Any:
     """Return a field on ranks, from such a field, a number, or an array that every rank holds and that broadcasts."""
     if isinstance(value, DistributedField):
         if value.space.parts != space.parts or value.layout != space.grid.backend:
@@ -248,7 +250,7 @@ def _spread(shape, space):
     return linear("block", lambda x: block(x, space), back)
 
 
-def everywhere(x, space):
+def everywhere(x: Any, space: Any) -> Any:
     """Return a field on ranks, from a number or an array that every rank holds, traced or not."""
     if not isbox(x):
         return block(x, space)
@@ -260,7 +262,7 @@ def everywhere(x, space):
     return _spread(np.shape(value), space)[0](x)
 
 
-def alike(back, value):
+def alike(back: Any, value: Any) -> Any:
     """A cotangent or tangent in the form of what it belongs to: a number, a whole array, or a field on ranks."""
     field, wanted = plain(back), plain(value)
     if isinstance(wanted, DistributedField):
@@ -268,12 +270,12 @@ def alike(back, value):
     return _spread(np.shape(wanted), field.space)[1](back) if isinstance(field, DistributedField) else back
 
 
-def total(x):
+def total(x: Any) -> Any:
     """Sum of all entries, on the tape too."""
     return alike(x, 0.0)
 
 
-def formulas(fun, value, args, nums):
+def formulas(fun: Any, value: Any, args: Any, nums: Any) -> Any:
     """Return the VJP and JVP of a call ``value = fun(*args)`` of autograd.numpy, as in FORMULAS; None if unknown.
 
     Numbers and whole arrays are made fields first; then every function entry by entry has the derivatives that
@@ -321,10 +323,10 @@ KNOWN = {*REDUCTIONS, *filter(callable, vars(anp).values())}
 class Sums(VSpace):
     """What autograd asks of a kind of values: to add them up."""
 
-    def __init__(self, value):
+    def __init__(self, value: Any) -> None:
         self.shape, self.dtype, self.value = value.shape, value.dtype, value
 
-    def zeros(self):
+    def zeros(self) -> Any:
         """A field of zeros."""
         return np.zeros_like(self.value)
 
@@ -335,7 +337,7 @@ class Sums(VSpace):
 # ---- calls that all ranks make alike ----
 
 
-def together(what, given, act, *args):
+def together(what: str, given: Any, act: Any, *args: Any) -> Any:
     """act(*args): what one rank raises, all raise; the arguments `given` and the result must be the same on all.
 
     Where no field on ranks was met, nothing is asked.
@@ -377,19 +379,19 @@ VSpace.register(DistributedField, Sums)
 class DistributedKind(ArrayKind):
     """What the tape and public calls ask of fields on ranks."""
 
-    def formulas(self, fun, value, args, nums):
+    def formulas(self, fun: Any, value: Any, args: Any, nums: Any) -> Any:
         """See `formulas`."""
         return formulas(fun, value, args, nums)
 
-    def match(self, derivative, value):
+    def match(self, derivative: Any, value: Any) -> Any:
         """See `alike`."""
         return alike(derivative, value)
 
-    def collectively(self, what, arguments, act, *args):
+    def collectively(self, what: str, arguments: Any, act: Any, *args: Any) -> Any:
         """See `together`."""
         return together(what, arguments, act, *args)
 
-    def process_count(self):
+    def process_count(self) -> Any:
         """Return the number of ranks of the last communicator."""
         return course.last.comm.size if course.last else 1
 

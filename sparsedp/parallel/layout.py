@@ -1,7 +1,10 @@
 """Layout: the backend of grids whose fields are stored in blocks on the ranks of MPI; see autodiff/backend.py."""
 
+from __future__ import annotations
+
 from functools import cache, cached_property, reduce
 from operator import add
+from typing import Any
 
 import numpy as np
 
@@ -45,7 +48,7 @@ class Layout(Partition, Backend):
 
     whole_fields = False
 
-    def __init__(self, shape, periodic, comm):
+    def __init__(self, shape: tuple, periodic: Any, comm: Any) -> None:
         super().__init__(shape, periodic, comm)
         hold(comm)
         self._pieces = cache(_pieces)
@@ -55,24 +58,24 @@ class Layout(Partition, Backend):
 
     __repr__ = __str__
 
-    def check(self, name):
+    def check(self, name: str) -> None:
         """Raise TypeError if a function does not work on ranks."""
         if name not in RIGHT:
             raise TypeError(f"{name} does not work on ranks yet; give it the grid from before dp.distribute")
 
-    def place(self, grid):
+    def place(self, grid: Any) -> Any:
         """Return a grid whose fields are on the same ranks."""
         return laid(grid, self.comm)
 
     # ------------------------------------------------------------ operators
 
-    def apply(self, op, u, out=None):
+    def apply(self, op: Any, u: Any, out: Any = None) -> Any:
         """Return the result of an Operator for a field on ranks, or one that every rank holds."""
         if out is not None:
             raise TypeError(f"{op.name} takes no out on ranks; leave it out")
         return self.agreement.agreed(op.name, self._applied, op, u)
 
-    def cut(self, op):
+    def cut(self, op: Any) -> Any:
         """What an operator does to the blocks of this rank, as a Structure; it is kept with the operator."""
         if "_cut" not in vars(op):
             vars(op)["_cut"] = localized(op.structure, _side(op.domain), _side(op.codomain))
@@ -92,7 +95,7 @@ class Layout(Partition, Backend):
             raise ShapeError(f"{op.name} takes a field on {op.domain.described}, got one on {u.space.described}")
         return u.flat if u.dtype.kind in "fc" else u.flat.astype(float)
 
-    def system(self, op, rtol, maxiter, method="auto", options=None):
+    def system(self, op: Any, rtol: Any, maxiter: Any, method: str = "auto", options: Any = None) -> Any:
         """The system of an operator on ranks, for `inverse`."""
         if _side(op.domain) != _side(op.codomain):
             raise TypeError(f"inverse of {op.name} does not work on ranks; both sides must lie there in the same way")
@@ -104,11 +107,11 @@ class Layout(Partition, Backend):
 
     stencil = staticmethod(stencil_of)  # what the rows of a Jacobian on each rank need
 
-    def reference(self, u):
+    def reference(self, u: Any) -> Any:
         """Return the argument of an Operator, which tells on which space its gradient is."""
         return u
 
-    def implementation(self, default):
+    def implementation(self, default: Any) -> Any:
         """Return what is called on ranks instead of a class or function of one process."""
         replacements = {
             System: self.system,
@@ -120,23 +123,23 @@ class Layout(Partition, Backend):
         }
         return replacements.get(default, default)
 
-    def system_and_choice(self, op, rtol, maxiter, method, options, solves):
+    def system_and_choice(self, op: Any, rtol: Any, maxiter: Any, method: str, options: Any, solves: Any) -> Any:
         """Return the System of an operator on ranks, and that PETSc solves it."""
         return self.system(op, rtol, maxiter, method, options), Choice("petsc", str(self))
 
-    def minimize(self, *given):
+    def minimize(self, *given: Any) -> Any:
         """`minimize` of unknowns on ranks."""
         from sparsedp.parallel.minimize import minimize_on_ranks
 
         return minimize_on_ranks(self.comm, *given)
 
-    def attempt(self, act, *args):
+    def attempt(self, act: Any, *args: Any) -> Any:
         """Return ``act(*args)``; if it fails on one rank it fails on all."""
         return self.agreement.agreed("a trial", act, *args, at_once=True)
 
     # ------------------------------------------------------------ fields
 
-    def tell(self, value):
+    def tell(self, value: Any) -> None:
         """Note a number or an array, or a part of its entries, that meets a field: it must be the same on all ranks."""
         value, what = np.asarray(value), "a number"
         if value.ndim:
@@ -144,14 +147,14 @@ class Layout(Partition, Backend):
             value = value[tuple(slice(None, None, n // most + 1) for n in value.shape)]
         self.agreement.tell(f"{what} beside a field on ranks", value.tobytes())
 
-    def volumes(self, space):
+    def volumes(self, space: Any) -> Any:
         """Control volumes, as a field."""
         lines = [
             self._beside(part, space.grid.control_lengths(space.kind, axis)) for axis, part in enumerate(space.parts)
         ]
         return DistributedField(np.concatenate([reduce(np.multiply.outer, some).reshape(-1) for some in lines]), space)
 
-    def mesh(self, grid, lines):
+    def mesh(self, grid: Any, lines: Any) -> Any:
         """Return a field of coordinates for each axis, from the coordinates along the axes."""
         space = Space(tuple(line.size for line in lines), "places", grid)
         lines = self._beside(space.shape, lines)
@@ -161,15 +164,15 @@ class Layout(Partition, Backend):
         """Return the parts of arrays along the axes that belong to the block of this rank."""
         return [line[start:stop] for line, (start, stop) in zip(lines, self.box(part))]
 
-    def flat(self, field):
+    def flat(self, field: Any) -> Any:
         """Return the field itself, whose operations act on the flat block."""
         return field
 
-    def field(self, space, value):
+    def field(self, space: Any, value: Any) -> Any:
         """Return a field on ranks of values that every rank holds."""
         return block(value, space)
 
-    def joined(self, name, fields):
+    def joined(self, name: str, fields: Any) -> Any:
         """The space of some fields side by side."""
         for field in fields:
             if not isinstance(field, DistributedField) or field.layout != self:
@@ -179,13 +182,13 @@ class Layout(Partition, Backend):
                 )
         return Joint([field.space for field in fields])
 
-    def split(self, space, v):
+    def split(self, space: Any, v: Any) -> Any:
         """Return the components of a field, or the fields that a joint one holds; differentiable."""
         if type(space) is Space and not is_distributed(v):
             return space.split_array(v)
         return tuple(take(v) for _, take, _ in self._pieces(space))
 
-    def join(self, space, parts):
+    def join(self, space: Any, parts: Any) -> Any:
         """Return one field of its components, or of fields; differentiable."""
         if type(space) is Space and not any(map(is_distributed, parts)):
             return space.join_arrays(parts)
@@ -193,19 +196,19 @@ class Layout(Partition, Backend):
         return reduce(add, (back(everywhere(part, inner)) for (inner, _, back), part in pairs))
 
 
-def jacobian_on_ranks(op, space):
+def jacobian_on_ranks(op: Any, space: Any) -> Any:
     """Return a Jacobian that was given as an Operator, between the unknowns on ranks."""
     if _side(op.domain) == _side(op.codomain) == _side(space):
         return op
     return from_matrix(op.matrix, space, space, op.name)
 
 
-def method_and_carry(settings):
+def method_and_carry(settings: Any) -> Any:
     """Return a scheme of transport, and the differentiable rule of a step on ranks."""
     return TransportMethod(settings), Carry(settings)
 
 
-def laid(grid, comm):
+def laid(grid: Any, comm: Any) -> Any:
     """Return a grid whose fields are on the ranks of a communicator."""
     made = object.__new__(type(grid))
     vars(made).update(grid.__getstate__(), backend=Layout(grid.shape, grid.periodic, comm))
@@ -217,13 +220,13 @@ class Joint(Space):
 
     spaces: list
 
-    def __init__(self, spaces):
+    def __init__(self, spaces: Any) -> None:
         parts = [part for space in spaces for part in space.parts]
         super().__init__(None, " and ".join(map(str, spaces)), spaces[0].grid, parts)
         vars(self).update(spaces=spaces)
 
     @cached_property
-    def volumes(self):
+    def volumes(self) -> Any:
         """Control volume of each value; ones where those of a field are not known, as on one process."""
         if any(node_axes(space.kind, 0, space.grid.dim) is None for space in self.spaces):
             return block(1.0, self)

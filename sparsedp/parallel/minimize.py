@@ -44,7 +44,7 @@ class LocalUnknowns:
     start : tree
     """
 
-    def __init__(self, comm: Any, start: Any):
+    def __init__(self, comm: Any, start: Any) -> None:
         self.comm = comm
         self.start = start
 
@@ -85,7 +85,7 @@ class DistributedObjective(Objective):
     box : Box
     """
 
-    def __init__(self, loss: Callable[[Any], Any], unknowns: LocalUnknowns, packing: Packing, box: Box):
+    def __init__(self, loss: Callable[[Any], Any], unknowns: LocalUnknowns, packing: Packing, box: Box) -> None:
         super().__init__(loss, None, packing, box, Batches(None))
         self.unknowns = unknowns
 

@@ -6,9 +6,12 @@ lies on any number of ranks. A box is one (start, stop) for each axis of a compo
 beyond 0 and n.
 """
 
+from __future__ import annotations
+
 from functools import cached_property
 from itertools import product
 from math import prod
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +32,7 @@ class Partition:
     comm : mpi4py.MPI.Comm
     """
 
-    def __init__(self, shape, periodic, comm):
+    def __init__(self, shape: tuple, periodic: Any, comm: Any) -> None:
         self.shape, self.periodic, self.comm = tuple(shape), tuple(periodic), comm
         self.ranks = _arrangement(self.shape, comm.size)
         self.cuts = [n * np.arange(p + 1) // p for n, p in zip(self.shape, self.ranks)]
@@ -51,38 +54,38 @@ class Partition:
 
     # ------------------------------------------------------------ blocks
 
-    def lines(self, axis, length):
+    def lines(self, axis: int, length: int) -> Any:
         """Return the cuts along one axis of a component with `length` entries: cells, nodes, or any other number."""
         return np.append(self.cuts[axis][:-1] * length // max(self.shape[axis], 1), length)
 
     @cached_property
-    def places(self):
+    def places(self) -> Any:
         """Along each axis, the place of every rank."""
         return [np.unravel_index(rank, self.ranks) for rank in range(self.comm.size)]
 
-    def box(self, part, rank=None):
+    def box(self, part: Any, rank: Any = None) -> Any:
         """The box of one component that a rank (default: this one) holds."""
         place = self.places[self.comm.rank if rank is None else rank]
         lines = [self.lines(axis, length) for axis, length in enumerate(part)]
         return tuple((int(line[p]), int(line[p + 1])) for line, p in zip(lines, place))
 
-    def shapes(self, parts, rank=None):
+    def shapes(self, parts: Any, rank: Any = None) -> Any:
         """Shapes of the blocks of a rank, one for each component."""
         return [lengths(self.box(part, rank)) for part in parts]
 
-    def size(self, parts, rank=None):
+    def size(self, parts: Any, rank: Any = None) -> Any:
         """Count of numbers in the blocks of a rank."""
         return sum(map(prod, self.shapes(parts, rank)))
 
-    def blocks(self, whole, parts, rank=None):
+    def blocks(self, whole: Any, parts: Any, rank: Any = None) -> Any:
         """What a rank holds of a whole flat field, as views, one for each component."""
         return [field[slices(self.box(part, rank))] for field, part in zip(components(whole, parts), parts)]
 
-    def take(self, values, parts):
+    def take(self, values: Any, parts: Any) -> Any:
         """Return the flat block of this rank of a whole flat field, a copy."""
         return np.concatenate([values[:0], *(block.reshape(-1) for block in self.blocks(values, parts))])
 
-    def gather(self, flat, parts):
+    def gather(self, flat: np.ndarray, parts: Any) -> Any:
         """Return the whole flat field on every rank, from the flat block of this rank."""
         whole = np.empty(sum(map(prod, parts)), flat.dtype)
         for rank, given in enumerate(self.agreement.gathered(flat)):
@@ -90,7 +93,7 @@ class Partition:
                 block[...] = values
         return whole
 
-    def owners(self, parts, entries):
+    def owners(self, parts: Any, entries: np.ndarray) -> Any:
         """Return the rank that holds each of some entries of a whole flat field, and the places in its flat block."""
         ranks, places = np.zeros((2, entries.size), np.int64)
         first, starts = 0, np.zeros(self.comm.size, np.int64)
@@ -108,25 +111,25 @@ class Partition:
 
     # ------------------------------------------------------------ numbers that all ranks agree on
 
-    def sum(self, number):
+    def sum(self, number: Any) -> Any:
         """Sum over the ranks, in their order."""
         return self.agreement.reduced(number, np.add)
 
-    def max(self, number):
+    def max(self, number: Any) -> Any:
         """The largest of all ranks; NaN when one is NaN."""
         return self.agreement.reduced(number, np.maximum)
 
-    def min(self, number):
+    def min(self, number: Any) -> Any:
         """The least of all ranks; NaN when one is NaN."""
         return self.agreement.reduced(number, np.minimum)
 
 
-def lengths(box):
+def lengths(box: Any) -> Any:
     """Shape of a box."""
     return tuple(stop - start for start, stop in box)
 
 
-def slices(box, origin=None):
+def slices(box: Any, origin: Any = None) -> Any:
     """Return one slice for each axis of a box, relative to the start of another box."""
     starts = [0] * len(box) if origin is None else [start for start, _ in origin]
     return tuple(slice(a - start, b - start) for (a, b), start in zip(box, starts))

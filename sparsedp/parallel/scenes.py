@@ -105,7 +105,15 @@ class Ensemble(Reconstructible):
 
     name = "ensemble"
 
-    def __init__(self, loss, scenes, executor=None, weights=None, chunk=None, progress=False):
+    def __init__(
+        self,
+        loss: Any,
+        scenes: Any,
+        executor: Any = None,
+        weights: Any = None,
+        chunk: Any = None,
+        progress: Any = False,
+    ) -> None:
         check_function("ensemble", loss, "lambda x, scene: ...")
         if not isinstance(scenes, Iterable):
             raise TypeError(
@@ -135,7 +143,7 @@ class Ensemble(Reconstructible):
         return f"<ensemble of {self.count} scenes>"
 
     @public("dp.ensemble(loss, scenes)")
-    def __call__(self, x, numbers=None):
+    def __call__(self, x: Any, numbers: Any = None) -> Any:
         numbers = list(range(self.count) if numbers is None else numbers)
         for number in numbers:
             if not is_whole(number, 0) or number >= self.count:

@@ -1,11 +1,14 @@
 """`python -m sparsedp ranks`: what of MPI and PETSc is here, and whether two processes get what one gets."""
 
+from __future__ import annotations
+
 import os
 import re
 import subprocess
 import sys
 from shutil import which
 from sysconfig import get_path
+from typing import Any
 
 import autograd.numpy as anp
 import numpy as np
@@ -34,7 +37,7 @@ COMMANDS = {  # words of what is wrong -> what helps
 }
 
 
-def report():
+def report() -> Any:
     """Lines on what is here and how two processes do; the last one is empty where they cannot."""
     script = [sys.executable, "-m", __name__]
     for command in (script, ["mpirun", "-n", "2", sys.executable, "-m", "mpi4py", *script[1:], "compare"]):
@@ -47,7 +50,7 @@ def report():
     yield "ranks work; write mpirun -n 2 python -m mpi4py scene.py"
 
 
-def run(command):
+def run(command: Any) -> Any:
     """Run a command; return the lines that it prints, and a few words on its error (empty without one)."""
     settings = {"OMPI_MCA_rmaps_base_oversubscribe": "1", "OMP_NUM_THREADS": "1", **os.environ}
     try:
@@ -62,7 +65,7 @@ def run(command):
 # ---- in processes of their own ---------------------------------------------------------------------------------------
 
 
-def versions():
+def versions() -> Any:
     """What loads here, in lines."""
     yield f"Python {sys.version.split()[0]}, NumPy {np.__version__}, {which('mpirun') or 'no mpirun'}"
     import mpi4py
@@ -76,7 +79,7 @@ def versions():
     yield f"petsc4py {petsc4py.__version__} for {np.dtype(PETSc.ScalarType)}, {hypre} hypre"
 
 
-def compare():
+def compare() -> Any:
     """Poisson's equation and a gradient, on all processes and on each alone: how far they differ, in one line."""
     from mpi4py import MPI
 

@@ -5,7 +5,10 @@ asks a System for sizes, and here these are sums over all ranks, with the same b
 turn, and raise together. The true residual is that of the operator itself, not of PETSc's matrix.
 """
 
+from __future__ import annotations
+
 from functools import cached_property, reduce
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -42,7 +45,7 @@ TIGHT = 1e-14  # least relative residual that PETSc is asked for; the contract r
 # ---- matrices ----
 
 
-def assembled(block, layout):
+def assembled(block: Any, layout: Any) -> Any:
     """Return a structure of blocks as a matrix of PETSc, which computes the products."""
     if isinstance(block, Chain):
         return reduce(PETSc.Mat.matMult, [assembled(member, layout) for member in block.members])
@@ -73,7 +76,7 @@ class RanksSystem(System):
 
     faces = splitting = None
 
-    def __init__(self, op, rtol=1e-10, maxiter=None):
+    def __init__(self, op: Any, rtol: Any = 1e-10, maxiter: Any = None) -> None:
         self.layout, self.parts = op.domain.backend, op.domain.parts
         self.side = self.layout, self.parts
         self.seed = [7, self.layout.comm.rank]
@@ -82,70 +85,70 @@ class RanksSystem(System):
     # sizes, over all ranks
 
     @property
-    def local_size(self):
+    def local_size(self) -> Any:
         """The number of entries of the blocks of this rank."""
         return self.layout.size(self.parts)
 
-    def size_of(self, x):
+    def size_of(self, x: Any) -> Any:
         """2-norm."""
         with np.errstate(over="ignore", invalid="ignore"):
             return float(np.sqrt(self.layout.sum(np.vdot(x, x).real)))
 
-    def largest(self, x):
+    def largest(self, x: Any) -> Any:
         """Largest magnitude; NaN when there is one."""
         return float(self.layout.max(np.max(np.abs(x), initial=0.0)))
 
-    def total(self, numbers):
+    def total(self, numbers: Any) -> Any:
         """Sums over all ranks."""
         return self.layout.sum(np.asarray(numbers, float))  # of an empty block bincount gives whole numbers
 
-    def extremes(self, x):
+    def extremes(self, x: Any) -> Any:
         """The least and the largest entry."""
         low, high = super().extremes(x)
         return self.layout.min(low), self.layout.max(high)
 
-    def shaped(self, x, space):
+    def shaped(self, x: Any, space: Any) -> Any:
         """The field of a flat block."""
         return DistributedField(x.copy(), space)
 
-    def flat(self, field):
+    def flat(self, field: Any) -> Any:
         """The flat block of a field."""
         return field.flat
 
-    def whole(self, x):
+    def whole(self, x: Any) -> Any:
         """The flat array of all entries, on every rank."""
         return self.layout.gather(x, self.parts)
 
     # products
 
-    def structure_of(self, op):
+    def structure_of(self, op: Any) -> Any:
         """What an operator does to blocks."""
         return self.layout.cut(op)
 
-    def product(self, x, transposed=False):
+    def product(self, x: Any, transposed: bool = False) -> Any:
         """A x or A^T x for the unknowns."""
         return self.masked(self.structure_of(self.op.T if transposed else self.op).product(x))
 
-    def applied(self, x):
+    def applied(self, x: Any) -> Any:
         """A x as it was given: not scaled, for all that is not an unknown too."""
         return self.structure_of(self.unscaled).product(x)
 
-    def residual(self, x, b, transposed=False):
+    def residual(self, x: Any, b: Any, transposed: bool = False) -> Any:
         """(b - A x, its norm; that of x)."""
         r = b - self.product(x, transposed)
         return r, self.size_of(r), self.size_of(x)
 
     @cached_property
-    def assembled(self):
+    def assembled(self) -> Any:
         """The operator as PETSc's matrix."""
         return assembled(self.structure_of(self.op), self.layout)
 
-    def vector(self, x):
+    def vector(self, x: Any) -> Any:
         """A flat block as PETSc's vector, on the same memory."""
         return PETSc.Vec().createWithArray(x, size=(x.size, self.size), comm=self.layout.comm)
 
     @cached_property
-    def components(self):
+    def components(self) -> Any:
         """(labels, count) of the connected components of the unknowns: those of the blocks, joined across ranks."""
         indptr, indices, data = self.matrix.getValuesCSR()
         links = _matrix((self.local_size,) * 2, indptr, indices, (data != 0).astype(float), self.layout)
@@ -164,29 +167,29 @@ class RanksSystem(System):
         return joined[labels], count
 
     @property
-    def entries(self):
+    def entries(self) -> None:
         """Where the contract would look for a null vector itself."""
         raise ArithmeticError("the null vector of one side is not known on ranks")
 
-    def kernel(self, labels, right, left, count):
+    def kernel(self, labels: Any, right: Any, left: Any, count: Any) -> Any:
         """The NullSpace of these vectors."""
         return RanksNullSpace(self, labels, right, left, count)
 
     # symmetry
 
     @cached_property
-    def volumes(self):
+    def volumes(self) -> Any:
         """Volumes of the entries of the block, divided by the largest of all."""
         flat = self.op.domain.volumes.flat
         return flat / 2.0 ** np.frexp(self.largest(flat))[1]
 
     @cached_property
-    def diagonal(self):
+    def diagonal(self) -> Any:
         """The diagonal on the unknowns."""
         return self.masked(self.assembled.getDiagonal().getArray().copy())
 
     @cached_property
-    def matrix(self):
+    def matrix(self) -> Any:
         """PETSc's matrix, with a row and a column of the identity, scaled, for what is no unknown."""
         if self.active is None:
             return self.assembled
@@ -198,7 +201,7 @@ class RanksSystem(System):
 class RanksNullSpace(NullSpace):
     """Null vectors whose blocks lie on ranks: sums and sizes are those of the system."""
 
-    def __init__(self, system, *given):
+    def __init__(self, system: Any, *given: Any) -> None:
         self.total, self.whole, self.size_of = system.total, system.whole, system.size_of
         super().__init__(*given)
 
@@ -214,7 +217,7 @@ class PetscEngine(Engine):
 
     method, iterative, hierarchical = "petsc", True, True
 
-    def __init__(self, system):
+    def __init__(self, system: Any) -> None:
         comm, w = system.layout.comm, system.weights
         PETSc.garbage_cleanup(comm)  # what Python has dropped is freed here, on all ranks together
         self.system, sign = system, -1.0 if system.sign < 0 else 1.0
@@ -248,7 +251,7 @@ class PetscEngine(Engine):
         ksp.setUp()
         self.hierarchy = f"{ksp.getType()} with {ksp.getPC().getType()} on {comm.size} ranks"
 
-    def solve(self, b, goal, transposed):
+    def solve(self, b: Any, goal: Any, transposed: bool) -> Any:
         """See solvers/solve.py."""
         system, reasons = self.system, PETSc.KSP.ConvergedReason
         rtol = max(0.5 * goal / (system.size_of(b) or 1.0), TIGHT)

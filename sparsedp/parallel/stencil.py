@@ -7,8 +7,11 @@ each colour gives the entries. Before a derivative is taken, and where a Newton 
 compared with a product along a random direction (solvers/jacobian.py): what it lacks is looked for again, or refused.
 """
 
+from __future__ import annotations
+
 from itertools import permutations
 from itertools import product as combinations
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +36,7 @@ __all__ = ["Stencil", "stencil_of"]
 COLOURS = 8  # times the entries of the fullest row: more are no stencil's
 
 
-def stencil_of(name, space, products, lacking=None):
+def stencil_of(name: str, space: Any, products: Any, lacking: Any = None) -> Any:
     """Return the Stencil of a Jacobian from products with it at several points; `lacking`: a Stencil to extend.
 
     Raises
@@ -98,7 +101,7 @@ class Stencil(ColouredPattern):
         Of colours.
     """
 
-    def __init__(self, space, steps, vector, count):
+    def __init__(self, space: Any, steps: Any, vector: Any, count: Any) -> None:
         self.space, self.steps, self.count, self.by_rows = space, steps, count, False
         own, (ends, _, around), found = _own(space), _sides(space), []
         for row, one, there in stencil_entries(steps, own[0], own[1:], ends, around):
@@ -110,7 +113,7 @@ class Stencil(ColouredPattern):
         colours[place], self.seeds = colour, vector @ own % count
         self._set_pattern(pattern_of(row, place, (len(own[0]), colours.size)), colours)
 
-    def operator(self, act, name):
+    def operator(self, act: Any, name: str) -> Any:
         """The matrix that acts as ``act(v)``, as an Operator."""
         space, own = self.space, Matrix(self.matrix(lambda v: act(DistributedField(v, self.space)).flat))
         shape, exchange = (self.seeds.size,) * 2, self.exchange

@@ -8,9 +8,12 @@ order follow. A step is one node of the tape, which sees fields on ranks alone, 
 ends at another one the widened grid has a wall that is not there; what that changes C leaves out.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
 from functools import cache, partial
 from math import floor, isfinite, prod
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import distance_transform_cdt
@@ -35,13 +38,13 @@ ROUNDING = 1e-9  # relative, of a displacement: what it may be off the one that 
 class Carry:
     """``move(u, v, dt, inflow)`` on fields that lie on ranks, or that all of them know; made by `Layout`."""
 
-    def __init__(self, setting):
+    def __init__(self, setting: Any) -> None:
         self.setting, self.layout, self.walls = setting, setting.grid.backend, wall_space(setting)
         self.speed, self.block, self.depth = last(self._speed), cache(partial(Block, setting)), 0
         if setting.solid is not None and setting.of == "cells":
             self.depth = int(np.max(distance_transform_cdt(setting.solid, "taxicab"), initial=0))
 
-    def __call__(self, u, v, dt, inflow):
+    def __call__(self, u: Any, v: Any, dt: Any, inflow: Any) -> Any:
         setting, given, name = self.setting, tuple(map(plain, (u, v, dt, inflow))), f"transport {self.setting.scheme}"
         inflows = self.walls.shape if np.shape(given[3]) else ()
         check_step(name, given[2])
@@ -87,7 +90,7 @@ class Carry:
             check_stability(setting, dt, wide.crop[0].forward(rate), method.scheme.max_courant)
 
 
-def velocity_space(setting, shape):
+def velocity_space(setting: Any, shape: tuple) -> Any:
     """Where a velocity of this shape lives."""
     grid = setting.grid
     return grid.faces if setting.velocity == "faces" else Space(shape, "cells", grid, (grid.shape,) * grid.dim)
@@ -96,7 +99,7 @@ def velocity_space(setting, shape):
 class Block:
     """The step on blocks that are widened by some cells, for velocities and inflow values of given shapes."""
 
-    def __init__(self, setting, width, shape, inflows, unstable):
+    def __init__(self, setting: Any, width: Any, shape: tuple, inflows: Any, unstable: Any) -> None:
         grid, layout = setting.grid, setting.grid.backend
         spans, sides = [], []
         for (a, b), n, pair in zip(layout.box(grid.shape), grid.shape, setting.sides, strict=True):
@@ -148,7 +151,7 @@ def _inflow(setting, move, spans):
 # ---- between fields and what a rank works on ----
 
 
-def widened(space, boxes, shape, places=None):
+def widened(space: Any, boxes: Any, shape: tuple, places: Any = None) -> Any:
     """The rules from the blocks of a field to boxes around them, at some places of an array of this shape; an Exchange.
 
     Those that lead there and back.
@@ -171,7 +174,7 @@ def widened(space, boxes, shape, places=None):
     return linear("widened", last(wide), back), exchange
 
 
-def last(act):
+def last(act: Any) -> Any:
     """Return a function of a field that reuses its last result: many steps have the same velocity."""
     held = [None, None]
 
@@ -183,7 +186,7 @@ def last(act):
     return known
 
 
-def on_blocks(agreement, local, ins, crop):
+def on_blocks(agreement: Any, local: Any, ins: Any, crop: Any) -> Any:
     """Return the Rule of fields on ranks, from the Rule on blocks; its derivatives consist of rules, to any order.
 
     Parameters
