@@ -279,6 +279,17 @@ def test_no_setters_and_no_caches_of_a_module():
     none(f"{m.place}:{d.lineno} @{word}" for m, d, word in words if word in ("setter", "cache", "lru_cache"))
 
 
+def test_no_settings_of_the_process_are_changed():
+    """Thresholds of the garbage collector and hooks of the interpreter belong to the program that uses the library."""
+    calls = "gc.set_threshold", "gc.disable", "gc.freeze", "sys.setrecursionlimit", "sys.settrace", "sys.setprofile"
+    none(
+        f"{m.place}:{node.lineno} changes {ast.unparse(node)}"
+        for m in modules()
+        for node in m.nodes(ast.Attribute)
+        if ast.unparse(node) in calls or (isinstance(node.ctx, ast.Store) and ast.unparse(node) == "sys.excepthook")
+    )
+
+
 def test_no_package_shows_a_function_with_the_name_of_its_module():
     """The function would be replaced by the module as soon as that is imported."""
     none(

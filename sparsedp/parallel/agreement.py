@@ -30,7 +30,7 @@ from sparsedp._utils.pytree import labels, leaves
 from sparsedp.autodiff.tape import plain
 from sparsedp.trajectory.specification import folded
 
-__all__ = ["Agreement", "course", "end_all"]
+__all__ = ["Agreement", "course", "end_all", "end_all_after_error"]
 
 ROOM = 24  # bytes beside the mark
 FAILED = (-1).to_bytes(8, "little", signed=True)
@@ -203,3 +203,10 @@ def end_all(kind: Any, error: Any, trace: Any) -> None:
     sys.stderr.write(f"rank {comm.rank} of {comm.size}: {told}")
     sys.stderr.flush()
     comm.Abort(1)
+
+
+def end_all_after_error() -> None:
+    """End all ranks at the exit of this one if an uncaught error ended it."""
+    error = getattr(sys, "last_value", None)
+    if error is not None:
+        end_all(type(error), error, error.__traceback__)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import sys
 from typing import Any
@@ -57,7 +58,7 @@ def distribute(grid: Grid, comm: Any = None) -> Grid:
 
         if comm is None and told == MPI.COMM_WORLD.size == 1:
             return grid
-        from sparsedp.parallel.agreement import end_all
+        from sparsedp.parallel.agreement import end_all_after_error
         from sparsedp.parallel.layout import laid
     except ImportError as error:
         raise ImportError(
@@ -69,8 +70,9 @@ def distribute(grid: Grid, comm: Any = None) -> Grid:
         raise RuntimeError(
             f"{told} processes were started, and mpi4py sees one: it belongs to another MPI; install it for this one"
         )
-    if MPI.COMM_WORLD.size > 1 and sys.excepthook is sys.__excepthook__:
-        sys.excepthook = end_all
+    if MPI.COMM_WORLD.size > 1:
+        atexit.unregister(end_all_after_error)  # of an earlier call
+        atexit.register(end_all_after_error)
     return laid(grid, MPI.COMM_WORLD if comm is None else comm)
 
 
