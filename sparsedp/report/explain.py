@@ -271,7 +271,7 @@ def _skipped_by_solver(calls: Calls, name: str, solver: Any) -> Iterator[str]:
     if not solver.engine.hierarchical:
         yield f"multigrid hierarchy for {name}: not built, {solver.engine.method} needs none"
     if not calls[name, "setup"]:
-        yield f"set-up of {name}: made before, {calls[name, 'reused']} solves reuse it"
+        yield f"set-up of {name}: built before, {calls[name, 'reused']} solves reuse it"
     if calls[name, "solve"] > 0 == calls[name, "adjoint"]:
         yield f"adjoint solve of {name}: nothing asks for it"
 

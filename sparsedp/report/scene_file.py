@@ -196,7 +196,7 @@ def claim_folder(folder: Path, names: Sequence[str], force: bool) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ValueError(f"{folder} cannot be made a folder: {error.strerror}; name another with --out") from error
+        raise ValueError(f"{folder} cannot be created: {error.strerror}; name another with --out") from error
     if not os.access(folder, os.W_OK | os.X_OK):
         raise ValueError(f"{folder} cannot be written to; name another with --out")
     for name in names:

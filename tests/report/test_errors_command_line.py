@@ -208,7 +208,7 @@ def test_refusals(scene, monkeypatch, capsys, target, sentence):
 
 def test_a_folder_that_cannot_be(scene, tmp_path, capsys):
     assert main(["report", str(scene), "--out", str(scene)]) == 2
-    assert "cannot be made a folder: File exists; name another with --out" in capsys.readouterr().err
+    assert "cannot be created: File exists; name another with --out" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere")
@@ -404,13 +404,19 @@ LONG = "a" * 5000
         (["check", f"scene.py:{LONG}"], r"scene.py has no function 'a+\.\.\. write scene.py:NAME of the function to e"),
         (["check", f"scene.py:loss:{LONG}"], r"scene.py has no 'a+\.\.\. the point; write scene.py:loss:NAME"),
         (["report", f"{LONG}/{LONG}.py"], r"there is no file a+\.\.\. name one that is there"),
-        (["report", "scene.py", "--out", LONG], r"a+\.\.\. cannot be made a folder: File name too long; name another "),
+        (
+            ["report", "scene.py", "--out", LONG],
+            r"a+\.\.\. cannot be created: File name too long; name another ",
+        ),
         pytest.param(
             ["report", f"scene.py:{'b' * 255}"],
             r".*b+\.\.\. cannot be written: File name too long; shorten the name, most file systems take up to 255 b",
             marks=pytest.mark.whole,
         ),
-        (["demo", "--out", LONG], r"a+\.\.\. cannot be made a folder: File name too long; name another with --out"),
+        (
+            ["demo", "--out", LONG],
+            r"a+\.\.\. cannot be created: File name too long; name another with --out",
+        ),
         (["demo", "--input", f"{LONG}.npy"], r"a+\.\.\. is not there or is no plain file; give the path of a .npy, "),
         (["demo", "--size", LONG], r"argument --size: invalid int value: 'a+\.\.\. see python -m sparsedp demo --help"),
         ([LONG], r"argument command: invalid choice: 'a+\.\.\. \(choose from .*; see python -m sparsedp --help"),

@@ -220,9 +220,9 @@ def test_refused_sizes_and_grounds():
 
 def test_folder_that_cannot_be(tmp_path):
     (tmp_path / "file").write_text("here first")
-    with pytest.raises(ValueError, match=r"file cannot be made a folder: File exists; name another with --out"):
+    with pytest.raises(ValueError, match=r"file cannot be created: File exists; name another with --out"):
         claim_folder(tmp_path / "file", [], False)
-    with pytest.raises(ValueError, match=r"file/out cannot be made a folder: Not a directory; name another with --out"):
+    with pytest.raises(ValueError, match=r"file/out cannot be created: Not a directory; name another with --out"):
         claim_folder(tmp_path / "file" / "out", [], False)
 
 

@@ -199,7 +199,7 @@ def test_no_matrix_for_constant_coefficients_on_a_box():
     solve = dp.inverse(-L.matrix_free(), "separable")
     plan = dp.explain(lambda b: anp.sum(solve(b) ** 2), U)
     assert plan.totals["matrices assembled"] == 0 and plan.totals["hierarchies built"] == 0
-    assert skipped(plan, "set-up of inverse(-laplacian): made before, 2 solves reuse it")
+    assert skipped(plan, "set-up of inverse(-laplacian): built before, 2 solves reuse it")
     assert plan.counts["inverse(-laplacian)", "reused"] == 2
     free = dp.explain(lambda u: anp.sum(L.matrix_free()(u) ** 2), U)
     assert free.totals["matrices assembled"] == 0 and skipped(free, "matrix of laplacian: not assembled")
