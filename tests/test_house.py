@@ -342,7 +342,6 @@ NOT_ANNOTATED = {
     "autodiff",
     "flow",
     "grid",
-    "interop",
     "io",
     "kernels",
     "network",

@@ -12,6 +12,7 @@ from zlib import crc32
 
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import NDArray
 
 from sparsedp._utils.calls import public
 from sparsedp._utils.counters import count
@@ -26,7 +27,8 @@ from sparsedp.solvers.sparsity import ColouredPattern, dense_pattern, find_patte
 
 __all__ = ["Adopted", "from_blackbox"]
 
-STEP, DIFFERENCES = "complex step", "central differences"
+STEP = "complex step"
+DIFFERENCES = "central differences"
 WAYS = {"auto": "", "complex": STEP, "difference": DIFFERENCES}
 COMPLEX = 1e-30  # step of the complex step: no difference is taken, so nothing cancels
 CENTRAL = EPS ** (1 / 3)  # step of central differences, relative to x
@@ -116,9 +118,15 @@ class Adopted(Reconstructible):
     _shapes: Any
     _coloured: Any
 
-    def __init__(self, f: Any, sparsity: Any, derivative: Any, name: str, jacobian: Any = (None, "", None)) -> None:
-        self._f, self._derivative, self.name = f, derivative, name
-        self._sparsity = None if sparsity is None else pattern_like(sparsity)
+    def __init__(
+        self, f: Callable, sparsity: Any, derivative: str, name: str, jacobian: tuple = (None, "", None)
+    ) -> None:
+        self._f = f
+        self._derivative = derivative
+        self.name = name
+        self._sparsity = sparsity
+        if sparsity is not None:
+            self._sparsity = pattern_like(sparsity)
         self._shapes, self.way, self._coloured = jacobian
         self.way = self.way or WAYS[derivative]
         self.runs = 0
@@ -126,8 +134,8 @@ class Adopted(Reconstructible):
         self._rule = Rule(
             name,
             self._run,
-            lambda nums, y, x: lambda g: (self._operator(x, y).T(g),),
-            lambda nums, tangents, y, x: self._operator(x, y)(tangents[0]),
+            self._vjp,
+            self._jvp,
         )
 
     def recipe(self) -> tuple:
@@ -138,22 +146,25 @@ class Adopted(Reconstructible):
 
     @public("dp.from_blackbox(f)")
     def __call__(self, x: Any) -> Any:
+        """Return the result of the function; it can be differentiated."""
         return self._rule(x)
 
     def __str__(self):
         if self._coloured is None:
             return f"{self.name}: no derivative asked for yet, {self.runs} runs"
-        each = self._coloured.count * (1 if self.way == STEP else 2)
+        runs = self._coloured.count
+        if self.way != STEP:
+            runs *= 2  # a central difference takes two
         rows, columns = self._coloured.pattern.shape
         return (
-            f"{self.name}: Jacobian {rows} x {columns} with {self._coloured.pattern.nnz} entries from {each} runs "
+            f"{self.name}: Jacobian {rows} x {columns} with {self._coloured.pattern.nnz} entries from {runs} runs "
             f"instead of {columns}, by {self.way}; {self.runs} runs so far"
         )
 
     __repr__ = __str__
 
     def _run(self, x):
-        """One run on plain values; a copy, for foreign code may return the array that it will write into next."""
+        """Run the function on plain values and return a copy: it may write into the returned array at the next run."""
         check_precision(f"the argument of {self.name}", x)
         count(f"{self.name}.run", "forward")
         with self._alone:
@@ -162,17 +173,31 @@ class Adopted(Reconstructible):
         if y.dtype.kind not in "biuf" and np.asarray(x).dtype.kind != "c":
             raise TypeError(f"{self.name} must return real numbers, got dtype {y.dtype}; take the real part")
         check_precision(f"the result of {self.name}", y)
-        return y.astype(float) if y.dtype.kind in "biu" else y
+        if y.dtype.kind in "biu":
+            return y.astype(float)
+        return y
+
+    def _vjp(self, nums, y, x):
+        def pull(g):
+            return (self._operator(x, y).T(g),)
+
+        return pull
+
+    def _jvp(self, nums, tangents, y, x):
+        return self._operator(x, y)(tangents[0])
 
     def _operator(self, x, y):
-        """The Jacobian as an Operator, at the argument of a run with the result y."""
+        """Return the Jacobian as an Operator, at the argument of a run with the result y."""
         if isbox(x):
             raise DerivativeError(
                 f"{self.name} is adopted: its Jacobian is known, its second derivative is not; use a method with "
                 "first derivatives, or write the function with autograd.numpy"
             )
-        matrix, again = self._at(x)
-        if not np.array_equal(again, plain(y) if x.dtype == float else self._run(x.astype(float))):
+        matrix, result = self._at(x)
+        first_result = plain(y)
+        if x.dtype != float:  # the Jacobian is computed in float64
+            first_result = self._run(x.astype(float))
+        if not np.array_equal(result, first_result):
             raise DerivativeError(
                 f"{self.name} gives another result for the same argument than before; it must depend on its argument "
                 "only, so what changes from call to call must be a part of it"
@@ -194,12 +219,13 @@ class Adopted(Reconstructible):
         return self._at(plain(x))[0]
 
     def _at(self, x):
-        """The Jacobian at a point, and the result there."""
+        """Return the Jacobian at a point and the result there, cached for the last two points."""
         x = np.asarray(x, dtype=float)
         with self._alone:
-            return self._points.find((x,)) or self._points.put((x,), self._made(x))
+            return self._points.find((x,)) or self._points.put((x,), self._computed(x))
 
-    def _made(self, x):
+    def _computed(self, x):
+        """Compute the Jacobian at a point and the result there."""
         check_finite(f"the argument of {self.name}", x)
         y = self._run(x)
         check_finite(f"{self.name} near x", y, "must be finite to be differentiated")
@@ -221,15 +247,19 @@ class Adopted(Reconstructible):
         )
 
     def _flat(self, x):
-        """A run from flat numbers to flat numbers."""
+        """Run the function on a flat argument and return the flat result."""
         return self._run(x.reshape(self._shapes[0])).reshape(-1)
 
     # ------------------------------------------------------------ the pattern
 
     def _patterns(self, x, y):
-        """Patterns to be tried at x, coloured, the cheapest first; each has the entries known from earlier points."""
-        rows, columns, earlier = y.size, x.size, self._sparsity
-        shapes = [self._shapes[0]] if self._shapes[0] == self._shapes[1] else None
+        """Yield coloured patterns to try at x, the cheapest first; each includes the entries of earlier points."""
+        rows = y.size
+        columns = x.size
+        earlier = self._sparsity
+        shapes = None  # of the grid, if x and y are fields on the same one
+        if self._shapes[0] == self._shapes[1]:
+            shapes = [self._shapes[0]]
         if self._coloured is not None:
             yield self._coloured
             earlier = self._coloured.pattern
@@ -241,19 +271,28 @@ class Adopted(Reconstructible):
         if self._sparsity is not None:
             return
         step = self._steps(x)
-        products = [  # exactly 0 in a row that does not depend on the columns; far moves see the other side of branches
-            lambda v: self._flat(x + step * v) - y,
-            lambda v: change(self._flat, x, y, v),
-        ]
+
+        def near(v):
+            return self._flat(x + step * v) - y
+
+        def far(v):
+            return change(self._flat, x, y, v)
 
         def coloured(pattern):
-            return ColouredPattern(pattern if earlier is None else pattern_like(pattern + earlier), shapes)
+            if earlier is not None:
+                pattern = pattern_like(pattern + earlier)
+            return ColouredPattern(pattern, shapes)
 
-        guess = None if shapes is None else stencil_pattern(products, shapes)
-        if guess is not None:
-            yield coloured(guess)
-        sparse = find_pattern(products, rows, columns)
-        yield coloured(dense_pattern(rows, columns) if sparse is None else sparse)
+        # Both changes are exactly 0 in a row that does not depend on the moved columns; far moves cross branches.
+        changes = [near, far]
+        if shapes is not None:
+            guess = stencil_pattern(changes, shapes)
+            if guess is not None:
+                yield coloured(guess)
+        pattern = find_pattern(changes, rows, columns)
+        if pattern is None:
+            pattern = dense_pattern(rows, columns)
+        yield coloured(pattern)
 
     # ------------------------------------------------------------ one Jacobian
 
@@ -261,71 +300,96 @@ class Adopted(Reconstructible):
         return CENTRAL * np.maximum(np.abs(x), typical(x))
 
     def _product(self, x, way):
+        """Return the product of the Jacobian at x with a vector, as a function of the vector."""
+
+        def complex_step(v):
+            return self._flat(x + 1j * COMPLEX * v).imag / COMPLEX
+
+        def central_difference(v):
+            return (self._flat(x + v) - self._flat(x - v)) / 2
+
         if way == STEP:
-            return lambda v: self._flat(x + 1j * COMPLEX * v).imag / COMPLEX
-        return lambda v: (self._flat(x + v) - self._flat(x - v)) / 2
+            return complex_step
+        return central_difference
 
     def _by_colours(self, coloured, x, way, share):
-        steps = np.ones_like(x) if way == STEP else share * self._steps(x)
-        along = self._product(x, way)
-        matrix = coloured.matrix(lambda v: along(steps * v))
+        """Compute the Jacobian on a pattern by one product for each colour."""
+        steps = np.ones_like(x)
+        if way != STEP:
+            steps = share * self._steps(x)
+        product_along = self._product(x, way)
+
+        def scaled_product(v):
+            return product_along(steps * v)
+
+        matrix = coloured.matrix(scaled_product)
         matrix.data /= steps[matrix.indices]
         check_finite(f"what differences of {self.name} close to x give", matrix.data, advice="; move x a little")
         return matrix
 
     def _probed(self, coloured, x):
-        """The Jacobian on a pattern, and the rows in which it misses what probes see.
+        """Return the Jacobian on a pattern, and the rows in which it disagrees with the probes.
 
-        Rows that the complex step does not get right are taken by central differences, then by shorter ones: next to a
-        kink these see one side of it, and at a kink the mean of both. What no short probe agrees with, as in code with
-        noise, may agree with a longer one. What all rows agree with at the first point is the way at later ones.
+        Rows in which the complex step fails are computed by central differences, then by shorter ones: next to a kink
+        these stay on one side of it, and at a kink they give the mean of both. Rows that no short probe agrees with, as
+        in code with noise, may agree with a longer one. The method that all rows agree with at the first point is used
+        at later ones.
         """
-        ways = [(STEP, 1.0)] if self.way != DIFFERENCES else []
-        ways += [(DIFFERENCES, share) for share in SHARES] if self._derivative != "complex" else []
-        made: dict = {}
-        matrix, wrong, judged = coloured.pattern, np.ones(coloured.pattern.shape[0], dtype=bool), False
+        ways = []
+        if self.way != DIFFERENCES:
+            ways.append((STEP, 1.0))
+        if self._derivative != "complex":
+            ways.extend((DIFFERENCES, share) for share in SHARES)
+        jacobians: dict = {}
+        matrix = coloured.pattern
+        wrong = np.ones(coloured.pattern.shape[0], dtype=bool)
+        probed = False
         for share, way in product(reversed(SHARES), ways):
             try:
                 with _strict():
-                    made[way] = made[way] if way in made else self._by_colours(coloured, x, *way)
-                    matrix = _with_rows(matrix, made[way], wrong)
+                    if way not in jacobians:
+                        jacobians[way] = self._by_colours(coloured, x, *way)
+                    matrix = _with_rows(matrix, jacobians[way], wrong)
                     wrong &= self._misses(matrix, x, way[0], share)
             except MemoryError:
                 raise
-            except Exception as error:  # the code takes no complex numbers here, or nothing so far from x
+            except Exception as error:  # the code takes no complex numbers, or no point this far from x
                 trouble = error
                 continue
-            judged = True
+            probed = True
             if not wrong.any():
                 self.way = self.way or way[0]
                 break
-        if not judged:
+        if not probed:
             raise trouble
         return matrix, wrong
 
     def _misses(self, matrix, x, way, share):
-        """Rows in which a Jacobian misses what its own way and a difference see along a direction of this point."""
-        v = share * self._steps(x) * np.random.default_rng(crc32(x.tobytes())).standard_normal(x.shape)
-        return np.any([_lacks(matrix, v, self._product(x, one), one) for one in {way, DIFFERENCES}], axis=0)
+        """Return the rows in which a Jacobian disagrees with its own method or with a difference along a direction."""
+        generator = np.random.default_rng(crc32(x.tobytes()))  # one direction for each point
+        v = share * self._steps(x) * generator.standard_normal(x.shape)
+        wrong = [_lacks(matrix, v, self._product(x, method), method) for method in {way, DIFFERENCES}]
+        return np.any(wrong, axis=0)
 
 
 @contextmanager
 def _strict():
-    """What is cast to real has lost the derivative."""
+    """Raise an error if a complex number is cast to real, which loses the derivative; ignore NumPy's warnings."""
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("error", np.exceptions.ComplexWarning)
         yield
 
 
 def _with_rows(matrix, other, rows):
-    """A matrix with these rows from another one on the same pattern."""
+    """Return a matrix with some rows from another one on the same pattern."""
     entries = np.repeat(rows, np.diff(matrix.indptr))
     return sp.csr_array((np.where(entries, other.data, matrix.data), matrix.indices, matrix.indptr), matrix.shape)
 
 
 def _lacks(matrix, v, along, way):
-    """Rows in which a matrix lacks something of the product along v."""
-    lacks, size = along(v) - matrix @ v, abs(matrix) @ np.abs(v)
+    """Return the rows in which the product of a matrix with v differs too much from the product along v."""
+    lacks = along(v) - matrix @ v
+    size = abs(matrix) @ np.abs(v)
     share, floor = MOST[way]
     wrong = ~(np.abs(lacks) <= share * size + floor * np.max(size, initial=0.0))
     doubtful = ~wrong & (np.abs(lacks) > GROWS * size)
@@ -337,8 +401,12 @@ def _lacks(matrix, v, along, way):
     return wrong
 
 
-def change(run: Any, x: Any, y: Any, v: Any) -> Any:
-    """How much run(x), which is y, changes when x moves along v by a tenth of its size; less where that is refused."""
+def change(run: Callable, x: NDArray, y: NDArray, v: NDArray) -> NDArray:
+    """Return the change of ``y = run(x)`` when x moves along v.
+
+    The move is a tenth of the size of x; shorter moves are tried if the function raises an error or returns NaN or
+    infinity. The change is 0 if it does so for all of them.
+    """
     for share in SMALLER:
         with suppress(*REFUSED):
             moved = run(x + 0.1 * share * typical(x) * v)
@@ -347,6 +415,6 @@ def change(run: Any, x: Any, y: Any, v: Any) -> Any:
     return np.zeros_like(y)
 
 
-def typical(x: Any) -> Any:
-    """Root mean square of an array, 1 where that is 0 or the array is empty."""
+def typical(x: NDArray) -> float:
+    """Return the root mean square of an array, or 1 if that is 0 or the array is empty."""
     return norm(x) / np.sqrt(max(x.size, 1)) or 1.0

@@ -1,8 +1,11 @@
-"""JAX: a function of arrays as one of JAX, and the other way. The only file that imports jax (extra `jax`)."""
+"""Bridge to JAX: functions of arrays as functions of JAX arrays, and the reverse.
+
+This is the only module that imports jax (extra `jax`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import nullcontext
 from functools import partial
 from itertools import compress
@@ -53,11 +56,11 @@ def to_jax(f: Callable, like: Any = None) -> Callable:
 
     Notes
     -----
-    JAX calls back: f runs in Python, on the CPU, and must give the same for the same arguments. What it raises is
-    raised as it is, and by jit inside an error of JAX. vmap runs f for one entry of a batch after the other. Only what
-    JAX asks for is differentiated, in reverse mode to every order. There is no forward mode, as in ``jax.hessian``,
-    ``jacfwd`` and ``jvp``: the Hessian is ``jax.jacrev(jax.grad(f))``. JAX cannot keep what f recorded, so the backward
-    pass runs f once more.
+    JAX calls back into Python: f runs on the CPU and must return the same result for the same arguments. An exception
+    of f is raised unchanged, under jit inside an error of JAX. vmap runs f for one entry of a batch after the other.
+    Only the arguments whose derivatives JAX asks for are differentiated, in reverse mode to every order. There is no
+    forward mode, as in ``jax.hessian``, ``jacfwd`` and ``jvp``: the Hessian is ``jax.jacrev(jax.grad(f))``. JAX cannot
+    keep the tape of f, so the backward pass runs f a second time.
 
     Examples
     --------
@@ -67,24 +70,25 @@ def to_jax(f: Callable, like: Any = None) -> Callable:
     Array([-16.,  -2.,  -4.,  22.], dtype=float32)
     """
     check_function("to_jax", f, "dp.interop.to_jax(dp.laplacian(grid))")
-    nodes: dict = {}  # by structure, shapes and dtypes of the arguments: those of the result may depend on all of them
+    nodes: dict = {}  # by structure, shapes and dtypes of the arguments: the form of the result may depend on all
 
     def call(*args):
         entries, structure = jax.tree.flatten(args)
         arrays = [*map(jnp.asarray, entries)]
         key = structure, tuple((array.shape, array.dtype) for array in arrays)
         if key not in nodes:
-            nodes[key] = _called(f, structure, like)
+            nodes[key] = _node_of(f, structure, like)
         node, result = nodes[key]
-        entries = node.applied(*arrays)  # the first call finds the structure
+        entries = node.applied(*arrays)  # the first call sets the structure of the result
         return jax.tree.unflatten(result.structure, entries)
 
     return ReconstructibleFunction(call, to_jax, f, like)
 
 
-def _called(f, structure, like):
+def _node_of(f, structure, like):
     """Return the node of f for arguments of one structure, and the form of its result."""
-    result, known = _Result("result of to_jax", like), {}  # type: _Result, dict
+    result = _Result("result of to_jax", like)
+    forms_by_arguments: dict = {}
 
     def fun(arrays):
         for array in arrays:
@@ -96,26 +100,31 @@ def _called(f, structure, like):
 
     def forms(values):
         key = tuple((value.shape, value.dtype) for value in values)
-        if like is None and key not in known:
+        if like is not None:
+            return jax.tree.leaves(like)
+        if key not in forms_by_arguments:
             try:
-                known[key] = [*map(np.zeros_like, fun([np.ones(*form)[()] for form in key]))]
+                results = fun([np.ones(shape, dtype)[()] for shape, dtype in key])
             except Exception as error:
                 raise TypeError(
                     "to_jax learns the shape of a result by one run with ones, which this function does not take "
                     f"({error}); give like, arrays of the shapes of the result"
                 ) from error
-        return known.get(key) or jax.tree.leaves(like)
+            forms_by_arguments[key] = [*map(np.zeros_like, results)]
+        return forms_by_arguments[key]
 
     return _Node(fun, forms), result
 
 
 class _Result:
-    """The form of a result of a function: that of `like`, or of its first run. Other runs are brought into its order.
+    """The structure of the result of a function: that of `like`, or of its first run.
+
+    Results of other runs are reordered to it.
 
     Parameters
     ----------
     name : str
-        Root of the paths in messages.
+        Name of the result in messages.
     like : pytree of arrays, optional
 
     Attributes
@@ -126,15 +135,17 @@ class _Result:
     structure: Any = None
 
     def __init__(self, name, like=None):
-        self._name, self._shapes = name, None
+        self._name = name
+        self._shapes = None
         if like is not None:
             self._shapes = [np.shape(leaf) for leaf in self.leaves(like)]
 
     def leaves(self, tree):
-        """The leaves of a result, paired by their paths: keys of dicts, fields of named tuples."""
+        """Return the leaves of a result, paired by their paths: keys of dicts, fields of named tuples."""
         rows, structure = jax.tree_util.tree_flatten_with_path(tree)
         if self.structure is None:
-            self.structure, self._paths = structure, [path for path, _ in rows]
+            self.structure = structure
+            self._paths = [path for path, _ in rows]
         entries = [leaf for _, leaf in rows]
         if structure != self.structure:
             entries = self._paired(dict(rows))
@@ -144,12 +155,18 @@ class _Result:
                 raise ShapeError(f"{place}: expected shape {shape}, as like has it, got {np.shape(leaf)}")
         return entries
 
-    def _paired(self, found):
-        """The leaves of a dict {path: leaf} in the order of the form."""
-        if found.keys() != set(self._paths):
-            expected, got = (", ".join(map(jax.tree_util.keystr, paths)) or "none" for paths in (self._paths, found))
+    def _paired(self, leaf_of_path):
+        """Return the leaves of a dict {path: leaf} in the order of the structure."""
+        if leaf_of_path.keys() != set(self._paths):
+            expected = _joined(self._paths)
+            got = _joined(leaf_of_path)
             raise ShapeError(f"{self._name}: expected the entries {expected}, got {got}; return the same each time")
-        return [found[path] for path in self._paths]
+        return [leaf_of_path[path] for path in self._paths]
+
+
+def _joined(paths):
+    """Return paths in a pytree as text."""
+    return ", ".join(map(jax.tree_util.keystr, paths)) or "none"
 
 
 class _Node:
@@ -158,18 +175,20 @@ class _Node:
     Parameters
     ----------
     fun : callable
-        ``fun(list of arrays) -> list of arrays``.
+        Takes and returns a list of arrays.
     forms : callable
-        JAX arrays -> things of the shapes and dtypes of the results.
+        Takes a list of JAX arrays and returns arrays of the shapes and dtypes of the results.
     """
 
     def __init__(self, fun, forms):
-        self.fun, self.forms, self._pulls = fun, forms, {}  # type: Any, Any, dict
+        self.fun = fun
+        self.forms = forms
+        self._pulls: dict = {}
         self.call = jax.custom_vjp(self._run)
         self.call.defvjp(self._forward, self._backward, symbolic_zeros=True)
 
     def applied(self, *values):
-        """Call the function of JAX; say what to write where JAX refuses forward mode."""
+        """Call the JAX function; explain the error that JAX raises in forward mode."""
         try:
             return self.call(*values)
         except TypeError as error:
@@ -182,39 +201,45 @@ class _Node:
             ) from error
 
     def _run(self, *values):
-        """At once, or by a call back when JAX runs what it traces."""
+        """Run the function directly, or register a callback if JAX traces the arguments."""
         if not any(isinstance(value, jax.core.Tracer) for value in values):
             return [*map(jnp.array, self.fun([np.asarray(value)[()] for value in values]))]
-        forms = jax.eval_shape(lambda *results: [*results], *self.forms(values))  # in the dtypes that JAX allows now
+        forms = jax.eval_shape(lambda *results: [*results], *self.forms(values))  # as JAX converts dtypes
         host = _Host(self.fun, tuple(form.dtype for form in forms))
         return jax.pure_callback(host, forms, *values, vmap_method="sequential")
 
     def _forward(self, *primals):
-        values, marks = [primal.value for primal in primals], [() if primal.perturbed else None for primal in primals]
+        values = [primal.value for primal in primals]
+        marks = [() if primal.perturbed else None for primal in primals]
         return [*self.applied(*values)], (values, marks)
 
     def _backward(self, kept, cotangents):
         values, marks = kept
-        given = [not (isinstance(g, SymbolicZero) or g.dtype == jax.dtypes.float0) for g in cotangents]
-        key = tuple(mark is not None for mark in marks), tuple(given)
-        if key not in self._pulls:
-            self._pulls[key] = self._pull(*key)
-        slopes = iter(self._pulls[key].applied(*values, *compress(cotangents, given)))
-        return tuple(next(slopes) if moves else None for moves in key[0])
+        moving = tuple(mark is not None for mark in marks)
+        nonzero = tuple(not (isinstance(g, SymbolicZero) or g.dtype == jax.dtypes.float0) for g in cotangents)
+        if (moving, nonzero) not in self._pulls:
+            self._pulls[moving, nonzero] = self._pull(moving, nonzero)
+        slopes = self._pulls[moving, nonzero].applied(*values, *compress(cotangents, nonzero))
+        variables = compress(range(len(moving)), moving)
+        return tuple(placed([None] * len(moving), variables, slopes))
 
-    def _pull(self, moving, given):
-        """Return the node from arguments and cotangents of some results to the gradients of the variable arguments."""
-        count, places = len(moving), [*compress(range(len(given)), given)]
+    def _pull(self, moving, nonzero):
+        """Return the node from arguments and nonzero cotangents to the gradients of the variable arguments."""
+        count = len(moving)
+        places = [*compress(range(len(nonzero)), nonzero)]
 
         def slopes(arrays):
             gradients = recorded(self.fun, arrays[:count], moving)[2]
-            return gradients(placed([None] * len(given), places, arrays[count:]))
+            return gradients(placed([None] * len(nonzero), places, arrays[count:]))
 
-        return _Node(slopes, lambda values: compress(values, moving))
+        def forms(values) -> Iterable:
+            return compress(values, moving)
+
+        return _Node(slopes, forms)
 
 
 class _Host(NamedTuple):
-    """What JAX calls back: equal ones are compiled once."""
+    """The callback of JAX; JAX compiles equal callbacks once."""
 
     fun: Any
     dtypes: tuple
@@ -238,7 +263,7 @@ def from_jax(function: Callable) -> Callable:
     Returns
     -------
     callable
-        Takes and gives NumPy arrays. Arguments of float64 are computed in float64, whatever ``jax_enable_x64`` says.
+        Takes and returns NumPy arrays. Arguments of float64 are computed in float64, whatever ``jax_enable_x64`` says.
 
     Raises
     ------
@@ -247,8 +272,9 @@ def from_jax(function: Callable) -> Callable:
 
     Notes
     -----
-    Compiled by JAX at the first call with each set of shapes. VJP by ``jax.vjp``, which runs the function again, JVP
-    by ``jax.jvp``, to every order; only what is traced is differentiated.
+    JAX compiles the function at the first call with each set of shapes. The VJP is ``jax.vjp``, which runs the function
+    again, and the JVP is ``jax.jvp``; derivatives of every order are supported. Only traced arguments are
+    differentiated.
 
     Examples
     --------
@@ -280,15 +306,18 @@ def from_jax(function: Callable) -> Callable:
 
 
 class _Traced:
-    """Return a JAX function that returns a list as a rule of the tape; its derivatives are JAX functions, too."""
+    """A JAX function that returns a list, as a rule of the tape; its derivatives are JAX functions, too."""
 
     def __init__(self, function):
-        self.function, self._compiled, self._derivatives = function, jax.jit(function), {}  # type: Any, Any, dict
+        self.function = function
+        self._compiled: Any = jax.jit(function)
+        self._derivatives: dict = {}
         self.rule = Rule("jax function", self._run, self._vjp, self._jvp)
 
     def _run(self, *entries):
         wide = any(np.asarray(entry).dtype in (np.float64, np.complex128) for entry in entries)
-        with jax.enable_x64(True) if wide else nullcontext():
+        precision = jax.enable_x64(True) if wide else nullcontext()
+        with precision:
             return tuple(map(owned, self._compiled(*entries)))
 
     def _vjp(self, nums, ans, *entries):
@@ -302,7 +331,7 @@ class _Traced:
         return self._derivative(_pushed, nums, ans, entries)[0](*entries, *tangents)
 
     def _derivative(self, make, nums, ans, entries):
-        """The rule of a derivative, and the places of the results that have one."""
+        """Return the rule of a derivative, and the places of the results that have one."""
         used = tuple(k for k, y in enumerate(plain(ans)) if dtype_of(y).kind in "fc")
         key = make, nums, used, len(entries)
         if key not in self._derivatives:
@@ -325,10 +354,14 @@ def _pushed(function, nums, used, count, *values):
     """Return the tangents of the results (0 if not `used`), from the arguments and the tangents of those in `nums`."""
     moving = [values[num] for num in nums]
     tangents = _alike(values[count:], moving)
-    results, slopes = jax.jvp(lambda *xs: function(*placed(values[:count], nums, xs)), moving, tangents)
+
+    def of_moving(*moving):
+        return function(*placed(values[:count], nums, moving))
+
+    results, slopes = jax.jvp(of_moving, moving, tangents)
     return placed(map(jnp.zeros_like, results), used, [slopes[k] for k in used])
 
 
 def _alike(slopes, values):
-    """Derivatives of the dtypes of values, as JAX wants them."""
+    """Return derivatives converted to the dtypes of the values, as JAX requires."""
     return [jnp.asarray(slope, jnp.result_type(x)) for slope, x in zip(slopes, values, strict=True)]

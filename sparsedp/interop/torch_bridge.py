@@ -1,12 +1,15 @@
-"""PyTorch: a function of arrays as one of tensors, and the other way. The only file that imports torch (extra `torch`).
+"""Bridge to PyTorch: functions of arrays as functions of tensors, and the reverse.
 
-Torch's gradient in a complex number is dL/dRe + i dL/dIm, the cotangent of our tape dL/dRe - i dL/dIm: each is turned
-into the other where it crosses.
+This is the only module that imports torch (extra `torch`).
+
+For a complex number, the gradient of torch is dL/dRe + i dL/dIm and the cotangent of our tape is dL/dRe - i dL/dIm;
+each is the complex conjugate of the other and is converted where it passes from one library to the other.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import autograd.numpy as anp
 import numpy as np
@@ -54,9 +57,10 @@ def to_torch(f: Callable) -> Callable:
     Notes
     -----
     Tensors and arrays share their memory; a result is copied where f may know its memory. f runs once for a value and
-    its gradient, and once more for a gradient of the gradient (``create_graph=True``), which is right to every order:
-    f must give the same for the same arguments. Gradients in complex numbers are torch's, dL/dRe + i dL/dIm, see
-    "Complex numbers" in docs/ideas.md. ``torch.func`` and forward mode do not look through it, torch says so.
+    its gradient, and a second time for a gradient of the gradient (``create_graph=True``). Derivatives of every order
+    are supported; f must return the same result for the same arguments. Gradients in complex numbers are torch's,
+    dL/dRe + i dL/dIm, see "Complex numbers" in docs/ideas.md. ``torch.func`` and forward mode are not supported; torch
+    raises an error.
 
     Examples
     --------
@@ -68,23 +72,34 @@ def to_torch(f: Callable) -> Callable:
     tensor([-16.,  -2.,  -4.,  22.])
     """
     check_function("to_torch", f, "dp.interop.to_torch(dp.laplacian(grid))")
-    return ReconstructibleFunction(
-        lambda *args, **options: _bridged(lambda tree: f(*tree[0], **tree[1]), (args, options)), to_torch, f
-    )
+
+    def apply(tree):
+        args, options = tree
+        return f(*args, **options)
+
+    def call(*args, **options):
+        return _bridged(apply, (args, options))
+
+    return ReconstructibleFunction(call, to_torch, f)
 
 
 def _bridged(fun, tree):
     """Return the result of a function of a tree of arrays as a tree of tensors, for a tree with some tensors."""
-    given, rebuild = flatten(tree)
-    places = [place for place, leaf in enumerate(given) if isinstance(leaf, torch.Tensor)]
-    tensors = [given[place] for place in places]
-    beside = [*map(constant, placed(given, places, [None] * len(places)))]  # no tensor: it would keep its graph alive
+    entries, rebuild = flatten(tree)
+    places = [place for place, leaf in enumerate(entries) if isinstance(leaf, torch.Tensor)]
+    tensors = [entries[place] for place in places]
+    # The closure below holds no tensor: a tensor would keep its graph alive.
+    constants = [*map(constant, placed(entries, places, [None] * len(places)))]
     if not torch.is_grad_enabled():
         tensors = [tensor.detach() for tensor in tensors]
-    result: list = []
-    tensors = _Call.apply(lambda arrays: fun(rebuild(placed(beside, places, arrays))), result, *tensors)
-    entries, filled, build = result
-    return build(placed(entries, filled, tensors))
+
+    def of_arrays(arrays):
+        return fun(rebuild(placed(constants, places, arrays)))
+
+    result: list = []  # filled by `_Call.forward`, which can return tensors only
+    outputs = _Call.apply(of_arrays, result, *tensors)
+    values, output_places, rebuild_result = result
+    return rebuild_result(placed(values, output_places, outputs))
 
 
 class _Call(torch.autograd.Function):
@@ -92,47 +107,58 @@ class _Call(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, fun, result, *tensors):
-        arrays, moving = [*map(_array, tensors)], ctx.needs_input_grad[2:]
-        made: list = []
+        arrays = [*map(_array, tensors)]
+        moving = ctx.needs_input_grad[2:]
+        traced: list[bool] = []
 
-        def watched(arrays):
+        def with_marks(arrays):
             tree = fun(arrays)
-            made.extend(map(isbox, leaves(tree)))  # what is traced comes from this call; all else may be f's own
+            traced.extend(map(isbox, leaves(tree)))
             return tree
 
-        values, rebuild, gradients = recorded(watched, arrays, moving)
+        values, rebuild, gradients = recorded(with_marks, arrays, moving)
         check_leaves("result of to_torch", rebuild(values), containers=False)
         places = [place for place, value in enumerate(values) if is_variable(value) or isinstance(value, np.ndarray)]
-        outputs = _tensors([values[k] if made[k] else np.array(values[k]) for k in places], arrays)
+        results = []
+        for place in places:
+            value = values[place]
+            # A traced result was computed by this call; f may keep a reference to any other one.
+            results.append(value if traced[place] else np.array(value))
+        outputs = _tensors(results, arrays)
         result += values, places, rebuild
         form = rebuild(range(len(values)))  # a second run may return a dict in another order
 
-        def again(arrays):
+        def rerun(arrays):
             return paired(fun(arrays), form, "result of to_torch", advice=SAME)
 
-        ctx.kept = again, moving, gradients, places, len(values)
-        ctx.save_for_backward(*tensors, *outputs)  # torch refuses what has been changed in place since
+        ctx.kept = rerun, moving, gradients, places, len(values)
+        ctx.save_for_backward(*tensors, *outputs)  # torch raises an error if one is changed in place
         ctx.set_materialize_grads(False)
         return tuple(outputs)
 
     @staticmethod
     def backward(ctx, *cotangents):
-        fun, moving, gradients, places, many = ctx.kept
-        count = len(moving)
-        tensors = ctx.saved_tensors[:count]
+        fun, moving, gradients, places, result_count = ctx.kept
+        input_count = len(moving)
+        tensors = ctx.saved_tensors[:input_count]
         places = [place for place, g in zip(places, cotangents, strict=True) if g is not None]
-        given = [g for g in cotangents if g is not None]
+        seeds = [g for g in cotangents if g is not None]
 
-        def slopes(arrays, gradients=None):
-            gradients = gradients or recorded(fun, arrays[:count], moving)[2]
-            return [*map(_turned, gradients(placed([None] * many, places, map(_turned, arrays[count:]))))]
+        def input_gradients(gradients, arrays):
+            of_results = placed([None] * result_count, places, map(_conjugated, arrays))
+            return [*map(_conjugated, gradients(of_results))]
 
-        if torch.is_grad_enabled():  # a gradient of this gradient is wanted
-            found = iter(_bridged(slopes, [*tensors, *given]))
+        def differentiable(arrays):
+            gradients = recorded(fun, arrays[:input_count], moving)[2]
+            return input_gradients(gradients, arrays[input_count:])
+
+        if torch.is_grad_enabled():  # a gradient of this gradient may be asked for
+            slopes = _bridged(differentiable, [*tensors, *seeds])
         else:
-            arrays = [*map(_array, given)]
-            found = iter(_tensors(slopes([*tensors, *arrays], gradients), arrays))
-        return None, None, *(next(found) if moves else None for moves in moving)
+            arrays = [*map(_array, seeds)]
+            slopes = _tensors(input_gradients(gradients, arrays), arrays)
+        variables = [place for place, moves in enumerate(moving) if moves]
+        return None, None, *placed([None] * input_count, variables, slopes)
 
 
 def _array(tensor):
@@ -146,20 +172,23 @@ def _array(tensor):
 
 def _tensors(values, others):
     """Return arrays as tensors of the same memory; copied if it is read-only or shared with other arrays."""
-    found, seen = [], [*others]
+    tensors = []
+    seen = [*others]
     for value in map(np.asarray, values):
         if not value.flags.writeable or min(value.strides, default=0) < 0:
             value = value.copy()
         if any(np.may_share_memory(value, other) for other in seen):
             value = value.copy()
         seen.append(value)
-        found.append(torch.from_numpy(value))
-    return found
+        tensors.append(torch.from_numpy(value))
+    return tensors
 
 
-def _turned(g):
-    """Convert a gradient of torch to a cotangent of the tape, or back."""
-    return anp.conj(g) if dtype_of(g).kind == "c" else g
+def _conjugated(g):
+    """Convert a gradient of torch to a cotangent of the tape, or the reverse."""
+    if dtype_of(g).kind == "c":
+        return anp.conj(g)
+    return g
 
 
 # ---- functions of torch on our tape ----------------------------------------------------------------------------------
@@ -189,12 +218,13 @@ def from_torch(function: Callable) -> Callable:
 
     Notes
     -----
-    The module is not changed, and its parameters get no ``.grad``: gradients come from `value_and_grad` like all
-    others, and ``module.load_state_dict({name: torch.tensor(p) for name, p in best.x.items()}, strict=False)`` puts
-    what was found back. torch computes in the dtypes that it is given: for float64 fields write ``module.double()``.
+    The module is not changed, and its parameters get no ``.grad``: `value_and_grad` returns their gradients. After a
+    minimization, ``module.load_state_dict({name: torch.tensor(p) for name, p in best.x.items()}, strict=False)`` copies
+    the optimal parameters into the module. torch computes in the dtypes of its arguments: for float64 fields write
+    ``module.double()``.
 
-    The function runs once for its value and for derivatives of every order, those with random numbers (dropout) too;
-    only what is traced is differentiated. Derivatives are reverse: `jvp` takes two passes.
+    The function runs once for its value and its derivatives of every order, also if it draws random numbers (dropout).
+    Only traced arguments are differentiated. Derivatives are in reverse mode: `jvp` takes two passes.
 
     Examples
     --------
@@ -204,15 +234,21 @@ def from_torch(function: Callable) -> Callable:
     (9.0, array([ 3., 12.]))
     """
     check_function("from_torch", function, "dp.interop.from_torch(module)")
-    run, parameters, names = function, {}, set()
+    run = function
+    parameters: dict[str, Any] = {}
+    names: set[str] = set()
     if isinstance(function, torch.nn.Module):
-        run = lambda parameters, *args: torch.func.functional_call(function, parameters, args)
+
+        def with_parameters(parameters, *args):
+            return torch.func.functional_call(function, parameters, args)
+
+        run = with_parameters
         parameters = {name: _owned(tensor) for name, tensor in function.named_parameters()}
         names = {*parameters, *(name for name, _ in function.named_buffers())}
 
-    def check_names(given):
-        """Refuse parameters that the module does not have; torch ignores them."""
-        unknown = [repr(name) for name in given if name not in names]
+    def check_names(argument):
+        """Raise an error for parameters that the module does not have; torch ignores them."""
+        unknown = [repr(name) for name in argument if name not in names]
         if unknown:
             expected = ", ".join(map(repr, parameters))
             raise ShapeError(f"parameters of from_torch: unknown key {', '.join(unknown)}; expected {expected}")
@@ -223,72 +259,94 @@ def from_torch(function: Callable) -> Callable:
             check_names(args[0])
         entries, rebuild = flatten(args)
         moving = [*map(isbox, entries)]
-        built: list = []
-        # Copies: torch, or the caller before the backward pass, may write into the arguments. Traced ones are safe.
-        entries = [np.array(one) if isinstance(one, np.ndarray) else one for one in entries]
+        for place, entry in enumerate(entries):
+            # torch, or the caller before the backward pass, may write into an array. Traced entries are not arrays.
+            if isinstance(entry, np.ndarray):
+                entries[place] = np.array(entry)
+        rebuild_result: Any = None
 
         def act(tensors):
-            results, *built[:] = flatten(run(*rebuild(tensors)))
+            nonlocal rebuild_result
+            results, rebuild_result = flatten(run(*rebuild(tensors)))
             return results
 
         graph = _Graph(act, moving)
         results = _rule(graph, *entries)
-        return built[0](parts(results, len(graph.outputs)))
+        return rebuild_result(parts(results, len(graph.outputs)))
 
     vars(call)["parameters"] = parameters
     return ReconstructibleFunction(call, from_torch, function)
 
 
 class _Graph:
-    """One run of a torch function: the tensors that go in, and those that come out.
+    """One run of a torch function, with its input and output tensors.
 
     Parameters
     ----------
     act : callable
-        ``act(tensors) -> list of tensors``.
+        ``act(tensors)`` returns a list of tensors.
     moving : list of bool
-        Which arguments may be differentiated.
-    inputs : list of tensors
-        The first of them, where another run has made them.
+        Whether each argument may be differentiated.
+    inputs : list of tensors, optional
+        The first arguments, if they are tensors of an earlier run.
     """
 
-    outputs: list
+    outputs: list[torch.Tensor]
 
     def __init__(self, act, moving, inputs=()):
-        self._act, self._moving, self.inputs = act, moving, [*inputs]
+        self._act = act
+        self._moving = moving
+        self.inputs = [*inputs]
         self._continues = bool(self.inputs)
 
     def run(self, *entries):
         """Return the results as a tuple of arrays, for arguments as arrays."""
-        for entry, moves in [*zip(entries, self._moving, strict=True)][len(self.inputs) :]:
-            tensor = _tensors([entry], ())[0].requires_grad_(moves) if moves or isinstance(entry, np.ndarray) else entry
-            self.inputs.append(tensor)
+        start = len(self.inputs)
+        for entry, moves in zip(entries[start:], self._moving[start:], strict=True):
+            if moves or isinstance(entry, np.ndarray):
+                (tensor,) = _tensors([entry], ())
+                self.inputs.append(tensor.requires_grad_(moves))
+            else:
+                self.inputs.append(entry)
         with torch.set_grad_enabled(any(self._moving)):
             self.outputs = self._act(self.inputs)
         return tuple(map(_owned, self.outputs))
 
     def as_new(self):
         """Return a graph of the same function that has not run; a graph of gradients belongs to one run."""
-        return self if self._continues else _Graph(self._act, self._moving)
+        if self._continues:
+            return self
+        return _Graph(self._act, self._moving)
 
     def pulled(self, places, moving):
-        """The graph of the gradients of some arguments; its arguments are those here, and then the cotangents."""
+        """Return the graph of the gradients of some arguments; it takes these arguments, then the cotangents."""
 
         def act(tensors):
-            ends = [y for y in self.outputs if y.requires_grad]
-            cotangents = [g.to(y.dtype) for y, g in zip(ends, tensors[len(self.inputs) :], strict=True)]
-            options = dict(create_graph=any(moving), retain_graph=True, allow_unused=True, materialize_grads=True)
-            wanted = [self.inputs[place] for place in places]
-            return torch.autograd.grad(ends, wanted, cotangents, **options)
+            outputs = [y for y in self.outputs if y.requires_grad]
+            cotangents = [g.to(y.dtype) for y, g in zip(outputs, tensors[len(self.inputs) :], strict=True)]
+            variables = [self.inputs[place] for place in places]
+            return torch.autograd.grad(
+                outputs,
+                variables,
+                cotangents,
+                create_graph=any(moving),
+                retain_graph=True,
+                allow_unused=True,
+                materialize_grads=True,
+            )
 
         return _Graph(act, moving, self.inputs)
 
 
 def _pull(nums, ans, graph, *entries):
+    """Return the function from cotangents of the results to gradients of the arguments `nums`."""
+
     def pull(g):
-        cotangents = [_turned(g[k]) for k, y in enumerate(graph.outputs) if y.requires_grad]
-        pulled = graph.pulled([num - 1 for num in nums], [*map(isbox, (*entries, *cotangents))])
-        return tuple(map(_turned, parts(_rule(pulled, *entries, *cotangents), len(nums))))
+        cotangents = [_conjugated(g[k]) for k, y in enumerate(graph.outputs) if y.requires_grad]
+        moving = [*map(isbox, (*entries, *cotangents))]
+        gradient_graph = graph.pulled([num - 1 for num in nums], moving)  # argument 0 of the rule is the graph
+        gradients = parts(_rule(gradient_graph, *entries, *cotangents), len(nums))
+        return tuple(map(_conjugated, gradients))
 
     return pull
 
