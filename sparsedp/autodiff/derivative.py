@@ -283,7 +283,7 @@ def _warn_unless_finite(name, derivative, again):
     derivative : tree
         Traced ones belong to an outer derivative, which is examined itself.
     again : callable
-        ``again()`` computes the derivative once more in reverse mode.
+        ``again()`` computes the derivative again, in reverse mode.
     """
     if thread.quiet:
         return
@@ -303,7 +303,7 @@ def _cause_of_non_finite(again):
     Parameters
     ----------
     again : callable
-        ``again()`` computes the derivative once more in reverse mode.
+        ``again()`` computes the derivative again, in reverse mode.
     """
     if process_count() > 1:
         return None

@@ -869,7 +869,7 @@ _call = direct(_primitive)
 def through(rule: Rule, nums: Sequence[int], *args: Any) -> Any:
     """Call a rule whose functions take values of outer traces and propagate their cotangents themselves.
 
-    Only the innermost trace, which is that of the arguments `nums`, gets a node.
+    Only the innermost trace, on which the arguments `nums` are, gets a node.
     """
     if not nums:
         return _run(rule, *args)
