@@ -52,7 +52,9 @@ class Agreement:
     """
 
     def __init__(self, comm: Any, where: str) -> None:
-        self.comm, self.where, course.last = comm, where, self
+        self.comm = comm
+        self.where = where
+        course.last = self
         self._mark = 0
         self._log: deque = deque(maxlen=100)  # what was told since the last message: (label, mark)
         self._mine = np.zeros(8 + ROOM, np.uint8)
@@ -98,7 +100,8 @@ class Agreement:
         return self._all[:, 8 : 8 + len(content)].tobytes()
 
     def _sent(self, head, content):
-        course.met, course.last = course.met + 1, self
+        course.met = course.met + 1
+        course.last = self
         self._mine[: 8 + len(content)] = np.frombuffer(head + content, np.uint8)
         self.comm.Allgather(self._mine, self._all)
         return self._all[:, :8].tobytes()
@@ -108,7 +111,8 @@ class Agreement:
         logs = zip_longest(*self.comm.allgather(list(self._log)), fillvalue=("nothing", 0))
         entries = next(entries for entries in logs if len(set(entries)) > 1)
         rank = next(rank for rank, entry in enumerate(entries) if entry != entries[0])
-        first, other = entries[0][0], entries[rank][0]
+        first = entries[0][0]
+        other = entries[rank][0]
         self._forget()
         raise _marked(
             ValueError(
@@ -130,7 +134,8 @@ class Agreement:
         """The numbers of all ranks in one, in the order of the ranks: the same bits on each, whatever MPI does."""
         count("ranks", "reduction")
         number = np.asarray(number)
-        content, label = number.tobytes(), f"{act.__name__} of shape {number.shape}, {number.dtype}"
+        content = number.tobytes()
+        label = f"{act.__name__} of shape {number.shape}, {number.dtype}"
         found = self.meet(label, content) if len(content) <= ROOM else b"".join(self.gathered(content, label))
         return act.reduce(np.ndarray((self.comm.size, *number.shape), number.dtype, found), axis=0)[()]
 

@@ -71,7 +71,8 @@ def localized(structure: Any, given: Any, made: Any) -> Any:
 
 def _between(members, given, made):
     """The sides of the members of a product from left to right: where neither knows, every rank has all of it."""
-    layout, sides = (given or made)[0], [made, *[None] * (len(members) - 1), given]
+    layout = (given or made)[0]
+    sides = [made, *[None] * (len(members) - 1), given]
 
     def side(member, parts, beyond):
         if isinstance(member, (Diagonal, Projector)):
@@ -94,7 +95,8 @@ class OnBlocks(Structure):
     """What acts on blocks as it is: a solve on ranks, a projection of its data."""
 
     def __init__(self, whole: Any, shape: tuple) -> None:
-        self.whole, self.shape = whole, shape
+        self.whole = whole
+        self.shape = shape
 
     def apply(self, x: Any, out: Any) -> None:
         self.whole.apply(x, out)
@@ -121,9 +123,13 @@ class Rows(Structure):
     """
 
     def __init__(self, inner: Any, shape: tuple, read: Any, windows: Any = (...,)) -> None:
-        self.inner, self.shape, self.read, self.windows = inner, shape, read, windows
+        self.inner = inner
+        self.shape = shape
+        self.read = read
+        self.windows = windows
         self.parts = getattr(inner, "out_parts", (inner.shape[:1],))
-        self.dtype, self.takes_complex = inner.dtype, inner.takes_complex
+        self.dtype = inner.dtype
+        self.takes_complex = inner.takes_complex
 
     def act(self, x: Any, out: Any) -> None:
         blocks = self._own(self.inner.product(self.read(x) if self.read else x))
@@ -181,7 +187,9 @@ class Columns(Structure):
     """The transpose of Rows: what a structure makes of a block is sent back to where they read it."""
 
     def __init__(self, inner: Any, shape: tuple, back: Any) -> None:
-        self.inner, self.shape, self.back = inner, shape, back
+        self.inner = inner
+        self.shape = shape
+        self.back = back
 
     def act(self, x: Any, out: Any) -> None:
         out[...] = self.back(self.inner.product(x))
@@ -208,7 +216,8 @@ class _Cut(Kronecker):
 
     def __init__(self, structure, periodic, out, reach):
         self.out_parts, self.in_parts = tuple(map(lengths, out)), tuple(map(lengths, reach))
-        self.shape, self.blocks = (sum(map(prod, self.out_parts)), sum(map(prod, self.in_parts))), {}
+        self.shape = (sum(map(prod, self.out_parts)), sum(map(prod, self.in_parts)))
+        self.blocks = {}
         for (r, c), terms in structure.blocks.items():
             sides = list(zip(out[r], reach[c], periodic, [*[False] * (len(periodic) - 1), True]))
             self.blocks[r, c] = tuple(
@@ -225,7 +234,8 @@ def _boxes(structure, own, periodic):
     """
     # A side from a to b is held as (a, -b): then the minimum of several is the side around all of them.
     out = np.array([[(a, -b) for a, b in box] for box in own])
-    reach, same = np.full((len(structure.in_parts), len(periodic), 2), NOTHING), []
+    reach = np.full((len(structure.in_parts), len(periodic), 2), NOTHING)
+    same = []
     for (r, c), terms in structure.blocks.items():
         if not prod(lengths(own[r])):
             continue
@@ -236,9 +246,11 @@ def _boxes(structure, own, periodic):
                 np.minimum(reach[c, axis], (read.min(), -read.max() - 1), out=reach[c, axis])
         if len(terms) > 1:
             # One pass adds up the ends of a row in another order: no end but that of the grid may be in the block.
-            low, high = own[r][-1][0] - 1, own[r][-1][1] + 1
+            low = own[r][-1][0] - 1
+            high = own[r][-1][1] + 1
             if not periodic[-1]:
-                low, high = max(low, 0), min(high, structure.in_parts[c][-1])
+                low = max(low, 0)
+                high = min(high, structure.in_parts[c][-1])
             np.minimum(reach[c, -1], (low, -high), out=reach[c, -1])
     for _ in range(len(out) + len(reach)):
         for c, r, axis in same:

@@ -115,7 +115,9 @@ def _copied(flat, given, made):
 
 def of_boxes(layout: Any, parts: Any, boxes: Any) -> Any:
     """The Exchange for a box of each component, which may reach into other blocks."""
-    leaves, entries, windows = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], []
+    leaves = [np.zeros(0, np.int64)]
+    entries = [np.zeros(0, np.int64)]
+    windows = []
     start = first = 0
     for part, box in zip(parts, boxes):
         here = layout.box(part)
@@ -126,6 +128,7 @@ def of_boxes(layout: Any, parts: Any, boxes: Any) -> Any:
         index = [line + a for line, (a, _) in zip(np.nonzero(away), box)]
         leaves.append(start + np.flatnonzero(away))
         entries.append(first + np.ravel_multi_index(index, part, mode="wrap"))
-        start, first = start + away.size, first + prod(part)
+        start = start + away.size
+        first = first + prod(part)
     shapes = list(map(lengths, boxes))
     return Exchange(layout, parts, start, np.concatenate(leaves), np.concatenate(entries), shapes, windows)

@@ -135,7 +135,9 @@ class Ensemble(Reconstructible):
         check_finite("weights", self._weights)
         self._weights = self._weights.tolist()
         self.made = ensemble, (loss, scenes, executor, self._weights, chunk, progress)
-        self._chunk, self._executor, self._progress = int(chunk or 1), executor, progress
+        self._chunk = int(chunk or 1)
+        self._executor = executor
+        self._progress = progress
         self._loss, *self._scenes = (_packed(x) if executor is not None else mapped(frozen, x) for x in (loss, *scenes))
         self._holders: dict = {}  # worker that has answered -> the keys of what it has
 
@@ -236,7 +238,8 @@ _alone = RLock()  # a worker may have several threads
 
 def _of_parcels(keys, bodies, task, loss, point, scenes, count):
     """(keys, this worker, what `_sum` returns of what they stand for; None where it has not all of them)."""
-    worker, found = f"{node()} {os.getpid()}", {}
+    worker = f"{node()} {os.getpid()}"
+    found = {}
     with _alone:
         for key in keys:
             if key not in _cache:

@@ -83,7 +83,8 @@ def compare() -> Any:
     """Poisson's equation and a gradient, on all processes and on each alone: how far they differ, in one line."""
     from mpi4py import MPI
 
-    alone, results = Grid((24, 20), size=1.0), []
+    alone = Grid((24, 20), size=1.0)
+    results = []
     for grid in (alone, distribute(alone)):
         solution = inverse(-laplacian(grid, dirichlet), rtol=1e-12)
         loss = value_and_grad(lambda b, solution=solution: anp.sum(anp.sin(100.0 * solution(b)) ** 2))
