@@ -68,7 +68,10 @@ BUGS = {
         "tests/parallel/test_ensemble.py",
     ),
     "a scene that a worker takes for another": Bug(
-        "parallel", "(n, weight, found[key])", "(n, weight, found[scenes[0][2]])", "tests/parallel/test_ensemble.py"
+        "parallel",
+        "(n, weight, unpickled[key])",
+        "(n, weight, unpickled[scenes[0][2]])",
+        "tests/parallel/test_ensemble.py",
     ),
     "momentum that passes through a wall": Bug(
         "flow",

@@ -1,11 +1,12 @@
-"""One loss over many scenes: its weighted sum and the derivatives of it, computed by the workers of any executor."""
+"""The weighted sum of one loss over many scenes, with derivatives, computed by the workers of any executor."""
 
 from __future__ import annotations
 
 import os
 import pickle
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from hashlib import sha256
 from platform import node
 from threading import RLock
@@ -13,6 +14,7 @@ from typing import Any
 
 import autograd.numpy as anp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sparsedp._utils.calls import public
 from sparsedp._utils.progress import shown_steps
@@ -25,7 +27,7 @@ from sparsedp.autodiff.tape_constants import frozen
 
 __all__ = ["Ensemble", "ensemble"]
 
-CACHED = 128  # scenes and losses that a worker keeps as they were unpacked, with all that they have set up since
+CACHED = 128  # most scenes and losses that a worker caches, with the solvers that they have set up
 
 
 def ensemble(
@@ -43,46 +45,48 @@ def ensemble(
     loss : callable
         ``loss(x, scene)``, a real scalar; `x` is any nesting of arrays, tuples, lists and dicts.
     scenes : iterable
-        Whatever the loss takes: observations, initial states, grids, solvers.
+        Second arguments of the loss: observations, initial states, grids, solvers.
     executor : concurrent.futures.Executor, optional
         Such as ``ProcessPoolExecutor``, Dask's ``client.get_executor()``, mpi4py's ``MPIPoolExecutor``.
-        Default: this process, one scene after the other. The caller starts it and shuts it down.
+        Default: this process, one scene after the other. The caller starts the executor and shuts it down.
     weights : array (number of scenes,), optional
         Default: ones.
     chunk : int, optional
-        Scenes of one task; default 1. More of them make fewer messages: a task returns one sum.
+        Number of scenes in one task; default 1. A larger chunk needs fewer messages: a task returns one sum.
     progress : bool or str
-        A bar over the tasks of each evaluation, with this label.
+        Whether to show a progress bar over the tasks of each evaluation; a str is its label.
 
     Returns
     -------
     Ensemble
-        ``total(x)``, or ``total(x, numbers)`` over the scenes of these numbers, in this order: a batch of `minimize`.
+        ``total(x)``; ``total(x, numbers)`` is the sum over the scenes with these numbers, in this order, as the batches
+        of `minimize` need it.
 
     Raises
     ------
     TypeError
-        If `loss` is no function, the executor has no `submit`, or a scene cannot be pickled.
+        If `loss` is not a function, the executor has no `submit`, or a scene cannot be pickled.
     ValueError
-        If there is no scene, or `chunk` is no whole number from 1 on.
+        If there is no scene, or `chunk` is not a positive integer.
     ShapeError, NonFiniteError
         If there is not one finite weight for each scene.
     IndexError
-        On use, if there is no scene of a number.
+        On use, if there is no scene with a number.
 
     Notes
     -----
-    Sums are taken in the order of the scenes, within a chunk and over chunks: the bits do not depend on the executor,
-    nor on how many workers it has. Loss and scenes are pickled once (by cloudpickle, where that is installed and
-    functions have no name). A worker keeps what it has unpacked, so each sets up a solver once; the bytes go with a
-    task until every worker has them, and again to one that has not. With each task goes x, and back comes a gradient
-    of its size. An error has the type that it has here, and names its scene; tasks that have not begun are cancelled.
+    Sums are taken in the order of the scenes, within a chunk and over chunks: the result is the same to the last bit
+    for every executor and number of workers. Loss and scenes are pickled once (by cloudpickle, if it is installed and
+    pickle fails, as for lambdas). A worker caches the unpickled objects, so each worker sets up a solver once. The
+    pickled bytes are sent with each task until every worker has them, and again to a worker that lacks them. Each task
+    sends x and returns a gradient of its size. An error keeps its type and names its scene; tasks that have not
+    started are cancelled.
 
-    Derivatives of second order are right, too; of third order there are none. Only the leaves of x that are traced
-    are differentiated. `explain` counts what this process does.
+    Derivatives of first and second order are supported, those of third order are not. Only the traced leaves of x
+    are differentiated. `explain` counts the work of this process only.
 
-    A script that starts processes needs ``if __name__ == "__main__":`` around what it does. Processes that are
-    forked while compiled loops run on several threads may hang: start them afresh, with one thread each, by
+    A script that starts processes needs ``if __name__ == "__main__":`` around its main part. Processes that are forked
+    while compiled loops run on several threads may hang: start new ones with one thread each, by
     ``ProcessPoolExecutor(2, multiprocessing.get_context("spawn"), dp.set_threads, (1,))``.
 
     Examples
@@ -95,24 +99,24 @@ def ensemble(
 
 
 class Ensemble(Reconstructible):
-    """The weighted sum of a loss over scenes. Made by `ensemble`.
+    """The weighted sum of a loss over scenes. Returned by `ensemble`.
 
     Attributes
     ----------
     count : int
-        Of scenes.
+        Number of scenes.
     """
 
     name = "ensemble"
 
     def __init__(
         self,
-        loss: Any,
-        scenes: Any,
+        loss: Callable,
+        scenes: Iterable,
         executor: Any = None,
-        weights: Any = None,
-        chunk: Any = None,
-        progress: Any = False,
+        weights: ArrayLike | None = None,
+        chunk: int | None = None,
+        progress: bool | str = False,
     ) -> None:
         check_function("ensemble", loss, "lambda x, scene: ...")
         if not isinstance(scenes, Iterable):
@@ -130,30 +134,40 @@ class Ensemble(Reconstructible):
             )
         if chunk is not None:
             check_whole("chunk of ensemble", chunk, 1, "; the default is 1")
-        self._weights = np.ones(self.count) if weights is None else np.array(weights, float)
-        check_shape("weights of ensemble", self._weights, (self.count,), "; give one number for each scene")
-        check_finite("weights", self._weights)
-        self._weights = self._weights.tolist()
+        if weights is None:
+            weights = np.ones(self.count)
+        weights = np.array(weights, float)
+        check_shape("weights of ensemble", weights, (self.count,), "; give one number for each scene")
+        check_finite("weights", weights)
+        self._weights = weights.tolist()
         self.made = ensemble, (loss, scenes, executor, self._weights, chunk, progress)
         self._chunk = int(chunk or 1)
         self._executor = executor
         self._progress = progress
-        self._loss, *self._scenes = (_packed(x) if executor is not None else mapped(frozen, x) for x in (loss, *scenes))
-        self._holders: dict = {}  # worker that has answered -> the keys of what it has
+        if executor is None:
+            self._loss = mapped(frozen, loss)
+            self._scenes = [mapped(frozen, scene) for scene in scenes]
+        else:
+            self._loss = _packed(loss)
+            self._scenes = [_packed(scene) for scene in scenes]
+        self._held_keys: dict[str, set] = {}  # for each worker that has answered, the keys of its cached objects
 
     def __repr__(self):
         return f"<ensemble of {self.count} scenes>"
 
     @public("dp.ensemble(loss, scenes)")
-    def __call__(self, x: Any, numbers: Any = None) -> Any:
-        numbers = list(range(self.count) if numbers is None else numbers)
+    def __call__(self, x: Any, numbers: Sequence[int] | None = None) -> Any:
+        """Return the weighted sum at x over all scenes, or over those with some numbers."""
+        if numbers is None:
+            numbers = range(self.count)
+        numbers = list(numbers)
         for number in numbers:
             if not is_whole(number, 0) or number >= self.count:
                 raise IndexError(f"ensemble has scenes 0 to {self.count - 1}, got {number!r}")
         if not numbers:
             raise ValueError("ensemble needs a scene, got none")
         check_leaves("x", x, containers=False)
-        x = copied(x)  # the caller may write into what is not traced, before a second derivative is asked for
+        x = copied(x)  # the caller may write into arrays of x before a second derivative is computed
         entries = leaves(x)
         moving = [place for place, leaf in enumerate(entries) if isbox(leaf)]
         slopes: Any = []
@@ -162,11 +176,15 @@ class Ensemble(Reconstructible):
             return self._sum(task, (_placed(x, moving, values), moving, tangents), numbers)
 
         def value(*values):
-            result, *slopes[:] = total(_slopes if values else _value, values)
+            nonlocal slopes
+            task = _slopes if values else _value
+            result, *slopes = total(task, values)
             return result
 
         def slopes_at(values):
-            return gradient(*values) if any(map(isbox, values)) else slopes
+            if any(map(isbox, values)):
+                return gradient(*values)
+            return slopes
 
         def along(nums, tangents, ans, *values):
             at = slopes_at(values)
@@ -174,25 +192,37 @@ class Ensemble(Reconstructible):
 
         def back(nums, ans, *values):
             at = slopes_at(values)
-            return lambda g: tuple(g * at[num] for num in nums)
 
-        def curved(nums, tangents, ans, *values):
-            given = dict(zip(nums, tangents, strict=True))
-            return hessian(*values, *(given.get(num, zero_like(one)) for num, one in enumerate(values)))
+            def pull(g):
+                return tuple(g * at[num] for num in nums)
 
-        def curved_back(nums, ans, *values):  # the Hessian is symmetric
+            return pull
+
+        def gradient_at(*values):
+            return tuple(total(_slopes, values)[1:])
+
+        def hessian_product(*values_and_tangents):
+            values = values_and_tangents[: len(moving)]
+            tangents = values_and_tangents[len(moving) :]
+            return tuple(total(_curvature, values, tangents))
+
+        def gradient_along(nums, tangents, ans, *values):
+            tangent_of = dict(zip(nums, tangents, strict=True))
+            return hessian(*values, *(tangent_of.get(num, zero_like(leaf)) for num, leaf in enumerate(values)))
+
+        def gradient_back(nums, ans, *values):  # the Hessian is symmetric
             def pull(g):
                 product = hessian(*values, *(g[num] for num in range(len(values))))
                 return tuple(product[num] for num in nums)
 
             return pull
 
-        hessian = Rule("ensemble", lambda *both: tuple(total(_curvature, both[: len(moving)], both[len(moving) :])))
-        gradient = Rule("ensemble", lambda *values: tuple(total(_slopes, values)[1:]), curved_back, curved)
+        hessian = Rule("ensemble", hessian_product)
+        gradient = Rule("ensemble", gradient_at, gradient_back, gradient_along)
         return Rule("ensemble", value, back, along)(*(entries[place] for place in moving))
 
     def _sum(self, task, point, numbers):
-        """What a task returns, added up over scenes in their order."""
+        """Add up the results of a task over scenes, in their order."""
         chunks = []
         for begin in range(0, len(numbers), self._chunk):
             scenes = [(n, self._weights[n], self._scenes[n]) for n in numbers[begin : begin + self._chunk]]
@@ -203,7 +233,10 @@ class Ensemble(Reconstructible):
             if self._executor is not None:
                 futures += map(self._submitted, chunks)
             for number in shown_steps(self._progress, range(len(chunks)), "scenes"):
-                parts = self._answer(chunks[number], futures[number]) if futures else _sum(*chunks[number])
+                if futures:
+                    parts = self._answer(chunks[number], futures[number])
+                else:
+                    parts = _sum(*chunks[number])
                 total = _added(total, parts)
         finally:
             for future in futures:
@@ -211,35 +244,39 @@ class Ensemble(Reconstructible):
         return total
 
     def _submitted(self, chunk):
-        """A task, with the bytes of what some worker may not have."""
+        """Submit a task, with the pickled objects that some worker may not have."""
         task, loss, point, scenes, count = chunk
         parcels = dict([loss, *(parcel for _, _, parcel in scenes)])
-        held = [*self._holders.values()]
-        bodies = {key: data for key, data in parcels.items() if not held or any(key not in keys for keys in held)}
+        held = [*self._held_keys.values()]
+        bodies = {}
+        for key, data in parcels.items():
+            if not held or any(key not in held_keys for held_keys in held):
+                bodies[key] = data
         keys = [(n, weight, parcel[0]) for n, weight, parcel in scenes]
         return self._executor.submit(_of_parcels, [*parcels], bodies, task, loss[0], point, keys, count)
 
     def _answer(self, chunk, future):
-        """What a task returns; where its worker has lost what it had, or is a new one, it is sent again with all."""
+        """Return the result of a task; if its worker lacks an object, send the task again with all objects."""
         keys, worker, parts = future.result()
         if parts is None:
-            self._holders[worker] = set()
+            self._held_keys[worker] = set()
             return self._answer(chunk, self._submitted(chunk))
-        self._holders.setdefault(worker, set()).update(keys)
+        self._held_keys.setdefault(worker, set()).update(keys)
         return parts
 
 
 # ---- in a worker -----------------------------------------------------------------------------------------------------
 
 
-_cache: OrderedDict = OrderedDict()  # key -> what was unpacked, read-only, with what it set up since; last used last
+# Read-only unpickled objects by key, with the solvers that they have set up; the last used is the last entry.
+_cache: OrderedDict = OrderedDict()
 _alone = RLock()  # a worker may have several threads
 
 
 def _of_parcels(keys, bodies, task, loss, point, scenes, count):
-    """(keys, this worker, what `_sum` returns of what they stand for; None where it has not all of them)."""
+    """Return the keys, the name of this worker, and the result of `_sum`, or None if the worker lacks an object."""
     worker = f"{node()} {os.getpid()}"
-    found = {}
+    unpickled = {}
     with _alone:
         for key in keys:
             if key not in _cache:
@@ -247,45 +284,55 @@ def _of_parcels(keys, bodies, task, loss, point, scenes, count):
                     return keys, worker, None
                 _cache[key] = mapped(frozen, pickle.loads(bodies[key]))
             _cache.move_to_end(key)
-            found[key] = _cache[key]
+            unpickled[key] = _cache[key]
         while len(_cache) > CACHED:
             _cache.popitem(last=False)
-    return keys, worker, _sum(task, found[loss], point, [(n, weight, found[key]) for n, weight, key in scenes], count)
+    weighted_scenes = [(n, weight, unpickled[key]) for n, weight, key in scenes]
+    return keys, worker, _sum(task, unpickled[loss], point, weighted_scenes, count)
 
 
 def _sum(task, loss, point, scenes, count):
-    """What a task returns over some scenes (number, weight, scene), added up in their order."""
-    (x, moving, tangents), total = point, None
+    """Add up the results of a task over scenes (number, weight, scene), in their order."""
+    x, moving, tangents = point
+    total = None
     x = mapped(frozen, x)
     values = [leaves(x)[place] for place in moving]
     for number, weight, scene in scenes:
         try:
-            parts = task(lambda values, scene=scene: loss(_placed(x, moving, values), scene), values, tangents)
+            parts = task(partial(_loss_of_values, loss, scene, x, moving), values, tangents)
         except Exception as error:
             if error.args and not isinstance(error.args[0], str):
                 raise RuntimeError(f"scene {number} of {count} raised {type(error).__name__}: {error}") from error
-            words = error.args[0] if error.args else type(error).__name__
-            error.args = f"scene {number} of {count}: {words}", *error.args[1:]
+            message = error.args[0] if error.args else type(error).__name__
+            error.args = f"scene {number} of {count}: {message}", *error.args[1:]
             raise
         total = _added(total, [weight * part for part in parts])
     return total
 
 
-def _value(of, values, tangents):
-    value = of(values)
+def _loss_of_values(loss, scene, x, moving, values):
+    """Return the loss of one scene, with other values at the variable leaves of x."""
+    return loss(_placed(x, moving, values), scene)
+
+
+def _value(loss, values, tangents):
+    """Return the value of a loss, as a task of `_sum`."""
+    value = loss(values)
     check_loss(value)
     return [float(value)]
 
 
-def _slopes(of, values, tangents):
-    with unwarned():  # the gradient of the whole ensemble is examined
-        value, slopes = value_and_grad(of)(values)
+def _slopes(loss, values, tangents):
+    """Return the value and the gradient of a loss, as a task of `_sum`."""
+    with unwarned():  # warnings are given for the gradient of the sum
+        value, slopes = value_and_grad(loss)(values)
     return [value, *slopes]
 
 
-def _curvature(of, values, tangents):
+def _curvature(loss, values, tangents):
+    """Return the product of the Hessian of a loss with the tangents, as a task of `_sum`."""
     with unwarned():
-        return jvp(grad(of), values, list(tangents))[1]
+        return jvp(grad(loss), values, list(tangents))[1]
 
 
 def _placed(x, moving, values):
@@ -295,7 +342,10 @@ def _placed(x, moving, values):
 
 
 def _added(total, parts):
-    return parts if total is None else [a + b for a, b in zip(total, parts, strict=True)]
+    """Return the sums of two lists; the first may be None."""
+    if total is None:
+        return parts
+    return [a + b for a, b in zip(total, parts, strict=True)]
 
 
 def _packed(thing):
@@ -305,6 +355,7 @@ def _packed(thing):
 
 
 def _pickled(thing):
+    """Pickle an object, by cloudpickle if pickle fails."""
     try:
         return pickle.dumps(thing, 5)
     except Exception as error:
