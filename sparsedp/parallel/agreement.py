@@ -1,12 +1,12 @@
-"""What all ranks do and know alike, and what one of them raises.
+"""Checks that all ranks do the same, and errors that all ranks raise together.
 
-Whatever goes between ranks begins with one message of 32 bytes from each to all. It holds the mark of the rank, made of
-all that ranks must do and be told alike (calls, numbers, arrays that every rank has), or the word that it has failed,
-and up to 24 bytes that are reduced. So
+Each communication of ranks begins with one message of 32 bytes from every rank to all. It holds the mark of the rank
+and up to 24 bytes to be reduced. The mark is a checksum of everything that must be the same on all ranks (calls,
+numbers, arrays that every rank has), or a code that says that the rank has failed. Therefore
 
-- a rank that fails says so in the next message, and all raise its error in its words;
-- unseeded random numbers, and a branch that only one rank takes, are errors where ranks meet next, not a drift;
-- a reduction takes one message, as it would without all this.
+- a rank that fails says so in its next message, and all ranks raise its error with its message;
+- unseeded random numbers, and a branch that only one rank takes, raise an error at the next message;
+- a reduction needs one message, as many as without these checks.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ __all__ = ["Agreement", "course", "end_all", "end_all_after_error"]
 
 ROOM = 24  # bytes beside the mark
 FAILED = (-1).to_bytes(8, "little", signed=True)
-PATIENCE = 15.0  # seconds that a rank which has failed waits for the others: they may be inside PETSc, and never come
+PATIENCE = 15.0  # seconds that a failed rank waits for the others: they may be inside PETSc and never answer
 
-# Of this process: how many messages there were; the agreement that was made or asked last; how many messages there were
-# before the outermost call that is under way; and (name, arguments) of calls whose arguments were not compared yet.
+# State of this process: `met`, the number of messages so far; `last`, the agreement built or used last; `begun`, the
+# number of messages before the outermost running call; `untold`, (name, arguments) of calls that are not compared yet.
 course: Any = SimpleNamespace(met=0, last=None, begun=None, untold=[])
 
 
 class Agreement:
-    """What the ranks of a communicator agree on: numbers, errors, and that they do the same.
+    """Checks that the ranks of a communicator do the same; reductions and errors of all ranks.
 
     Parameters
     ----------
     comm : mpi4py.MPI.Comm
     where : str
-        What an error says of this rank.
+        Description of this rank that is added to its errors.
     """
 
     def __init__(self, comm: Any, where: str) -> None:
@@ -56,23 +56,23 @@ class Agreement:
         self.where = where
         course.last = self
         self._mark = 0
-        self._log: deque = deque(maxlen=100)  # what was told since the last message: (label, mark)
+        self._log: deque = deque(maxlen=100)  # (label, mark) of each call of `tell` since the last message
         self._mine = np.zeros(8 + ROOM, np.uint8)
         self._all = np.zeros((comm.size, 8 + ROOM), np.uint8)
 
     # ------------------------------------------------------------ what must be the same
 
     def tell(self, label: str, content: bytes) -> None:
-        """Note what this rank does, or was given, in words and as bytes: it is compared with the next message."""
+        """Add an action or argument of this rank to its mark, which the next message compares with other ranks."""
         while course.untold:
-            what, given = course.untold.pop(0)
-            for number, tree in enumerate(given):
-                self.tell_all(f"argument {number}", what, tree)
+            name, arguments = course.untold.pop(0)
+            for number, tree in enumerate(arguments):
+                self.tell_all(f"argument {number}", name, tree)
         self._mark = crc32(content, self._mark)
         self._log.append((label, self._mark))
 
     def tell_all(self, root: Any, what: str, tree: Any) -> None:
-        """The same for the leaves of a tree, on the tape or not; those on ranks are agreed on already."""
+        """Add the leaves of a tree, traced or not, to the mark; distributed fields are compared already."""
         for name, leaf in zip(labels(tree, root), leaves(tree)):
             value = plain(leaf)
             if isinstance(value, (Number, np.ndarray, np.generic, str)):
@@ -84,22 +84,23 @@ class Agreement:
         Raises
         ------
         Exception
-            That of the first rank that failed, on all of them.
+            The error of the lowest rank that failed, on all ranks.
         ValueError
-            If ranks were told different things.
+            If the marks of the ranks differ.
         """
         self.tell(label, label.encode())
         mark = self._mark.to_bytes(8, "little")
-        found = self._sent(mark, content)
-        if found == mark * self.comm.size:
+        marks = self._sent(mark, content)
+        if marks == mark * self.comm.size:
             self._log.clear()
-        elif FAILED in (found[k : k + 8] for k in range(0, len(found), 8)):
+        elif FAILED in (marks[k : k + 8] for k in range(0, len(marks), 8)):
             self._raise_together()
         else:
             self._refuse()
         return self._all[:, 8 : 8 + len(content)].tobytes()
 
     def _sent(self, head, content):
+        """Send a mark and bytes from this rank to all; return the marks of all ranks."""
         course.met = course.met + 1
         course.last = self
         self._mine[: 8 + len(content)] = np.frombuffer(head + content, np.uint8)
@@ -107,37 +108,44 @@ class Agreement:
         return self._all[:, :8].tobytes()
 
     def _refuse(self):
-        """Say what the ranks were told that is not the same."""
+        """Raise an error that names the first difference between the logs of the ranks."""
         logs = zip_longest(*self.comm.allgather(list(self._log)), fillvalue=("nothing", 0))
         entries = next(entries for entries in logs if len(set(entries)) > 1)
         rank = next(rank for rank, entry in enumerate(entries) if entry != entries[0])
         first = entries[0][0]
         other = entries[rank][0]
         self._forget()
-        raise _marked(
-            ValueError(
+        if first == other:
+            message = (
                 f"{first} is not the same on rank {rank} as on rank 0; give all ranks the same numbers, random ones by "
                 "the same seed"
-                if first == other
-                else f"rank {rank} came to {other} where rank 0 came to {first}; let nothing depend on the number of "
+            )
+        else:
+            message = (
+                f"rank {rank} came to {other} where rank 0 came to {first}; let nothing depend on the number of "
                 "the rank, on a clock or on numbers of one rank"
             )
-        )
+        raise _marked(ValueError(message))
 
     def _forget(self):
+        """Reset the mark and the log."""
         self._mark = 0
         self._log.clear()
 
     # ------------------------------------------------------------ numbers
 
     def reduced(self, number: Any, act: Any) -> Any:
-        """The numbers of all ranks in one, in the order of the ranks: the same bits on each, whatever MPI does."""
+        """Reduce the numbers of all ranks by a ufunc, in their order: every rank gets the same bits."""
         count("ranks", "reduction")
         number = np.asarray(number)
         content = number.tobytes()
         label = f"{act.__name__} of shape {number.shape}, {number.dtype}"
-        found = self.meet(label, content) if len(content) <= ROOM else b"".join(self.gathered(content, label))
-        return act.reduce(np.ndarray((self.comm.size, *number.shape), number.dtype, found), axis=0)[()]
+        if len(content) <= ROOM:
+            contents = self.meet(label, content)
+        else:
+            contents = b"".join(self.gathered(content, label))
+        numbers = np.ndarray((self.comm.size, *number.shape), number.dtype, contents)
+        return act.reduce(numbers, axis=0)[()]
 
     def gathered(self, value: Any, label: str = "gather") -> Any:
         """Return the values of all ranks as a list, on every rank."""
@@ -147,9 +155,10 @@ class Agreement:
     # ------------------------------------------------------------ errors
 
     def agreed(self, label: str, act: Any, *args: Any, at_once: bool = False) -> Any:
-        """act(*args), which may fail on one rank only: then it fails on all.
+        """Call ``act(*args)``, which may fail on one rank only; if it does, raise the error on all ranks.
 
-        Inside of `together`, that tells them; `at_once`: they are told here, for the caller goes on in another way.
+        Inside `together`, the outermost call tells the other ranks. With `at_once` they are told here, because the
+        caller catches the error and continues.
         """
         alone = at_once or course.begun is None
         try:
@@ -158,14 +167,14 @@ class Agreement:
             if alone:
                 self.fail(error)
             if not hasattr(error, "on_all_ranks"):
-                self.tell(f"an error in {label}", b"failed")  # if it is caught on the way, the ranks differ
+                self.tell(f"an error in {label}", b"failed")  # if a caller catches it, the marks differ
             raise
         if alone:
             self.meet(label)
         return result
 
     def fail(self, error: Any) -> None:
-        """Raise an error on all ranks: that of the lowest one which has failed, in its words and with its place."""
+        """Raise an error on all ranks: the error of the lowest rank that failed, with the rank in its message."""
         if hasattr(error, "on_all_ranks"):
             raise error
         watch = Timer(PATIENCE, end_all, (type(error), error, error.__traceback__))
@@ -175,15 +184,21 @@ class Agreement:
         self._raise_together(error, watch)
 
     def _raise_together(self, error=None, watch=None):
-        where = f" (on rank {self.comm.rank}{self.where})"
-        mine = None if error is None else (f"{type(error)}{error}", _packed(error, where))
-        told = self.comm.allgather(mine)
+        """Exchange the errors of all ranks and raise the first; `error` is None on a rank without one."""
+        entry = None
+        if error is not None:
+            where = f" (on rank {self.comm.rank}{self.where})"
+            entry = f"{type(error)}{error}", _packed(error, where)
+        entries = self.comm.allgather(entry)
         if watch:
             watch.cancel()
         self._forget()
-        if len({one and one[0] for one in told}) == 1:  # all have failed in the same way
+        errors = [entry for entry in entries if entry is not None]
+        texts = {text for text, _ in errors}
+        if len(errors) == self.comm.size and len(texts) == 1:  # all ranks failed in the same way
             raise _marked(error)
-        raise _marked(next(filter(None, told))[1]) from error
+        _, first_error = errors[0]
+        raise _marked(first_error) from error
 
 
 def _marked(error):
@@ -193,19 +208,19 @@ def _marked(error):
 
 
 def _packed(error, where):
-    """An error as others can raise it: of the nearest class that is made of words alone; with the place added."""
+    """Return an error that other ranks can raise: of the nearest base class that takes one message."""
     for kind in type(error).__mro__:
         try:
             return pickle.loads(pickle.dumps(kind(f"{error}{where}")))
         except Exception:
-            continue  # it takes other arguments, or other ranks do not know it
+            continue  # the class takes other arguments, or cannot be unpickled on other ranks
 
 
 def end_all(kind: Any, error: Any, trace: Any) -> None:
     """End all ranks with the error of one, so that no rank waits for its messages."""
     comm = MPI.COMM_WORLD
-    told = "".join(traceback.format_exception(kind, error, trace))
-    sys.stderr.write(f"rank {comm.rank} of {comm.size}: {told}")
+    text = "".join(traceback.format_exception(kind, error, trace))
+    sys.stderr.write(f"rank {comm.rank} of {comm.size}: {text}")
     sys.stderr.flush()
     comm.Abort(1)
 
