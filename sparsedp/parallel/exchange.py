@@ -1,4 +1,4 @@
-"""What goes from rank to rank: every rank gathers the numbers that it reads, by a PetscSF."""
+"""Exchange of numbers between ranks: each rank gathers the numbers that it reads, by a PetscSF."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ HELD = MPI.Comm.Create_keyval()
 def hold(comm: Any) -> None:
     """Keep PETSc's own copy of a communicator. Called by all ranks together.
 
-    Without a holder it is freed with the last object on it, which Python drops sooner on one rank than on another: the
-    one would then wait for the others to make a new one.
+    Otherwise PETSc frees the copy with the last object on it. Python drops that object at different times on different
+    ranks, so a rank that has to build a new copy would wait for the others.
     """
     if comm.Get_attr(HELD) is None:
         comm.Set_attr(HELD, PETSc.Comm(comm).duplicate())
@@ -38,13 +38,14 @@ class Exchange:
     ----------
     layout : Partition
     parts : list of shapes
-        Of the components of the whole field.
+        Shapes of the components of the whole field.
     size : int
-        Count of numbers that are read.
+        Number of entries that are read.
     leaves, entries : int arrays
-        Of what is not copied: where it goes in the result, and its number in the whole flat field.
+        For the entries that are exchanged: their places in the result, and their numbers in the whole flat field.
     shapes, windows : lists
-        Of what is copied, for each component: the shape of what is read, and where the copy is in it and in the block.
+        For the entries that are copied, by component: the shape of the result, and their windows in the result and in
+        the block.
     """
 
     def __init__(
@@ -60,11 +61,11 @@ class Exchange:
         ranks, places = layout.owners(parts, entries)
         counts = np.array([leaves.size, np.count_nonzero(ranks != layout.comm.rank)])
         self.agreement = layout.agreement
-        self.busy, self.crossing = map(int, layout.sum(counts))  # of all ranks
+        self.busy, self.crossing = map(int, layout.sum(counts))  # sums over all ranks
         self.read = size, shapes, [there for there, _ in windows]
         self.block = layout.size(parts), layout.shapes(parts), [here for _, here in windows]
         if self.busy:
-            PETSc.garbage_cleanup(layout.comm)  # what Python has dropped is freed here, on all ranks together
+            PETSc.garbage_cleanup(layout.comm)  # frees the objects that Python has dropped, on all ranks together
             self._forest = PETSc.SF().create(layout.comm)
             remote = np.stack([ranks, places], axis=1).astype(PETSc.IntType)
             self._forest.setGraph(self.block[0], leaves.astype(PETSc.IntType), remote)
@@ -75,7 +76,7 @@ class Exchange:
         return self._sent("bcast", MPI.REPLACE, flat, self.placed(flat))
 
     def backward(self, read: Any) -> Any:
-        """The transpose: what stands beside the numbers read is added where they came from."""
+        """Apply the transpose: add the cotangents of the numbers read to the entries that they were read from."""
         return self._sent("reduce", MPI.SUM, read, self.taken(read))
 
     def placed(self, flat: np.ndarray) -> Any:
@@ -83,14 +84,15 @@ class Exchange:
         return _copied(flat, self.block, self.read)
 
     def taken(self, read: Any) -> Any:
-        """The transpose of that."""
+        """Apply the transpose of `placed`."""
         return _copied(read, self.read, self.block)
 
     def _sent(self, word, act, given, out):
-        """What comes from others, or goes to them, added to what stays here."""
+        """Exchange entries with other ranks, combining them with the entries of `out` by `act`."""
         if self.busy:
             self.agreement.meet("exchange")
-            out = out.copy() if np.may_share_memory(out, given) else out
+            if np.may_share_memory(out, given):
+                out = out.copy()
             for part in ("Begin", "End"):
                 getattr(self._forest, word + part)(KINDS[given.dtype.char], given, out, act)
         if self.crossing:
@@ -114,7 +116,7 @@ def _copied(flat, given, made):
 
 
 def of_boxes(layout: Any, parts: Any, boxes: Any) -> Any:
-    """The Exchange for a box of each component, which may reach into other blocks."""
+    """Return the Exchange for a box of each component, which may reach into other blocks."""
     leaves = [np.zeros(0, np.int64)]
     entries = [np.zeros(0, np.int64)]
     windows = []

@@ -1,4 +1,4 @@
-"""`python -m sparsedp ranks`: what of MPI and PETSc is here, and whether two processes get what one gets."""
+"""Self-test of ranks, ``python -m sparsedp ranks``: versions of MPI and PETSc, and a comparison of two processes."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from sparsedp.solvers.inverse import inverse
 
 __all__ = ["report"]
 
-SECONDS = 300  # after which a test is given up; the first one compiles loops
-WITHIN = 1e-10  # of one process, relative
+SECONDS = 300  # timeout of a test; the first one compiles loops
+WITHIN = 1e-10  # tolerance, relative to the result of one process
 DEBIAN = "apt-get install -y --no-install-recommends"
 # Debian keeps petsc4py in a folder of its own, which a virtual environment of its python has to be told.
 PETSC4PY = f"ls -d /usr/lib/petscdir/*/*-real/lib/python3/dist-packages > {get_path('purelib')}/petsc.pth"
-COMMANDS = {  # words of what is wrong -> what helps
+COMMANDS = {  # for key words of an error, the command that repairs it
     "'mpirun'": f"{DEBIAN} openmpi-bin",
     "'mpi4py'": "python -m pip install mpi4py",
     "'petsc4py'": f"{DEBIAN} python3-petsc4py && {PETSC4PY} (not on Debian: conda install -c conda-forge petsc4py)",
@@ -38,7 +38,7 @@ COMMANDS = {  # words of what is wrong -> what helps
 
 
 def report() -> Any:
-    """Lines on what is here and how two processes do; the last one is empty where they cannot."""
+    """Yield lines on the installed versions and the test of two processes; the last is empty if the test failed."""
     script = [sys.executable, "-m", __name__]
     for command in (script, ["mpirun", "-n", "2", sys.executable, "-m", "mpi4py", *script[1:], "compare"]):
         lines, wrong = run(command)
@@ -59,14 +59,16 @@ def run(command: Any) -> Any:
         return [], str(error)
     told = [line for line in done.stderr.splitlines() if line.strip(" -")] or [f"exit code {done.returncode}"]
     errors = [line for line in told if re.match(r"[\w.]+Error: ", line)] or told
-    return done.stdout.splitlines(), errors[0] if done.returncode else ""
+    if done.returncode == 0:
+        return done.stdout.splitlines(), ""
+    return done.stdout.splitlines(), errors[0]
 
 
 # ---- in processes of their own ---------------------------------------------------------------------------------------
 
 
 def versions() -> Any:
-    """What loads here, in lines."""
+    """Yield lines with the versions of the packages that can be imported."""
     yield f"Python {sys.version.split()[0]}, NumPy {np.__version__}, {which('mpirun') or 'no mpirun'}"
     import mpi4py
     from mpi4py import MPI
@@ -80,7 +82,7 @@ def versions() -> Any:
 
 
 def compare() -> Any:
-    """Poisson's equation and a gradient, on all processes and on each alone: how far they differ, in one line."""
+    """Solve Poisson's equation with a gradient, on all processes and on one; yield one line with the difference."""
     from mpi4py import MPI
 
     alone = Grid((24, 20), size=1.0)
