@@ -215,8 +215,7 @@ TABLE = [
     (
         lambda: dp.stepper("leapfrog", RATES, 0.1, damping=(1.0, 0.0)).back((1.0, 1.0)),
         VALUE,
-        "a leapfrog step with damping cannot be reversed: what it takes away grows on the way back; give rollout a "
-        "memory in bytes",
+        "a leapfrog step with damping cannot be reversed: the damped part would grow; give rollout a memory in bytes",
     ),
     (
         lambda: dp.stepper("rk4", fast, 0.1).back(1.0),
@@ -246,7 +245,7 @@ TABLE = [
     (
         lambda: dp.sponge(LINE, 2, 0),
         VALUE,
-        "speed of sponge must be > 0, got 0; give that of the fastest waves",
+        "speed of sponge must be > 0, got 0; give the speed of the fastest waves",
     ),
     (
         lambda: dp.total_variation(LINE, 0.0),

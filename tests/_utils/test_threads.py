@@ -394,7 +394,7 @@ def test_stress_hears_of_growth_in_its_own_thread(check):
     def work(number):
         factor = 30.0 if number == 0 else 0.9
         loss = lambda u: np.sum(dp.rollout(lambda u, p: factor * u, u, None, 20) ** 2)
-        return [run(loss, numbers(number, 4)).flagged for _ in range(10)]
+        return [run(loss, numbers(number, 4)).has_grown for _ in range(10)]
 
     check(lambda: work, 1)
     assert work(0) == [True] * 10 and work(1) == [False] * 10
