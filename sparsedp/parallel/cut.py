@@ -1,4 +1,4 @@
-"""How a linear map that is defined once, for the whole grid, acts on the blocks of the ranks.
+"""Restriction of a linear map, defined once for the whole grid, to the blocks of the ranks.
 
 Every rank has the whole definition, and cuts out the rows of its own block:
 
@@ -52,7 +52,9 @@ def localized(structure: Any, given: Any, made: Any) -> Any:
     if isinstance(structure, Sum):
         return Sum([localized(member, given, made) for member in structure.members])
     if isinstance(structure, Diagonal):
-        return _of_diagonal(structure, *given) if given else structure
+        if given:
+            return _of_diagonal(structure, *given)
+        return structure
     shape = tuple(side[0].size(side[1]) if side else n for side, n in zip((made, given), structure.shape))
     if isinstance(structure, OwnRows):
         return structure.inner[structure.transposed]
@@ -80,7 +82,9 @@ def _between(members, given, made):
         if isinstance(member, Solution):
             return member.solver.system.side
         found = getattr(member, parts, ((),))
-        return (layout, found) if len(found[0]) == len(layout.shape) else None
+        if len(found[0]) == len(layout.shape):
+            return layout, found
+        return None
 
     for place in range(len(members) - 1, 0, -1):
         left, right = members[place - 1 : place + 1]
@@ -132,7 +136,9 @@ class Rows(Structure):
         self.takes_complex = inner.takes_complex
 
     def act(self, x: Any, out: Any) -> None:
-        blocks = self._own(self.inner.product(self.read(x) if self.read else x))
+        if self.read:
+            x = self.read(x)
+        blocks = self._own(self.inner.product(x))
         for block, target in zip(blocks, components(out, [block.shape for block in blocks])):
             target[...] = block
 
@@ -140,7 +146,7 @@ class Rows(Structure):
         return [part[window] for part, window in zip(components(wide, self.parts), self.windows)]
 
     def explicit(self) -> Any:
-        """The rows as a csr_array; its columns are what is read."""
+        """Return the rows as a csr_array; its columns are the entries that are read."""
         if self.read is None:
             raise _no_matrix(self.inner)
         blocks = self._own(np.arange(self.inner.shape[0]))
@@ -160,7 +166,8 @@ def _of_diagonal(structure, layout, parts):
 def _of_matrix(matrix, shape, given, made):
     """The rows of a matrix that make the blocks of this rank, or all rows where every rank has the result."""
     (given or made)[0].tell(matrix.data)
-    matrix = matrix[made[0].take(np.arange(matrix.shape[0]), made[1])] if made else matrix
+    if made:
+        matrix = matrix[made[0].take(np.arange(matrix.shape[0]), made[1])]
     if not given:
         return Rows(Matrix(matrix), shape, None)
     places, exchange = reads(matrix.indices, *given)
@@ -175,7 +182,7 @@ def reads(entries: np.ndarray, layout: Any, parts: Any) -> Any:
 
 
 class OwnRows(Turning):
-    """A square matrix of which each rank knows the rows that make its block, and no one the others.
+    """A square matrix of which each rank holds only the rows of its own block.
 
     `inner`: Rows; Columns, which send what the rows make to whom it belongs, where it is added; and the Stencil.
     """
@@ -260,7 +267,7 @@ def _boxes(structure, own, periodic):
 
 
 def _entries(factor, side, wraps):
-    """Rows and columns of the entries in some rows of a factor, and their values; unbroken on a periodic axis."""
+    """Return rows, columns and values of the entries in some rows of a factor, contiguous on a periodic axis."""
     (n, columns), rows = factor.shape, np.arange(*side)
     matrix = factor.matrix[rows % max(n, 1)]
     row = rows_of(matrix)
