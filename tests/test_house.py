@@ -335,21 +335,6 @@ def test_the_table_of_places_is_true():
 
 # ---- types ---------------------------------------------------------------------------------------------------------
 
-# Packages whose public functions are not all annotated yet: the list only gets shorter.
-NOT_ANNOTATED = {
-    "_utils",
-    "advection",
-    "autodiff",
-    "flow",
-    "grid",
-    "io",
-    "kernels",
-    "network",
-    "operators",
-    "optimize",
-    "parallel",
-}
-
 
 def public_functions(module):
     """Return the functions and methods without an underscore in their name, or in that of their class."""
@@ -372,14 +357,9 @@ def test_public_functions_are_annotated():
     none(
         f"{m.place}:{node.lineno} {node.name} needs types for its parameters and its result"
         for m in modules()
-        if room(m.name) not in NOT_ANNOTATED
         for node in public_functions(m)
         if not is_annotated(node)
     )
-
-
-def test_packages_that_are_not_annotated_exist():
-    assert {room(m.name) for m in modules()} >= NOT_ANNOTATED
 
 
 # ---- the shop window -----------------------------------------------------------------------------------------------

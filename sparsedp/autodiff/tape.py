@@ -408,7 +408,7 @@ def new_trace() -> int:
 
 @contextmanager
 def _new_autograd_trace():
-    """Number a trace of autograd in the same sequence.
+    """Give a trace of autograd the next number of this module.
 
     autograd counts the open traces of all threads up and down. Of two nested traces, one of them of this module or of
     another thread, the inner one could get the smaller number, and its derivative would be wrong.
@@ -827,6 +827,7 @@ class Rule(Reconstructible):
         self.made = made or (Rule, (name, forward, vjp, jvp, keywords))
 
     def __call__(self, *args: Any, **options: Any) -> Any:
+        """Evaluate the rule, and record it where an argument is traced."""
         if self.keywords or options:
             args = self._positional(args, options)
         return _call(self, *args)

@@ -71,6 +71,7 @@ class Condition(Value):
         return self.a, self.b
 
     def __call__(self, value: Any) -> NoReturn:
+        """Refuse a value: those of walls are arguments of `lift`."""
         raise TypeError(f"{self} takes no value here; write G(u) + B(values), B = dp.lift(grid, dp.{self})")
 
     def __repr__(self) -> str:

@@ -72,7 +72,7 @@ def localized(structure: Any, given: Any, made: Any) -> Any:
 
 
 def _between(members, given, made):
-    """The sides of the members of a product from left to right: where neither knows, every rank has all of it."""
+    """Return the sides of the members of a product, left to right; an unknown side is held whole by every rank."""
     layout = (given or made)[0]
     sides = [made, *[None] * (len(members) - 1), given]
 
@@ -136,6 +136,7 @@ class Rows(Structure):
         self.takes_complex = inner.takes_complex
 
     def act(self, x: Any, out: Any) -> None:
+        """Write the product with x into `out`."""
         if self.read:
             x = self.read(x)
         blocks = self._own(self.inner.product(x))
@@ -153,6 +154,7 @@ class Rows(Structure):
         return self.inner.explicit()[np.concatenate([block.reshape(-1) for block in blocks])]
 
     def magnitude(self) -> Any:
+        """Return the structure of the absolute values of the entries."""
         entries = abs(self.explicit())
         return lambda x: entries @ self.read(x)
 
@@ -164,7 +166,7 @@ def _of_diagonal(structure, layout, parts):
 
 
 def _of_matrix(matrix, shape, given, made):
-    """The rows of a matrix that make the blocks of this rank, or all rows where every rank has the result."""
+    """Return the rows of a matrix that make the blocks of this rank, or all rows where every rank has the result."""
     (given or made)[0].tell(matrix.data)
     if made:
         matrix = matrix[made[0].take(np.arange(matrix.shape[0]), made[1])]
@@ -199,9 +201,11 @@ class Columns(Structure):
         self.back = back
 
     def act(self, x: Any, out: Any) -> None:
+        """Write the product with x into `out`."""
         out[...] = self.back(self.inner.product(x))
 
     def magnitude(self) -> Any:
+        """Return the structure of the absolute values of the entries."""
         entries = abs(self.inner.explicit())
         return lambda x: self.back(entries @ x)
 
@@ -210,7 +214,7 @@ class Columns(Structure):
 
 
 def _of_factors(structure, shape, layout, there):
-    """The rows of a Kronecker structure that make the blocks of this rank on the layout `there`, by one exchange."""
+    """Return the rows of a Kronecker structure for the blocks of this rank on the layout `there`, by one exchange."""
     own = [there.box(part) for part in structure.out_parts]
     out, reach = _boxes(structure, own, layout.periodic)
     read = of_boxes(layout, structure.in_parts, reach).forward
@@ -252,7 +256,7 @@ def _boxes(structure, own, periodic):
             for read in filter(np.size, columns):
                 np.minimum(reach[c, axis], (read.min(), -read.max() - 1), out=reach[c, axis])
         if len(terms) > 1:
-            # One pass adds up the ends of a row in another order: no end but that of the grid may be in the block.
+            # One pass adds up the ends of a row in another order: only the ends of the grid itself may be in the block.
             low = own[r][-1][0] - 1
             high = own[r][-1][1] + 1
             if not periodic[-1]:
@@ -279,7 +283,7 @@ def _entries(factor, side, wraps):
 
 
 def _cut_factor(factor, rows, columns, wraps, last):
-    """Some rows and columns of a factor. It takes the loops that the whole one takes: others round in another way."""
+    """Return some rows and columns of a factor. It uses the loops of the whole factor, so that rounding is the same."""
     row, column, data = _entries(factor, rows, wraps)
     inside = (column >= columns[0]) & (column < columns[1])
     entries = data[inside], (row[inside], column[inside] - columns[0])

@@ -51,19 +51,19 @@ class DistributedField(np.lib.mixins.NDArrayOperatorsMixin):
         return self
 
     def astype(self, dtype: Any, copy: Any = True) -> Any:
-        """The same field in another dtype."""
+        """Return the same field in another dtype."""
         return self.like(self.flat.astype(dtype))
 
     def gather(self) -> Any:
-        """The whole field on every rank, a plain array."""
+        """Return the whole field on every rank, a plain array."""
         return self.layout.gather(self.flat, self.space.parts).reshape(self.shape)
 
     def fingerprint(self) -> Any:
-        """A whole number for its bits, the same on every rank."""
+        """Return a whole number for its bits, the same on every rank."""
         return int(self.layout.sum(np.int64(hash(self.flat.tobytes()) >> 16)))
 
     def refuse(self, what: str, *args: Any, **options: Any) -> None:
-        """The answer to all that needs more than the block."""
+        """Return the answer to all that needs more than the block."""
         name = getattr(what, "__name__", what)
         raise TypeError(f"{name} does not work on a field that lies on ranks; write dp.gather(u) for the whole array")
 
@@ -94,10 +94,15 @@ class DistributedField(np.lib.mixins.NDArrayOperatorsMixin):
 
 
 for name, what in {
-    "__getitem__": "u[...]", "__setitem__": "u[...] = value", "__array__": "conversion to an array",
-    "__reduce__": "pickling", "__bool__": "a truth value", "__iter__": "iteration", "__len__": "iteration",
+    "__getitem__": "u[...]",
+    "__setitem__": "u[...] = value",
+    "__array__": "conversion to an array",
+    "__reduce__": "pickling",
+    "__bool__": "a truth value",
+    "__iter__": "iteration",
+    "__len__": "iteration",
     **dict.fromkeys(["__float__", "__complex__", "__int__", "__index__"], "conversion to a number"),
-}.items():  # fmt: skip
+}.items():
     setattr(DistributedField, name, partialmethod(DistributedField.refuse, what))
 
 
@@ -128,7 +133,7 @@ def _first(*values):
 
 
 def _over_all(function, act, x, axis=None, *others, **options):
-    """A function of a whole field; what asks for more, such as an axis, is refused."""
+    """Return a function of a whole field; what asks for more, such as an axis, is refused."""
     if axis is not None and options == {"keepdims": True} and x.shape[axis] == 1:
         return x  # along an axis of one entry
     if any(value is not None and value is not False for value in (axis, *others, *options.values())):
@@ -142,7 +147,7 @@ def _sum(x):
 
 
 def _extreme(act, end, x):
-    """The least or the largest entry; NaN when one is NaN."""
+    """Return the least or the largest entry; NaN when one is NaN."""
     return x.layout.agreement.reduced(act.reduce(x.flat, initial=_ends(x)[end]), act)
 
 
@@ -155,7 +160,7 @@ def _max_from(x, *axis, initial=None, **options):
 
 
 def _ends(x):
-    """The least and the largest number of the dtype of a field."""
+    """Return the least and the largest number of the dtype of a field."""
     if x.dtype.kind == "i":
         return np.iinfo(x.dtype).min, np.iinfo(x.dtype).max
     return {"f": (-np.inf, np.inf), "b": (False, True)}.get(x.dtype.kind) or x.refuse("an order of complex numbers")
@@ -245,7 +250,7 @@ REDUCED: dict = {np.add: _sum, np.maximum: _max, np.minimum: _min}  # as ``np.ad
 
 
 def _spread(shape, space):
-    """The rules from numbers, or whole arrays, of a shape to fields on ranks, and back: transposes of each other."""
+    """Return the rules from numbers or whole arrays of a shape to fields on ranks, and their transposes."""
     back = DistributedField.gather if shape else _sum
     return linear("block", lambda x: block(x, space), back)
 
@@ -263,7 +268,7 @@ def everywhere(x: Any, space: Any) -> Any:
 
 
 def alike(back: Any, value: Any) -> Any:
-    """A cotangent or tangent in the form of what it belongs to: a number, a whole array, or a field on ranks."""
+    """Return a cotangent or tangent in the form of what it belongs to: a number, a whole array, or a field on ranks."""
     field, wanted = plain(back), plain(value)
     if isinstance(wanted, DistributedField):
         return everywhere(back, wanted.space)
@@ -327,7 +332,7 @@ class Sums(VSpace):
         self.shape, self.dtype, self.value = value.shape, value.dtype, value
 
     def zeros(self) -> Any:
-        """A field of zeros."""
+        """Return a field of zeros."""
         return np.zeros_like(self.value)
 
     def _mut_add(self, x, y):
@@ -338,7 +343,7 @@ class Sums(VSpace):
 
 
 def together(what: str, given: Any, act: Any, *args: Any) -> Any:
-    """act(*args): what one rank raises, all raise; the arguments `given` and the result must be the same on all.
+    """Return act(*args): an error of one rank is raised on all; `given` and the result must be equal on all ranks.
 
     Where no field on ranks was met, nothing is asked.
     """
@@ -364,7 +369,7 @@ def together(what: str, given: Any, act: Any, *args: Any) -> Any:
 
 
 def _agreement(given):
-    """That of the fields among some values, or of the last message since the outermost call began; else None."""
+    """Return the agreement of the fields among some values, or of the last message of this call; else None."""
     for leaf in leaves(given):
         backend: Any = getattr(plain(leaf), "backend", NUMPY)
         if not backend.whole_fields:

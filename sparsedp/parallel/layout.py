@@ -35,9 +35,24 @@ __all__ = ["Layout"]
 
 # The functions that call `check_grid` or `check_operator` and work on ranks; all others raise TypeError.
 RIGHT = {
-    "component", "curl", "distribute", "divergence", "flow_step", "flux", "harmonic_average", "interior", "inverse",
-    "laplacian", "projection", "prolong", "restrict", "sample", "sponge", "transport", "upwind",
-}  # fmt: skip
+    "component",
+    "curl",
+    "distribute",
+    "divergence",
+    "flow_step",
+    "flux",
+    "harmonic_average",
+    "interior",
+    "inverse",
+    "laplacian",
+    "projection",
+    "prolong",
+    "restrict",
+    "sample",
+    "sponge",
+    "transport",
+    "upwind",
+}
 
 
 ENTRIES = 1000  # of an array beside a field that are compared between ranks, in 5 us
@@ -76,7 +91,7 @@ class Layout(Partition, Backend):
         return self.agreement.agreed(op.name, self._applied, op, u)
 
     def cut(self, op: Any) -> Any:
-        """What an operator does to the blocks of this rank, as a Structure; it is kept with the operator."""
+        """Return what an operator does to the blocks of this rank, as a Structure; it is kept with the operator."""
         if "_cut" not in vars(op):
             vars(op)["_cut"] = localized(op.structure, _side(op.domain), _side(op.codomain))
         return vars(op)["_cut"]
@@ -96,11 +111,11 @@ class Layout(Partition, Backend):
         return u.flat if u.dtype.kind in "fc" else u.flat.astype(float)
 
     def system(self, op: Any, rtol: Any, maxiter: Any, method: str = "auto", options: Any = None) -> Any:
-        """The system of an operator on ranks, for `inverse`."""
+        """Return the system of an operator on ranks, for `inverse`."""
         if _side(op.domain) != _side(op.codomain):
             raise TypeError(f"inverse of {op.name} does not work on ranks; both sides must lie there in the same way")
         if method != "auto" or options:
-            raise TypeError(f"inverse takes no method and no options on ranks, got {method!r}; leave them away")
+            raise TypeError(f"inverse takes no method and no options on ranks, got {method!r}; omit them")
         if op.dtype.kind == "c":
             raise TypeError(f"inverse takes real operators on ranks, {op.name} is complex; solve it on one process")
         return RanksSystem(op, rtol, maxiter)
@@ -173,7 +188,7 @@ class Layout(Partition, Backend):
         return block(value, space)
 
     def joined(self, name: str, fields: Any) -> Any:
-        """The space of some fields side by side."""
+        """Return the space of some fields side by side."""
         for field in fields:
             if not isinstance(field, DistributedField) or field.layout != self:
                 raise TypeError(

@@ -64,7 +64,7 @@ class Partition:
         return [np.unravel_index(rank, self.ranks) for rank in range(self.comm.size)]
 
     def box(self, part: Any, rank: Any = None) -> Any:
-        """The box of one component that a rank (default: this one) holds."""
+        """Return the box of one component that a rank (default: this one) holds."""
         place = self.places[self.comm.rank if rank is None else rank]
         lines = [self.lines(axis, length) for axis, length in enumerate(part)]
         return tuple((int(line[p]), int(line[p + 1])) for line, p in zip(lines, place))
@@ -78,7 +78,7 @@ class Partition:
         return sum(map(prod, self.shapes(parts, rank)))
 
     def blocks(self, whole: Any, parts: Any, rank: Any = None) -> Any:
-        """What a rank holds of a whole flat field, as views, one for each component."""
+        """Return what a rank holds of a whole flat field, as views, one for each component."""
         return [field[slices(self.box(part, rank))] for field, part in zip(components(whole, parts), parts)]
 
     def take(self, values: Any, parts: Any) -> Any:
@@ -116,11 +116,11 @@ class Partition:
         return self.agreement.reduced(number, np.add)
 
     def max(self, number: Any) -> Any:
-        """The largest of all ranks; NaN when one is NaN."""
+        """Return the largest of all ranks; NaN when one is NaN."""
         return self.agreement.reduced(number, np.maximum)
 
     def min(self, number: Any) -> Any:
-        """The least of all ranks; NaN when one is NaN."""
+        """Return the least of all ranks; NaN when one is NaN."""
         return self.agreement.reduced(number, np.minimum)
 
 

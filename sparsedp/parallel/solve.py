@@ -2,7 +2,7 @@
 
 The contract (solvers/solve.py) is unchanged: true residual, powers of two, both null spaces, refinement, refusal. It
 asks a System for sizes, and here these are sums over all ranks, with the same bits on each: all ranks take the same
-turn, and raise together. The true residual is that of the operator itself, not of PETSc's matrix.
+branch, and raise together. The true residual is computed with the operator itself, not with PETSc's matrix.
 """
 
 from __future__ import annotations
@@ -99,38 +99,38 @@ class RanksSystem(System):
         return float(self.layout.max(np.max(np.abs(x), initial=0.0)))
 
     def total(self, numbers: Any) -> Any:
-        """Sums over all ranks."""
+        """Return sums over all ranks."""
         return self.layout.sum(np.asarray(numbers, float))  # of an empty block bincount gives whole numbers
 
     def extremes(self, x: Any) -> Any:
-        """The least and the largest entry."""
+        """Return the least and the largest entry."""
         low, high = super().extremes(x)
         return self.layout.min(low), self.layout.max(high)
 
     def shaped(self, x: Any, space: Any) -> Any:
-        """The field of a flat block."""
+        """Return the field of a flat block."""
         return DistributedField(x.copy(), space)
 
     def flat(self, field: Any) -> Any:
-        """The flat block of a field."""
+        """Return the flat block of a field."""
         return field.flat
 
     def whole(self, x: Any) -> Any:
-        """The flat array of all entries, on every rank."""
+        """Return the flat array of all entries, on every rank."""
         return self.layout.gather(x, self.parts)
 
     # products
 
     def structure_of(self, op: Any) -> Any:
-        """What an operator does to blocks."""
+        """Return what an operator does to blocks."""
         return self.layout.cut(op)
 
     def product(self, x: Any, transposed: bool = False) -> Any:
-        """A x or A^T x for the unknowns."""
+        """Return a x or A^T x for the unknowns."""
         return self.masked(self.structure_of(self.op.T if transposed else self.op).product(x))
 
     def applied(self, x: Any) -> Any:
-        """A x as it was given: not scaled, for all that is not an unknown too."""
+        """Return a x as it was given: not scaled, for all that is not an unknown too."""
         return self.structure_of(self.unscaled).product(x)
 
     def residual(self, x: Any, b: Any, transposed: bool = False) -> Any:
@@ -144,7 +144,7 @@ class RanksSystem(System):
         return assembled(self.structure_of(self.op), self.layout)
 
     def vector(self, x: Any) -> Any:
-        """A flat block as PETSc's vector, on the same memory."""
+        """Return a flat block as PETSc's vector, on the same memory."""
         return PETSc.Vec().createWithArray(x, size=(x.size, self.size), comm=self.layout.comm)
 
     @cached_property
@@ -172,7 +172,7 @@ class RanksSystem(System):
         raise ArithmeticError("the null vector of one side is not known on ranks")
 
     def kernel(self, labels: Any, right: Any, left: Any, count: Any) -> Any:
-        """The NullSpace of these vectors."""
+        """Return the NullSpace of these vectors."""
         return RanksNullSpace(self, labels, right, left, count)
 
     # symmetry

@@ -114,7 +114,7 @@ class Stencil(ColouredPattern):
         self._set_pattern(pattern_of(row, place, (len(own[0]), colours.size)), colours)
 
     def operator(self, act: Any, name: str) -> Any:
-        """The matrix that acts as ``act(v)``, as an Operator."""
+        """Return the matrix that acts as ``act(v)``, as an Operator."""
         space, own = self.space, Matrix(self.matrix(lambda v: act(DistributedField(v, self.space)).flat))
         shape, exchange = (self.seeds.size,) * 2, self.exchange
         both = Rows(own, shape, exchange.forward), Columns(own.transpose(), shape, exchange.backward)

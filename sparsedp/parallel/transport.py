@@ -45,6 +45,7 @@ class Carry:
             self.depth = int(np.max(distance_transform_cdt(setting.solid, "taxicab"), initial=0))
 
     def __call__(self, u: Any, v: Any, dt: Any, inflow: Any) -> Any:
+        """Return the field after a step."""
         setting, given, name = self.setting, tuple(map(plain, (u, v, dt, inflow))), f"transport {self.setting.scheme}"
         inflows = self.walls.shape if np.shape(given[3]) else ()
         check_step(name, given[2])
@@ -74,7 +75,7 @@ class Carry:
         return most - most // 4 if cells <= most - most // 4 else most
 
     def _speed(self, v):
-        """The largest velocity, in widths of the narrowest cell."""
+        """Return the largest velocity, in widths of the narrowest cell."""
         space = velocity_space(self.setting, np.shape(v))
         parts = components(np.abs(block(v, space).flat), self.layout.shapes(space.parts))
         narrowest = [np.min(h, initial=np.inf) for h in self.setting.grid.widths]
@@ -134,7 +135,7 @@ class Block:
 
 
 def _inflow(setting, move, spans):
-    """The rules of inflow values: a wall of the widened grid gets what is given there, zeros where there is none."""
+    """Return the rules of inflow values: walls of the widened grid get the given values, or zeros."""
     boxes, places = [], [np.zeros(0, int)]
     numbers = iter(components(np.arange(move.walls.size), move.walls.parts))
     for part in move.space.parts:
@@ -152,7 +153,7 @@ def _inflow(setting, move, spans):
 
 
 def widened(space: Any, boxes: Any, shape: tuple, places: Any = None) -> Any:
-    """The rules from the blocks of a field to boxes around them, at some places of an array of this shape; an Exchange.
+    """Return the rules from the blocks of a field to boxes around them, at some places of an array of this shape.
 
     Those that lead there and back.
     """

@@ -149,7 +149,7 @@ def direct_engine(system: System, *, precision: str = "auto") -> Direct:
         return direct_engine(system, precision="double")
     if not growth < LARGEST_GROWTH:
         raise ConvergenceError(
-            f"{system.unscaled} is singular and its null space is neither constant nor that of the volumes, or its "
+            f"{system.unscaled} is singular and its null space is neither the constants nor the volumes, or its "
             "condition number is beyond 1e14; add a shift, or remove the rows that depend on others",
             info=failure("setup_failed"),
         )

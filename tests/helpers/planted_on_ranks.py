@@ -42,7 +42,7 @@ BUGS_ON_RANKS = {
         "return structure.inner[0]",
         "tests/parallel/test_ranks.py::test_as_on_one_process[newton-2]",
     ),
-    "on ranks, what one refuses at a trial point that only it knows": (
+    "on ranks, a refusal at a trial point of one rank alone": (
         '"a trial", act, *args, at_once=True',
         '"a trial", act, *args',
         "tests/parallel/test_ranks.py::test_as_on_one_process[newton-2]",

@@ -148,7 +148,7 @@ def test_the_longest_step():
 
 @pytest.mark.parametrize("method", ["heun", "rk4", "radau"])
 def test_a_break_without_a_jump_has_the_derivative_0(method):
-    """That of the discrete steps is an error, which was refused as uncertain beside nothing."""
+    """The derivative of the discrete steps is an error, which was refused as uncertain beside nothing."""
     rate = lambda u, off, t: anp.where(t < off, 1.0, 1.0) - u * u
     step = dp.stepper(method, rate, 1.0, tolerance=1e-4, breaks=lambda off: [off])
     value, slope = value_and_grad(lambda off: step((np.full(1, 2.0), 0.0), off)[0][0])(0.5)

@@ -1,4 +1,4 @@
-"""Nonlinear implicit steps: what one Jacobian serves for, on which grid it stands, and that nothing else changes."""
+"""Nonlinear implicit steps: reuse of a Jacobian, the grid it is stored on, and that nothing else changes."""
 
 from functools import cache
 
@@ -144,7 +144,7 @@ def test_small_steps_add_up(method):
 
 @pytest.mark.parametrize("method", ["backward_euler", "tr_bdf2"])
 def test_no_diffusion_and_hardly_any(method):
-    """As a rate: nu = 0 is the identity; at 1e-300 and at diffusion number 1e8 the gradient is that of the formula."""
+    """As a rate: nu = 0 is the identity; at 1e-300 and at diffusion number 1e8 the gradient equals the formula."""
     grid = dp.Grid(8, size=1.0)
     op = dp.laplacian(grid, dp.dirichlet)
     mode = np.sin(np.pi * grid.centres()[0])

@@ -73,7 +73,7 @@ REFUSED = [
     ),
     (
         TypeError,
-        "inverse takes no method and no options on ranks, got 'direct'; leave them away",
+        "inverse takes no method and no options on ranks, got 'direct'; omit them",
         lambda s: dp.inverse(dp.laplacian(s.grid), method="direct"),
     ),
     (

@@ -99,8 +99,8 @@ SET_UP = [
     Case(
         lambda: dp.inverse(matrix([1, 2], [2, 4])),
         FAILED,
-        match="<matrix: space(2) -> space(2), explicit> is singular and its null space is neither constant nor that "
-        "of the volumes, or its condition number is beyond 1e14; add a shift, or remove the rows that depend on others",
+        match="<matrix: space(2) -> space(2), explicit> is singular and its null space is neither the constants nor "
+        "the volumes, or its condition number is beyond 1e14; add a shift, or remove the rows that depend on others",
     ),
     Case(
         lambda: dp.inverse(matrix([0, 0], [1, 2])),

@@ -151,7 +151,7 @@ def test_preconditioners(rng):
 
 
 def test_a_stale_preconditioner_costs_iterations_but_no_digits(rng):
-    """The hierarchy is of other coefficients; the residual is that of the operator itself."""
+    """The hierarchy is of other coefficients; the residual is computed with the operator itself."""
     k = coefficients("inclusion", 32)
     old = heterogeneous(np.ones((32, 32)))
     new = heterogeneous(k)

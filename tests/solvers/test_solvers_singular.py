@@ -223,7 +223,7 @@ def test_labels_from_factors_are_those_from_entries():
 
 
 FAILURES = [
-    ([[1.0, 2.0], [2.0, 4.0]], "setup_failed", "is singular and its null space is neither constant nor that of"),
+    ([[1.0, 2.0], [2.0, 4.0]], "setup_failed", "is singular and its null space is neither the constants nor"),
     ([[0.0, 0.0], [1.0, 2.0]], "empty_row", "row 0 of <matrix: space(2) -> space(2), explicit> has no entries"),
     ([[1.0, -1.0], [1.0, -1.0]], "setup_failed", "the null vector of the other side was not found; add a shift"),
     (

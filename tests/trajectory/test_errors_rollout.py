@@ -298,7 +298,7 @@ TABLE = [
         "keep uses a traced value that is not part of the state, and its derivative would be lost; "
         "return what it needs of the state, and combine the two outside of rollout",
     ),
-    # the way back
+    # the backward pass
     (
         slope(lambda u, p: anp.tanh(1e160 * u * p), 0.0 * U, 1.0),
         FINITE,

@@ -205,7 +205,7 @@ class Functions(Reconstructible, Structure):
         self.dtype = np.dtype(dtype)
 
     def recipe(self) -> tuple:
-        """The call that makes it again: see _utils/reconstruction.py."""
+        """Return the call that makes it again: see _utils/reconstruction.py."""
         return Functions, (self.forward, self.backward, self.domain, self.codomain, self.dtype)
 
     def apply(self, x: NDArray, out: NDArray) -> None:
