@@ -8,24 +8,24 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
-from sparsedp._utils import buffers as results
+from sparsedp._utils import buffers
 
 SHAPE = (1 << 15,)
 
 
 @pytest.fixture(autouse=True)
 def _nothing_waits(monkeypatch):
-    monkeypatch.setattr(results, "LARGE", 8 * SHAPE[0])  # quick to fill
-    results._free.clear()
+    monkeypatch.setattr(buffers, "LARGE", 8 * SHAPE[0])  # quick to fill
+    buffers._free.clear()
     yield
-    results._free.clear()
+    buffers._free.clear()
 
 
 def test_the_memory_of_a_result_that_is_gone_serves_again():
-    first = results.empty(SHAPE, float)
+    first = buffers.empty(SHAPE, float)
     where = first.ctypes.data
     del first
-    assert results.empty(SHAPE, float).ctypes.data == where
+    assert buffers.empty(SHAPE, float).ctypes.data == where
 
 
 @pytest.mark.parametrize(
@@ -48,13 +48,13 @@ def test_the_memory_of_a_result_that_is_gone_serves_again():
     ],
 )
 def test_what_somebody_sees_is_never_handed_out(hold):
-    first = results.empty(SHAPE, float)
+    first = buffers.empty(SHAPE, float)
     first[:] = 7.0
     where = first.ctypes.data
     seen = hold(first)
     del first
     gc.collect(1)  # what is new; a whole one looks at all that the tests before have left
-    others = [results.empty(SHAPE, float) for _ in range(3)]
+    others = [buffers.empty(SHAPE, float) for _ in range(3)]
     assert where not in [other.ctypes.data for other in others]
     for other in others:
         other[:] = 1.0
@@ -63,7 +63,7 @@ def test_what_somebody_sees_is_never_handed_out(hold):
 
 
 def test_a_result_is_plain_writeable_and_its_own():
-    result = results.empty(SHAPE, float)
+    result = buffers.empty(SHAPE, float)
     assert type(result) is np.ndarray
     assert result.flags.writeable
     assert result.flags.c_contiguous
@@ -72,18 +72,18 @@ def test_a_result_is_plain_writeable_and_its_own():
 
 
 def test_what_waits_is_bounded(monkeypatch):
-    monkeypatch.setattr(results, "SPARE", 2 * results.LARGE)
-    many = [results.empty(SHAPE, float) for _ in range(5)]
+    monkeypatch.setattr(buffers, "SPARE", 2 * buffers.LARGE)
+    many = [buffers.empty(SHAPE, float) for _ in range(5)]
     last = many.pop()
     where = last.ctypes.data
     many.clear()
     del last
-    assert sum(memory.size for memory in results._free.values()) == 2 * results.LARGE
-    assert where in [memory.ctypes.data for memory in results._free.values()]
+    assert sum(memory.size for memory in buffers._free.values()) == 2 * buffers.LARGE
+    assert where in [memory.ctypes.data for memory in buffers._free.values()]
 
 
 def test_operators_take_it_and_give_right_results(monkeypatch):
-    monkeypatch.setattr(results, "LARGE", 8)
+    monkeypatch.setattr(buffers, "LARGE", 8)
     grid = dp.Grid((20, 30), size=1.0)
     laplacian = dp.laplacian(grid)
     u = np.random.default_rng(0).standard_normal(grid.shape)
@@ -98,14 +98,14 @@ def test_operators_take_it_and_give_right_results(monkeypatch):
 
 
 def test_threads_never_share_a_result(monkeypatch):
-    monkeypatch.setattr(results, "LARGE", 8)
+    monkeypatch.setattr(buffers, "LARGE", 8)
     faults = []
 
     def work(number):
         for _ in range(300):
-            mine = results.empty((1000,), float)
+            mine = buffers.empty((1000,), float)
             mine[:] = number
-            other = results.empty((1000,), float)
+            other = buffers.empty((1000,), float)
             other[:] = -number
             if not (np.all(mine == number) and np.all(other == -number)):
                 faults.append(number)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
-from sparsedp._utils import html as markup
+from sparsedp._utils import html
 
 GRID = dp.Grid((6, 4), size=(3.0, 1.0), periodic=(True, False))
 
@@ -76,7 +76,7 @@ def test_inverse_tells_how_it_solves():
 
 
 def test_numbers_are_not_broken():
-    table = markup.table([[2.4e-11, "a sentence that may be broken at its spaces"]])
+    table = html.table([[2.4e-11, "a sentence that may be broken at its spaces"]])
     assert '<td nowrap="nowrap">2.4e-11</td>' in table and "<td>a sentence" in table
 
 
@@ -137,7 +137,7 @@ def test_check_of_an_operator():
 
 def test_curves():
     lines = {"<one>": [(1e-3, 1.0), (1.0, 1e6), (np.nan, 1.0), (2.0, -1.0)], "two": [(1.0, 1e3)]}
-    picture = ElementTree.fromstring(markup.curves(lines, "step & co", "gap", log=(True, True)))
+    picture = ElementTree.fromstring(html.curves(lines, "step & co", "gap", log=(True, True)))
     first, second = picture.iter("polyline")
     left, right = (tuple(map(float, point.split(","))) for point in first.get("points").split())
     [middle] = (tuple(map(float, point.split(","))) for point in second.get("points").split())
@@ -148,9 +148,9 @@ def test_curves():
 
 
 def test_curves_of_nothing():
-    assert markup.curves({"a": [], "b": [(1.0, 0.0)]}, "x", "y") == ""
+    assert html.curves({"a": [], "b": [(1.0, 0.0)]}, "x", "y") == ""
 
 
 def test_words_of_the_user_are_no_markup():
-    assert "<script>" not in markup.table([["<script>", markup.Markup("<b>bold</b>")]], ["<script>"], "<script>")
-    assert re.search("<td[^>]*><b>bold</b></td>", markup.table([[markup.Markup("<b>bold</b>")]]))
+    assert "<script>" not in html.table([["<script>", html.Markup("<b>bold</b>")]], ["<script>"], "<script>")
+    assert re.search("<td[^>]*><b>bold</b></td>", html.table([[html.Markup("<b>bold</b>")]]))

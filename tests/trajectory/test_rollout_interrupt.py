@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
-from sparsedp._utils import counters as ledger
+from sparsedp._utils import counters
 from sparsedp._utils.pytree import leaves
 from sparsedp.autodiff import tape
 from sparsedp.autodiff.derivative import pullback, pushforward
@@ -85,9 +85,9 @@ def told(found):
 
 
 def left_over():
-    mine = ledger.thread
+    mine = counters.thread
     kept = len(mine.calls), len(mine.solve_hooks), len(mine.loop_hooks), len(mine.inner), len(mine.witnesses)
-    return len(ledger.active), *kept, set(tape.untraced)
+    return len(counters.active), *kept, set(tape.untraced)
 
 
 @pytest.mark.parametrize("job", [gradient, product, twice])

@@ -552,15 +552,13 @@ class Waves(OnCells):
         return act
 
 
-@dataclass(frozen=True)
-class Adaptive(OnCells):
-    """Map u to the state after an interval that is crossed with error control, beside many small steps of rk4."""
+TOO_SHARP_FOR_FLOAT32 = ((ValueError, "cannot meet the tolerance 1e-08 with a state of float32"),)
 
-    method: str
-    sides: tuple
-    seed: int
-    batched = False
-    tolerance = 1e-3
+
+class ErrorControlled(OnCells):
+    """A step with error control, whose derivative may be refused where the tolerance is too coarse for it."""
+
+    own_refusals = ()
 
     @property
     def order(self):
@@ -572,8 +570,19 @@ class Adaptive(OnCells):
     def refusals(self):
         coarse = (dp.errors.DerivativeError, "tolerance")
         if self.method == "radau":
-            return (*FIRST_ORDER, coarse)
-        return (coarse,)
+            return (*FIRST_ORDER, coarse, *self.own_refusals)
+        return (coarse, *self.own_refusals)
+
+
+@dataclass(frozen=True)
+class Adaptive(ErrorControlled):
+    """Map u to the state after an interval that is crossed with error control, beside many small steps of rk4."""
+
+    method: str
+    sides: tuple
+    seed: int
+    batched = False
+    tolerance = 1e-3
 
     def _expression(self):
         return ("laplacian", self.sides, None, "neumann")
@@ -607,7 +616,7 @@ SHARP = ("rk4", "ssprk3", "radau")
 
 
 @dataclass(frozen=True)
-class Switched(OnCells):
+class Switched(ErrorControlled):
     """Map u to the state after an interval in which a source is switched off, beside the closed form.
 
     u' = -k u + f until the time `off`, u' = -k u after it.
@@ -617,20 +626,7 @@ class Switched(OnCells):
     seed: int
     batched = False
     tolerance = 1e-4
-
-    @property
-    def order(self):
-        if self.method == "radau":
-            return 1
-        return 2
-
-    @property
-    def refusals(self):
-        coarse = (dp.errors.DerivativeError, "tolerance")
-        single = (ValueError, "cannot meet the tolerance 1e-08 with a state of float32")
-        if self.method == "radau":
-            return (*FIRST_ORDER, coarse, single)
-        return (coarse, single)
+    own_refusals = TOO_SHARP_FOR_FLOAT32
 
     def parameters(self, box):
         return {"k": 0.9, "f": 1 + 0.3 * np.sin(numbers(self.seed, box.shape)), "off": 0.23}
@@ -657,26 +653,13 @@ def switch_of(p):
 
 
 @dataclass(frozen=True)
-class Ball(OnCells):
+class Ball(ErrorControlled):
     """Map u to u h + v of a ball that bounces once, started from a height that depends on the mean of u."""
 
     method: str
     batched = False
     tolerance = 1e-4
-
-    @property
-    def order(self):
-        if self.method == "radau":
-            return 1
-        return 2
-
-    @property
-    def refusals(self):
-        coarse = (dp.errors.DerivativeError, "tolerance")
-        single = (ValueError, "cannot meet the tolerance 1e-08 with a state of float32")
-        if self.method == "radau":
-            return (*FIRST_ORDER, coarse, single)
-        return (coarse, single)
+    own_refusals = TOO_SHARP_FOR_FLOAT32
 
     def parameters(self, box):
         return {"g": 9.81, "e": 0.8}
