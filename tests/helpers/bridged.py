@@ -23,6 +23,21 @@ def in_trees(p):
     return {"a": anp.sin(p["x"]) * p["y"], "more": (anp.sum(p["x"] ** 2 * p["y"]), p["x"])}
 
 
+def gradient_with_a_reused_constant(f):
+    """Return the gradient in a = (1, 1) of sums of f(a, w), where w is overwritten between the calls and afterwards."""
+    work = np.array([2.0, 3.0])
+
+    def loss(a):
+        total = 0.0
+        for k in (1.0, 2.0):
+            work[:] = [k, 2 * k]
+            total = total + anp.sum(f(a, work))
+        work[:] = np.nan
+        return total
+
+    return dp.grad(loss)(np.array([1.0, 1.0]))
+
+
 FIELD = numbers(*GRID.shape)
 SIDES = np.exp(0.3 * numbers(GRID.faces.size))
 SCENES = {  # function of arrays, its arguments
