@@ -12,8 +12,11 @@ import os
 import sys
 import warnings
 from concurrent.futures import ThreadPoolExecutor
+from threading import RLock
 from types import FunctionType
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -29,6 +32,9 @@ loops: list[Kernel] = []  # all loops that the imported modules define
 
 NOTICE = "sparsedp: compiling loops for this machine, once; `python -m sparsedp compile` does all of them\n"
 _noticed: list[bool] = []
+
+# numba gives one type two numbers where two threads create it at once, and then finds no signature for its arguments.
+_type_creation = RLock()
 
 
 @contextlib.contextmanager
@@ -76,6 +82,17 @@ def _types(words: str) -> Iterator[Any]:
         dimensions = int(word[-1])
         entry = marked.get(word[0]) or entries[kind]
         yield types.Array(entry, dimensions, "C", readonly=kind != "write")
+
+
+def _example(kind: Any, writable: bool) -> Any:
+    """Return an argument of a numba type; an array is empty and read-only unless `writable`."""
+    from numba.np.numpy_support import as_dtype
+
+    if not hasattr(kind, "ndim"):
+        return as_dtype(kind).type(0).item()
+    array = np.empty((0,) * kind.ndim, as_dtype(kind.dtype))
+    array.flags.writeable = writable
+    return array
 
 
 @functools.cache
@@ -156,6 +173,8 @@ class Kernel:
         self.options = options
         self.name = name or loop.__name__
         self.__doc__ = loop.__doc__
+        self._dispatcher: Any = None
+        self._is_compiled = False
         self.single = self
         self.complex = self
         if "~" in words:
@@ -164,14 +183,24 @@ class Kernel:
             self.complex = Kernel(loop, words.replace("+", "*"), uses, given, name, **options)
         loops.append(self)
 
-    @functools.cached_property
+    @property
     def compiled(self) -> Any:
         """The compiled loop; None, after one warning, if it cannot be compiled."""
+        if not self._is_compiled:
+            with _type_creation:
+                if not self._is_compiled:
+                    self._dispatcher = self._compile_or_warn()
+                    self._is_compiled = True
+        return self._dispatcher
+
+    def _compile_or_warn(self) -> Any:
         try:
-            return self._compile()
+            dispatcher = self._compile()
+            self._register_types(dispatcher)
+            return dispatcher
         except Exception as error:  # any problem of LLVM or numba on this machine
             message = f"The compiled kernels do not work here ({error}); NumPy is used instead."
-            warnings.warn(message, RuntimeWarning, stacklevel=4)
+            warnings.warn(message, RuntimeWarning, stacklevel=5)
             return None
 
     def _compile(self) -> Any:
@@ -190,6 +219,16 @@ class Kernel:
                 return njit([signature], cache=use_cache, **options)(loop)
             except (OSError, RuntimeError):  # there is no place for the cache
                 return njit([signature], **options)(loop)
+
+    def _register_types(self, dispatcher: Any) -> None:
+        """Let numba create and store the types of all arguments, writable and read-only, without running the loop.
+
+        It determines the types of a call before it looks for a signature, and no signature has two strings at its end.
+        """
+        for writable in (True, False):
+            arguments = [_example(kind, writable) for kind in _types(self.words)]
+            with contextlib.suppress(TypeError):
+                dispatcher(*arguments, "start", "stop")
 
     def run(self, rows: int, work: int, threads: int, *args: Any) -> None:
         """Call the loop on slabs that cover range(rows), on one thread for less than SERIAL values of work.

@@ -485,6 +485,31 @@ def test_the_first_use_of_the_library_by_four_threads():
     assert subprocess.run([sys.executable, "-c", FIRST], check=False, timeout=300).returncode == 0
 
 
+SLOW_TYPES = """
+import time, weakref
+from numba.core.types import abstract
+
+def intern(cls, inst):
+    reference = weakref.ref(inst, abstract._on_type_disposal)
+    known = abstract._typecache.get(reference)
+    known = known and known()
+    if known is not None:
+        return known
+    time.sleep(0.002)  # another thread creates the same type meanwhile
+    inst._code = abstract._autoincr()
+    abstract._typecache[reference] = reference
+    return inst
+
+abstract._TypeMetaclass._intern = intern
+"""
+
+
+@NUMBA
+def test_numba_types_that_threads_create_at_once():
+    """numba numbers a type twice if two threads create it at once; afterwards it found no signature of our loops."""
+    assert subprocess.run([sys.executable, "-c", SLOW_TYPES + FIRST], check=False, timeout=300).returncode == 0
+
+
 # ---------------------------------------------------------------- teams of the compiled kernels
 
 
