@@ -13,6 +13,10 @@ import pytest
 from sources import FUNCTION, modules
 
 import sparsedp
+from sparsedp.advection.transport import CHOICES
+from sparsedp.advection.transport import METHODS as SCHEMES
+from sparsedp.integrators.runge_kutta import IMPLICIT
+from sparsedp.integrators.stepper import UNUSED
 from sparsedp.optimize.minimize import METHODS
 from sparsedp.solvers.choose_method import METHODS as ENGINES
 
@@ -117,6 +121,32 @@ def test_conditions_have_docstrings_of_their_own():
         assert examples.examples and not doctest.DocTestRunner(verbose=False).run(examples).failed, name
 
 
+def names_with_a_page():
+    """Return the functions and objects of the package by their public names, without errors and missing bridges."""
+    names = {name: getattr(sparsedp, name) for name in sparsedp._MODULE_OF}
+    for room in set(sparsedp._PUBLIC_PACKAGES) - {"errors", "report"}:  # those of `report` are public as dp.NAME
+        module = getattr(sparsedp, room)
+        there = [name for name in module.__all__ if find_spec(EXTRAS.get(name.split("_")[-1], "sparsedp"))]
+        names.update({f"{room}.{name}": getattr(module, name) for name in there})
+    return names
+
+
+def see_also(doc):
+    """Return the names in the section See Also of a docstring."""
+    found = re.search(r"(?m)^See Also\n-{8}\n((?:.+\n?)+)", doc)
+    return [name.strip() for name in found[1].replace("\n", " ").split(",")] if found else []
+
+
+def test_see_also_holds_in_both_directions():
+    """Every public function names others by their public names, and those name it."""
+    links = {name: see_also(inspect.getdoc(value)) for name, value in names_with_a_page().items()}
+    assert not [name for name, others in links.items() if not others]
+    assert not [name for name, others in links.items() if len(set(others)) < len(others) or name in others]
+    assert not [(a, b) for a in links for b in links[a] if b in links and a not in links[b]]
+    bridges = {f"interop.{name}" for name in sparsedp.interop.__all__}
+    assert {other for others in links.values() for other in others} <= {*links, *bridges}
+
+
 def options_in_the_table(function):
     """Return the default of each option of each method, by the tables in a docstring."""
     found: dict = {}
@@ -161,6 +191,48 @@ def test_methods_of_minimize_document_their_options(method):
 
 def test_options_of_inverse_are_those_of_its_table():
     check_options(options_in_the_table(sparsedp.inverse), options_of(ENGINES, lambda method: 1))
+
+
+def rows_of_three(function):
+    """Return the rows of three cells in the notes of a docstring, the head of the table among them."""
+    notes = inspect.getdoc(function).partition("\nNotes\n")[2].partition("\nReferences\n")[0]
+    lines = [re.split(r"  +", line.strip()) for line in notes.splitlines()]
+    return [cells for cells in lines if len(cells) == 3 and not cells[0].startswith("=")]
+
+
+def named_in(cell, methods):
+    """Return the methods that a cell of a table stands for."""
+    named = {method for method in methods if re.search(rf"\b{method}\b", cell)}
+    if cell.startswith("all but "):
+        return set(methods) - {re.match(r"all but (\w+)", cell)[1]}
+    return set(methods) if cell.startswith("all") else named
+
+
+def test_options_of_transport_are_those_of_its_table():
+    table = {option: (values, schemes) for option, values, schemes in rows_of_three(sparsedp.transport)}
+    assert table.pop("option") == ("values", "schemes")
+    assert set(table) == set(CHOICES)
+    for option, (values, schemes) in table.items():
+        assert ast.literal_eval(f"({values})") == CHOICES[option]
+        takers = {name for name, scheme in SCHEMES.items() if option in ("velocity", "of", *scheme.options)}
+        assert named_in(schemes, SCHEMES) == takers, option
+
+
+def test_arguments_of_stepper_are_those_of_its_table():
+    rows = {words: (default, methods) for words, default, methods in rows_of_three(sparsedp.stepper)}
+    assert rows.pop("arguments") == ("default", "methods")
+    parameters = inspect.signature(sparsedp.stepper).parameters
+    takers = {}
+    for words, (defaults, methods) in rows.items():
+        names = words.split(", ") if "options" not in words else ["options"]
+        takers.update(dict.fromkeys(names, named_in(methods, UNUSED)))
+        if names != ["options"]:
+            wanted = ast.literal_eval(f"({defaults},)")
+            assert [parameters[name].default for name in names] == list(wanted * len(names))[: len(names)], words
+    assert set(takers) == set(parameters) - {"method", "rate", "dt"}
+    assert takers.pop("options") == set(IMPLICIT)
+    for name, methods in takers.items():
+        assert methods == {method for method in UNUSED if name not in UNUSED[method]}, name
 
 
 def test_every_module_says_what_it_is():

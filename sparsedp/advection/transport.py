@@ -127,8 +127,26 @@ def transport(
     DerivativeError
         If `solid` is traced.
 
+    See Also
+    --------
+    upwind, conservation_law, flow_step, convection, dirichlet, neumann
+
     Notes
     -----
+    Options by scheme. The first value is the default; an option that the scheme does not use is refused.
+
+    =============  =========================  ===========================
+    option         values                     schemes
+    =============  =========================  ===========================
+    velocity       "faces", "cells"           all
+    of             "cells", "faces"           all
+    form           None, "flux", "advective"  upwind, van_leer
+    unstable       "raise", "allow"           upwind, van_leer
+    interpolation  "linear", "cubic"          semi_lagrangian, maccormack
+    backtrace      "euler", "midpoint"        semi_lagrangian, maccormack
+    clamp          True, False                maccormack
+    =============  =========================  ===========================
+
     Limiters and clamps (van_leer, and maccormack unless clamp=False) have kinks in u where neighbours are equal, for
     example where a field is 0. The derivative there is one of several possible ones, and `check.gradient` returns
     "inconclusive".

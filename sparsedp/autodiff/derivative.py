@@ -489,6 +489,10 @@ def jvp(fun: Callable, x: Any, tangent: Any) -> tuple:
     NonFiniteGradientWarning
         If the derivative holds NaN or infinity; it names the call whose derivative is not finite.
 
+    See Also
+    --------
+    vjp, hvp
+
     Notes
     -----
     Forward mode, or two reverse passes if a part of `fun` has no forward derivative.
@@ -544,6 +548,10 @@ def hvp(loss: Callable, x: Any, tangent: Any) -> Any:
     -----
     NonFiniteGradientWarning
         If the product holds NaN or infinity; it names the call whose derivative is not finite.
+
+    See Also
+    --------
+    value_and_grad, jvp
 
     Examples
     --------
@@ -630,6 +638,10 @@ def vjp(fun: Callable, *x: Any) -> tuple[Any, Callable]:
     NonFiniteGradientWarning
         If a result of `pull` holds NaN or infinity; it names the call whose derivative is not finite.
 
+    See Also
+    --------
+    jvp, value_and_grad
+
     Notes
     -----
     Complex numbers: cotangents are dL/dRe - i dL/dIm, see "Complex numbers" in docs/ideas.md.
@@ -685,6 +697,10 @@ def grad(loss: Callable, argnum: int = 0) -> Callable:
     NonFiniteGradientWarning
         If the gradient holds NaN or infinity; it names the call whose derivative is not finite.
 
+    See Also
+    --------
+    value_and_grad
+
     Examples
     --------
     >>> grad(lambda x: x**2)(3.0)
@@ -727,6 +743,10 @@ def value_and_grad(loss: Callable, argnum: int = 0) -> Callable:
     -----
     NonFiniteGradientWarning
         If the gradient holds NaN or infinity; it names the call whose derivative is not finite.
+
+    See Also
+    --------
+    grad, vjp, hvp, minimize, check.gradient
 
     Notes
     -----

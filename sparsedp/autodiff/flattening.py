@@ -48,6 +48,10 @@ def flatten(tree: Any) -> tuple[np.ndarray, Callable]:
     ShapeError
         On use, if a vector has another length.
 
+    See Also
+    --------
+    minimize
+
     Examples
     --------
     >>> vector, unflatten = flatten({"u": np.array([1.0, 2.0]), "k": 3.0})

@@ -747,6 +747,10 @@ def differentiable(
         On use, if a traced value is given where there is no derivative, or a cotangent has a wrong number, shape or
         dtype.
 
+    See Also
+    --------
+    implicit, from_blackbox, check.gradient
+
     Notes
     -----
     `vjp` gets read-only copies of the arrays in `args` that are not traced, also of those in tuples, lists and dicts:

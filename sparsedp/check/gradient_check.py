@@ -80,6 +80,10 @@ def gradient(
     NonFiniteError
         If x holds NaN or infinity.
 
+    See Also
+    --------
+    value_and_grad, differentiable, certify, stress, v_curve, check.order
+
     Notes
     -----
     Conditions for agreement along every direction. The gap between differences and gradient is at most 1e-8 of the

@@ -387,6 +387,10 @@ def transpose(op: Operator, seeds: int = 5, rng: Rng = None) -> Summary:
         One row for float64, complex128, float32 and complex64, each <= 10. `.verdict`, `.ok`,
         `.worst`, `.rows`; str() is the table.
 
+    See Also
+    --------
+    check.operator, check.twin
+
     Notes
     -----
     The figure is |<A u, v> - <u, A^T v>| / (eps sqrt(|A|_1 |A|_inf) |u| |v|). The products are plain, without
@@ -428,6 +432,10 @@ def twin(op: Operator, seeds: int = 3, rng: Rng = None) -> Summary:
         The difference of the two products, entry by entry, in units of eps |A| |u| (for products of
         operators |A| |B| |u|), each <= 10. The transposed products are also compared with the matrix that the
         transpose assembles by itself.
+
+    See Also
+    --------
+    check.operator, check.transpose
 
     Notes
     -----
@@ -519,6 +527,10 @@ def operator(op: Operator, seeds: int = 3, rng: Rng = None) -> OperatorSummary:
     OperatorSummary
         `.verdict` and `.ok`; `.rows` with name, figure, limit, ok, note; `.failed` names what failed;
         print(summary) shows it all.
+
+    See Also
+    --------
+    check.transpose, check.twin, Operator, check.order
 
     Notes
     -----

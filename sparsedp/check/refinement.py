@@ -45,6 +45,10 @@ def order(
     ValueError
         If there are fewer than three sizes, or they do not increase.
 
+    See Also
+    --------
+    check.operator, check.gradient
+
     Examples
     --------
     >>> from math import cos, sin

@@ -129,6 +129,10 @@ def conservation_law(
     TypeError
         If flux, speed or source is not a function, or a function or the state does not hold real numbers.
 
+    See Also
+    --------
+    transport, free_slip, inflow, outflow, stepper
+
     Notes
     -----
     Order: 2 where the solution is smooth and has no extremum (van_leer), 1 at shocks.

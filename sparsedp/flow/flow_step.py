@@ -157,6 +157,11 @@ def flow_step(
     UnstableStepError
         If dt is too large for explicit viscosity or diffusivity. On use, if it is too large for convection.
 
+    See Also
+    --------
+    transport, projection, convection, face_laplacian, face_lift, brinkman, no_slip, free_slip, inflow, outflow,
+    rollout
+
     Notes
     -----
     A step of explicit viscosity is stable for dt nu / h^2 <= 1/8 in 2-D (Adams-Bashforth); a longer one raises.

@@ -96,6 +96,10 @@ def face_laplacian(
     TypeError
         If `boundary` or `solid_boundary` is not a flow condition.
 
+    See Also
+    --------
+    laplacian, flow_step, face_lift, convection
+
     Examples
     --------
     >>> from sparsedp import Grid
@@ -141,6 +145,10 @@ def face_lift(grid: Grid, boundary: Any = no_slip, solid: ArrayLike | None = Non
     TypeError
         If `boundary` is not a flow condition.
 
+    See Also
+    --------
+    lift, flow_step, face_laplacian, no_slip, inflow
+
     Examples
     --------
     >>> from sparsedp import Grid
@@ -184,6 +192,10 @@ def convection(grid: Grid, boundary: Any = no_slip, solid: ArrayLike | None = No
         If an axis is named that is periodic or does not exist.
     TypeError
         If `boundary` is not a flow condition.
+
+    See Also
+    --------
+    transport, flow_step, face_laplacian
 
     References
     ----------

@@ -108,6 +108,10 @@ def forces(
         On use, if the viscosity is infinite, or if the result is not finite: NaN or too large numbers around the
         obstacle.
 
+    See Also
+    --------
+    brinkman
+
     Notes
     -----
     Exact balance: at a steady state the force equals the momentum that enters through the sides of any box around the
@@ -151,6 +155,10 @@ def brinkman(grid: Grid) -> Callable[[Any], Any]:
         On use, if it is not an array of real numbers.
     NonFiniteError
         On use, if it is NaN or infinite.
+
+    See Also
+    --------
+    flow_step, forces
 
     Notes
     -----

@@ -79,6 +79,10 @@ def projection(
     ConvergenceError
         On use, if the solve does not meet `rtol`.
 
+    See Also
+    --------
+    divergence, flow_step, no_slip, free_slip, inflow, outflow
+
     Notes
     -----
     Null space: the pressure of a closed region is determined up to a constant, which is removed for each region.

@@ -85,39 +85,84 @@ class Condition(Value):
 dirichlet = Condition(
     1.0,
     0.0,
-    """Fix the value at a wall: u = value.
+    """Fix the value of a field at a wall, u = value.
 
-    In an operator the value is 0; `lift` adds other values. In `transport` it is the value of the inflow. The field is
-    odd across the wall: the slope there is (value - u) / (h / 2), with u in the cell next to the wall and h its width.
+    With u_c in the cell beside the wall, h the width of this cell and n pointing outwards::
+
+        u_wall = value
+        du/dn  = (value - u_c) / (h / 2)
+
+    In an operator the value is 0; `lift` adds other values. In `transport` it is the value `inflow`, where the velocity
+    points inwards. An argument ``boundary=`` of `gradient`, `laplacian`, `upwind`, `average`, `lift` and `transport`
+    takes it, alone for all walls or as an entry of a dict; ``solid_boundary=`` takes it for the walls of obstacles.
+
+    See Also
+    --------
+    neumann, robin, gradient, laplacian, lift, transport
 
     Examples
     --------
     >>> import numpy as np
     >>> import sparsedp as dp
-    >>> dp.gradient(dp.Grid(2), dp.dirichlet)(np.ones(2))
+    >>> grid = dp.Grid(2)
+    >>> slopes = dp.gradient(grid, dp.dirichlet)(np.ones(2))
+    >>> slopes
     array([ 2.,  0., -2.])
+
+    With the values 1 and 3 at the two walls:
+
+    >>> slopes + dp.lift(grid, dp.dirichlet)(np.array([1.0, 3.0]))
+    array([0., 0., 4.])
     """,
 )
 neumann = Condition(
     0.0,
     1.0,
-    """Fix the slope at a wall: du/dn = value, n pointing outwards.
+    """Fix the slope of a field at a wall, du/dn = value, with n pointing outwards.
 
-    In an operator the slope is 0, a tight or insulated wall; `lift` adds other values. It is the condition of walls
-    that are not named.
+    With u_c in the cell beside the wall and h the width of this cell::
+
+        u_wall = u_c + value h / 2
+        du/dn  = value
+
+    In an operator the slope is 0, an insulated or impermeable wall; `lift` adds other slopes. It is the condition of
+    axes that are not named. In `transport` a velocity that points inwards brings in the value of the cell at the wall.
+    An argument ``boundary=`` of `gradient`, `laplacian`, `upwind`, `average`, `lift` and `transport` takes it, alone
+    for all walls or as an entry of a dict; ``solid_boundary=`` takes it for the walls of obstacles.
+
+    See Also
+    --------
+    dirichlet, robin, gradient, laplacian, lift, transport
 
     Examples
     --------
     >>> import numpy as np
     >>> import sparsedp as dp
-    >>> dp.gradient(dp.Grid(2), dp.neumann)(np.array([1.0, 3.0]))
+    >>> grid = dp.Grid(2)
+    >>> slopes = dp.gradient(grid, dp.neumann)(np.array([1.0, 3.0]))
+    >>> slopes
     array([0., 2., 0.])
+
+    With the outward slopes 5 and 7 at the two walls:
+
+    >>> slopes + dp.lift(grid, dp.neumann)(np.array([5.0, 7.0]))
+    array([-5.,  2.,  7.])
     """,
 )
 
 
 def robin(a: float, b: float) -> Condition:
     """Return the condition a u + b du/dn = value, with n pointing outwards.
+
+    With u_c in the cell beside the wall and h the width of this cell::
+
+        u_wall = (b u_c + value h / 2) / (a h / 2 + b)
+        du/dn  = (value - a u_c) / (a h / 2 + b)
+
+    In an operator the value is 0; `lift` adds other values. A wall that exchanges heat with surroundings of the
+    temperature T is robin(h, k) with the value h T, for a heat transfer coefficient h and a conductivity k. An argument
+    ``boundary=`` of `gradient`, `laplacian`, `upwind`, `average` and `lift` takes it, alone for all walls or as an
+    entry of a dict; ``solid_boundary=`` takes it for the walls of obstacles. `transport` does not.
 
     Parameters
     ----------
@@ -135,12 +180,20 @@ def robin(a: float, b: float) -> Condition:
     TypeError
         If a weight is not a real number.
 
+    See Also
+    --------
+    dirichlet, neumann, gradient, laplacian, lift
+
     Examples
     --------
     >>> robin(2, 1)
     robin(2, 1)
     >>> robin(1, 0)
     dirichlet
+    >>> import numpy as np
+    >>> import sparsedp as dp
+    >>> dp.gradient(dp.Grid(2), dp.robin(1.0, 0.5))(np.ones(2))
+    array([ 1.,  0., -1.])
     """
     a = check_number("a of robin", a, ">= 0", EXAMPLE, EXAMPLE)
     b = check_number("b of robin", b, ">= 0", EXAMPLE, EXAMPLE)
@@ -201,15 +254,29 @@ no_slip = FlowCondition(
     True,
     dirichlet,
     neumann,
-    """Let the fluid stick to a wall: nothing passes, and the fluid at the wall moves with the wall.
+    """Make a fluid stick to a wall: nothing passes, and at the wall the fluid has the velocity of the wall.
 
-    A wall moves with the values of `face_lift` (a lid), else it rests. It is the condition of flow on walls that are
-    not named. The pressure has slope 0 there.
+    With v the component of the velocity across the wall, w one along it (w_c half a cell of width h away from the
+    wall), p the pressure and n pointing outwards::
+
+        v = 0,   w_wall = velocity of the wall,   dw/dn = (w_wall - w_c) / (h / 2),   dp/dn = 0
+
+    A wall is at rest, unless `face_lift` or the argument ``walls=`` of `flow_step` moves it along itself (a lid). It is
+    the condition of flow on axes that are not named. An argument ``boundary=`` of `projection`, `flow_step`,
+    `face_laplacian`, `face_lift`, `convection` and `forces` takes it; ``solid_boundary=`` takes it for obstacles.
+
+    See Also
+    --------
+    free_slip, inflow, outflow, projection, flow_step, face_lift
 
     Examples
     --------
+    A uniform flow between two walls is slowed down in the cells beside them:
+
     >>> import sparsedp as dp
-    >>> box = dp.projection(dp.Grid((4, 3), size=1.0), boundary=dp.no_slip)
+    >>> channel = dp.Grid((1, 3), periodic=(True, False))
+    >>> dp.face_laplacian(channel, dp.no_slip)(channel.join(1.0, 0.0))[:3]
+    array([-2.,  0., -2.])
     """,
 )
 free_slip = FlowCondition(
@@ -217,14 +284,28 @@ free_slip = FlowCondition(
     True,
     neumann,
     neumann,
-    """Let the fluid glide along a wall: nothing passes, and the wall exerts no friction.
+    """Let a fluid slip along a wall: nothing passes, and the wall exerts no friction.
 
-    The slope of the velocity along the wall is 0, as in a plane of symmetry. The pressure has slope 0 there.
+    With v the component of the velocity across the wall, w one along it, p the pressure and n pointing outwards::
+
+        v = 0,   dw/dn = 0,   dp/dn = 0
+
+    This is also a plane of symmetry. An argument ``boundary=`` of `projection`, `flow_step`, `face_laplacian`,
+    `face_lift`, `convection` and `forces` takes it; ``solid_boundary=`` takes it for obstacles. In `conservation_law`
+    it is a wall that reflects waves: the cells are mirrored, and ``momentum=`` names the field that changes its sign.
+
+    See Also
+    --------
+    no_slip, inflow, outflow, projection, flow_step, conservation_law
 
     Examples
     --------
+    A uniform flow between two walls is not slowed down:
+
     >>> import sparsedp as dp
-    >>> L = dp.face_laplacian(dp.Grid((4, 3), size=1.0), {"y": (dp.no_slip, dp.free_slip)})
+    >>> channel = dp.Grid((1, 3), periodic=(True, False))
+    >>> dp.face_laplacian(channel, dp.free_slip)(channel.join(1.0, 0.0))[:3]
+    array([0., 0., 0.])
     """,
 )
 inflow = FlowCondition(
@@ -232,15 +313,33 @@ inflow = FlowCondition(
     False,
     dirichlet,
     neumann,
-    """Prescribe what passes a side: the velocity across it is what the face field holds there.
+    """Prescribe the velocity of the fluid on a side: what the faces of the side hold is kept.
 
-    A projection does not change these entries, so set them in the first state. The velocity along the side is given by
-    `face_lift`, by default 0. The pressure has slope 0 there. A region with an inflow needs an outflow.
+    With v the component of the velocity across the side, w one along it (w_c half a cell of width h away from the
+    side), p the pressure and n pointing outwards::
+
+        v = value on the faces,   w_side = given,   dw/dn = (w_side - w_c) / (h / 2),   dp/dn = 0
+
+    A `projection` does not change v on these faces: set it in the first state, or by ``inflow=`` of `flow_step`. w_side
+    is 0, unless `face_lift` or ``walls=`` of `flow_step` gives it. A region with an inflow needs an outflow. An
+    argument ``boundary=`` of `projection`, `flow_step`, `face_laplacian`, `face_lift`, `convection` and `forces` takes
+    it. In `conservation_law` the state beyond the side is its argument ``inflow=``.
+
+    See Also
+    --------
+    no_slip, free_slip, outflow, projection, flow_step, face_lift, conservation_law
 
     Examples
     --------
+    What enters a channel passes all of it:
+
+    >>> import numpy as np
     >>> import sparsedp as dp
-    >>> channel = dp.projection(dp.Grid((4, 3), size=1.0), boundary={"x": (dp.inflow, dp.outflow)})
+    >>> grid = dp.Grid((3, 1))
+    >>> P = dp.projection(grid, boundary={"x": (dp.inflow, dp.outflow)})
+    >>> v = grid.join(np.array([[2.0], [0.0], [0.0], [0.0]]), 0.0)
+    >>> grid.split(P(v))[0].ravel()
+    array([2., 2., 2., 2.])
     """,
 )
 outflow = FlowCondition(
@@ -248,14 +347,32 @@ outflow = FlowCondition(
     False,
     neumann,
     dirichlet,
-    """Open a side: the flow through it is computed, and the pressure is 0 there.
+    """Open a side to a fluid: the flow through it is computed, and the pressure there is 0.
 
-    The slope of the velocity along the side is 0. Flow may also enter through it.
+    With w a component of the velocity along the side, p the pressure (p_c in the cell beside the side, h the width of
+    this cell) and n pointing outwards::
+
+        p_side = 0,   dp/dn = -p_c / (h / 2),   dw/dn = 0
+
+    The component across the side follows from the divergence, which is 0 in each cell; it may also point inwards. An
+    argument ``boundary=`` of `projection`, `flow_step`, `face_laplacian`, `face_lift`, `convection` and `forces` takes
+    it. In `conservation_law`, where it is the default, the last cell is repeated beyond the side, and waves leave.
+
+    See Also
+    --------
+    no_slip, free_slip, inflow, projection, flow_step, conservation_law
 
     Examples
     --------
+    What enters a channel leaves it at its open end:
+
+    >>> import numpy as np
     >>> import sparsedp as dp
-    >>> channel = dp.projection(dp.Grid((4, 3), size=1.0), boundary={"x": (dp.inflow, dp.outflow)})
+    >>> grid = dp.Grid((3, 1))
+    >>> P = dp.projection(grid, boundary={"x": (dp.inflow, dp.outflow)})
+    >>> v = grid.join(np.array([[2.0], [0.0], [0.0], [0.0]]), 0.0)
+    >>> grid.split(P(v))[0][-1]
+    array([2.])
     """,
 )
 

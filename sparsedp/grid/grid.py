@@ -79,6 +79,10 @@ class Grid(Value, Uncached):
     TypeError
         If a length is not a real number, or an entry of `periodic` not True or False.
 
+    See Also
+    --------
+    Space, distribute
+
     Examples
     --------
     >>> grid = Grid((4, 3), size=(2.0, 3.0))

@@ -42,6 +42,10 @@ class Space(Value, Uncached):
     ShapeError
         If the shape has an entry that is not an integer >= 0.
 
+    See Also
+    --------
+    Grid
+
     Notes
     -----
     `shape` is the shape of a field. Cells and nodes have the shape of the grid of cells or nodes;

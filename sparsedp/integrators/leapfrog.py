@@ -194,6 +194,10 @@ def sponge(
     ValueError
         If a sponge is deeper than its axis, an axis that is named has no ends, or speed or echo are out of range.
 
+    See Also
+    --------
+    stepper
+
     Notes
     -----
     The rate grows with the square of the depth: s = 1.5 c log(1 / echo) (depth / width)^2 / width. Measured for round

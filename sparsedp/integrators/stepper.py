@@ -174,8 +174,28 @@ def stepper(
         nor an event, or changes faster than the steps resolve; if an event grazes its surface, so that its time
         has no derivative; if two differentiated breaks coincide.
 
+    See Also
+    --------
+    implicit, matrix_exponential, conservation_law, sponge, rollout
+
     Notes
     -----
+    Arguments by method. One that the method does not use is refused.
+
+    ==================================  ===========  ================================================================
+    arguments                           default      methods
+    ==================================  ===========  ================================================================
+    linear, source, timed, tolerance    None         all but leapfrog; imex and etdrk4 need `linear`
+    max_step, breaks, events            None         all but leapfrog; they need a tolerance
+    floor                               None         all; it has an effect with a tolerance
+    unstable                            "raise"      all; it has an effect on euler, heun, ssprk3, rk4, leapfrog
+    jacobian                            None         backward_euler, crank_nicolson, tr_bdf2, radau; no effect on imex
+    damping                             None         leapfrog
+    solver                              "auto"       all; radau takes "auto" and "direct" alone
+    rtol, maxiter                       1e-10, None  all; they have an effect on solves
+    options of `inverse` or `implicit`  none         backward_euler, crank_nicolson, tr_bdf2, imex
+    ==================================  ===========  ================================================================
+
     Formula: derivatives are those of the discrete step. A linear stage x of (1 - z L) x = b, z = c dt, has
     b_bar = y, z_bar = y . L x with (1 - z L)^T y = g; a nonlinear one is a root, see `implicit`.
     A coefficient of 0 leaves the state as it is, bit for bit, without set-up or solve.

@@ -79,6 +79,10 @@ def from_blackbox(f: Callable, sparsity: Any = None, derivative: str = "auto", n
     NonFiniteError
         If f is NaN or infinite near x.
 
+    See Also
+    --------
+    differentiable, interop.to_torch, interop.to_jax
+
     Notes
     -----
     Cost: one run for each colour of the pattern (two for central differences), one at x, and two or three that probe

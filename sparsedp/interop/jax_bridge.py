@@ -54,6 +54,10 @@ def to_jax(f: Callable, like: Any = None) -> Callable:
     ShapeError
         On use, if the result has other entries or shapes than `like`.
 
+    See Also
+    --------
+    interop.from_jax, from_blackbox
+
     Notes
     -----
     JAX calls back into Python: f runs on the CPU and must return the same result for the same arguments. An exception
@@ -269,6 +273,10 @@ def from_jax(function: Callable) -> Callable:
     ------
     TypeError
         If it is no function; on use, if a dtype has other than single or double precision.
+
+    See Also
+    --------
+    interop.to_jax
 
     Notes
     -----

@@ -54,6 +54,10 @@ def to_torch(f: Callable) -> Callable:
     RuntimeError
         By torch, in the backward pass, if a tensor has been changed in place since the call.
 
+    See Also
+    --------
+    interop.from_torch, from_blackbox
+
     Notes
     -----
     Tensors and arrays share their memory; a result is copied where f may know its memory. f runs once for a value and
@@ -215,6 +219,10 @@ def from_torch(function: Callable) -> Callable:
         If it is no function; on use, if a dtype has other than single or double precision.
     ShapeError
         On use, if the dict holds parameters that the module does not have.
+
+    See Also
+    --------
+    interop.to_torch
 
     Notes
     -----

@@ -83,6 +83,10 @@ def save(
     OSError
         If the file cannot be written.
 
+    See Also
+    --------
+    load, interop.to_xarray
+
     Examples
     --------
     >>> import tempfile
@@ -152,6 +156,10 @@ def load(path: str | os.PathLike) -> tuple[Grid, dict[str, Any]]:
         If a library is missing; the extra `files` installs all of them; .npz needs none.
     OSError
         If there is no such file, or it cannot be read.
+
+    See Also
+    --------
+    save
 
     Examples
     --------

@@ -57,6 +57,10 @@ def to_xarray(
     ValueError
         If two variables would have one name, or a key of `attrs` or `at` is unknown.
 
+    See Also
+    --------
+    interop.from_xarray, save
+
     Examples
     --------
     >>> from sparsedp import Grid
@@ -90,6 +94,10 @@ def from_xarray(grid: Grid, array: xarray.DataArray, /) -> np.ndarray:
         If its coordinates along an axis are not those of the grid.
     ValueError
         If a dimension is missing, or the array has coordinates that would be lost.
+
+    See Also
+    --------
+    interop.to_xarray
 
     Examples
     --------

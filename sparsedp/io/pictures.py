@@ -43,6 +43,10 @@ def from_image(path: str | os.PathLike) -> np.ndarray:
     OSError
         If there is no such file, or it is no picture.
 
+    See Also
+    --------
+    plot
+
     Examples
     --------
     >>> import tempfile

@@ -81,6 +81,10 @@ def set_threads(n: int | None = None) -> None:
     ValueError
         If `n` is out of range.
 
+    See Also
+    --------
+    ensemble
+
     Examples
     --------
     >>> set_threads(1)

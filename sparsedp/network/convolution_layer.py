@@ -55,6 +55,10 @@ def convolution(p: dict[str, Any], x: Any, padding: str = "periodic") -> Any:
     ShapeError
         If the shapes do not fit.
 
+    See Also
+    --------
+    network.dense, network.convolution_weights, network.residual_block
+
     Examples
     --------
     >>> p = {"weight": np.array([[[-0.5, 0.0, 0.5]]]), "bias": np.zeros(1)}

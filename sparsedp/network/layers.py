@@ -34,6 +34,10 @@ def dense(p: dict[str, Any], x: Any) -> Any:
     ShapeError
         If the shapes do not fit.
 
+    See Also
+    --------
+    network.dense_weights, network.convolution
+
     Examples
     --------
     >>> dense({"weight": np.array([[1.0, 2.0]]), "bias": np.zeros(2)}, np.array([[3.0]]))
@@ -77,6 +81,10 @@ def tanh(x: Any) -> Any:
     -------
     array like x
 
+    See Also
+    --------
+    network.relu, network.softplus
+
     Examples
     --------
     >>> float(tanh(np.array(0.0)))
@@ -96,6 +104,10 @@ def relu(x: Any) -> Any:
     -------
     array like x
 
+    See Also
+    --------
+    network.softplus, network.tanh
+
     Examples
     --------
     >>> relu(np.array([-1.0, 2.0]))
@@ -114,6 +126,10 @@ def softplus(x: Any) -> Any:
     Returns
     -------
     array like x
+
+    See Also
+    --------
+    network.relu, network.tanh
 
     Examples
     --------
@@ -145,6 +161,10 @@ def residual_block(
     ------
     ShapeError, ValueError
         As convolution.
+
+    See Also
+    --------
+    network.convolution, network.residual_weights
 
     Examples
     --------

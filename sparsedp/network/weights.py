@@ -36,6 +36,10 @@ def dense_weights(
     dict
         weight (inputs, outputs) and bias (outputs,).
 
+    See Also
+    --------
+    network.dense
+
     Examples
     --------
     >>> p = dense_weights(np.random.default_rng(0), 3, 2)
@@ -63,6 +67,10 @@ def convolution_weights(
     -------
     dict
         weight (outputs, inputs, *widths) and bias (outputs,).
+
+    See Also
+    --------
+    network.convolution
 
     Examples
     --------
@@ -99,6 +107,10 @@ def residual_weights(
     dict
         first and second, parameters of convolutions.
 
+    See Also
+    --------
+    network.residual_block
+
     Examples
     --------
     >>> sorted(residual_weights(np.random.default_rng(0), 4, 3))
@@ -123,6 +135,10 @@ def save(path: str | os.PathLike[str], parameters: Any) -> None:
         If a leaf is something else, or a key of a dict is not a string.
     OSError
         If the file cannot be written; a previous file of this name is kept.
+
+    See Also
+    --------
+    network.load
 
     Examples
     --------
@@ -150,6 +166,10 @@ def load(path: str | os.PathLike[str]) -> Any:
     ------
     ValueError
         If `save` did not write the file, or it is damaged.
+
+    See Also
+    --------
+    network.save
 
     Examples
     --------

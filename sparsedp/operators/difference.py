@@ -52,6 +52,10 @@ def gradient(
     ValueError
         If `boundary` names an axis that is periodic or that the grid lacks.
 
+    See Also
+    --------
+    divergence, laplacian, upwind, average, lift, dirichlet, neumann, robin, curl
+
     Notes
     -----
     Order 2 inside on uniform grids and on smooth maps of them. Transpose: with volumes V, W and
@@ -99,6 +103,10 @@ def divergence(grid: Grid) -> Operator:
     TypeError
         If `grid` is no Grid.
 
+    See Also
+    --------
+    gradient, laplacian, curl, flux, projection
+
     Notes
     -----
     Exact for the finite-volume balance on any grid: sum(volumes * D(v)) is the flow through the walls.
@@ -140,6 +148,10 @@ def flux(grid: Grid, cells: Any) -> Operator:
     ValueError
         If there is not one slice of neighbouring cells for each axis.
 
+    See Also
+    --------
+    divergence
+
     Examples
     --------
     >>> import numpy as np
@@ -180,6 +192,10 @@ def laplacian(
     ShapeError
         If `solid` has another shape than the grid.
 
+    See Also
+    --------
+    gradient, divergence, lift, inverse, face_laplacian, dirichlet, neumann, robin
+
     Notes
     -----
     Order 2 inside; next to a wall the truncation error is of order 1 (neumann) or 0 (dirichlet),
@@ -216,6 +232,10 @@ def curl(grid: Grid) -> Operator:
     ------
     ValueError
         If the grid is 1-D.
+
+    See Also
+    --------
+    gradient, divergence
 
     Examples
     --------
@@ -260,6 +280,10 @@ def upwind(grid: Grid, axis: int | str = 0, direction: int = 1, boundary: Any = 
     ------
     ValueError
         If the grid has no such axis, or `direction` is not 1 or -1.
+
+    See Also
+    --------
+    gradient, lift, transport
 
     Examples
     --------

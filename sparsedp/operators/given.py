@@ -60,6 +60,10 @@ def from_matrix(matrix: ArrayLike, domain: Any = None, codomain: Any = None, nam
     NonFiniteError
         If an entry is NaN or infinite.
 
+    See Also
+    --------
+    from_functions, from_linear_operator, Operator
+
     Examples
     --------
     >>> rows = from_matrix([[1.0, 2.0], [0.0, 3.0]])
@@ -118,6 +122,10 @@ def from_linear_operator(linop: Any, domain: Any = None, codomain: Any = None, n
         If the operator does not fit the spaces.
     DerivativeError
         On use of `.T`, if the LinearOperator has no rmatvec.
+
+    See Also
+    --------
+    from_matrix, from_functions, Operator
 
     Examples
     --------
@@ -185,6 +193,10 @@ def from_functions(
         On use, if a function returns an array of another shape.
     DerivativeError
         On use of the transpose when there is none.
+
+    See Also
+    --------
+    from_matrix, from_linear_operator, Operator
 
     Examples
     --------

@@ -49,6 +49,10 @@ def harmonic_average(grid: Grid) -> Callable:
     NonFiniteError
         On use, if a coefficient is NaN or infinite.
 
+    See Also
+    --------
+    average, elliptic_solver
+
     Examples
     --------
     >>> from sparsedp import Grid

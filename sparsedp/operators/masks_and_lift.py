@@ -45,6 +45,10 @@ def lift(grid: Grid, boundary: Any) -> Operator:
     ValueError
         If `boundary` names a periodic axis.
 
+    See Also
+    --------
+    gradient, laplacian, upwind, face_lift, dirichlet, neumann, robin
+
     Notes
     -----
     With walls of values v the equation -D (G u + B v) = b is solved by ``solve(b + D(B(v)))``,
@@ -95,6 +99,10 @@ def mask(space: Space, keep: ArrayLike) -> Operator:
     TypeError
         If `space` is not a Space, or `keep` is not boolean.
 
+    See Also
+    --------
+    interior, diagonal, identity
+
     Examples
     --------
     >>> from sparsedp import Grid
@@ -122,6 +130,10 @@ def interior(grid: Grid, solid: ArrayLike | None = None) -> Operator:
     ShapeError
         If `solid` has another shape than the grid.
 
+    See Also
+    --------
+    mask
+
     Examples
     --------
     >>> from sparsedp import Grid
@@ -148,6 +160,10 @@ def identity(space: Space) -> Operator:
     ------
     TypeError
         If `space` is no Space.
+
+    See Also
+    --------
+    mask, diagonal
 
     Examples
     --------
@@ -182,6 +198,10 @@ def diagonal(space: Space, values: ArrayLike) -> Operator:
         If `space` is not a Space, or the values are not numbers.
     DerivativeError
         If the values are traced: an Operator is constant; write ``values * u``.
+
+    See Also
+    --------
+    mask, identity
 
     Examples
     --------

@@ -54,6 +54,10 @@ class Operator(Frozen, Reconstructible):
     ShapeError
         If the structure does not fit the spaces.
 
+    See Also
+    --------
+    from_matrix, from_functions, from_linear_operator, inverse, check.operator
+
     Examples
     --------
     >>> import numpy as np

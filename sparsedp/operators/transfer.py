@@ -49,6 +49,10 @@ def average(grid: Grid, boundary: Any = neumann) -> Operator:
     ValueError
         If `boundary` names an axis that is periodic or that the grid lacks.
 
+    See Also
+    --------
+    gradient, harmonic_average, component
+
     Examples
     --------
     >>> average(Grid(3))(np.array([1.0, 2.0, 4.0]))
@@ -81,6 +85,10 @@ def sample(grid: Grid, points: ArrayLike) -> Operator:
         If a coordinate is NaN or infinite.
     ValueError
         If a point lies outside the box.
+
+    See Also
+    --------
+    restrict, prolong
 
     Examples
     --------
@@ -136,6 +144,10 @@ def restrict(grid: Grid, factor: int | Sequence[int]) -> Operator:
     ShapeError
         If the factor is not a whole number >= 1 that divides the shape.
 
+    See Also
+    --------
+    prolong, sample
+
     Examples
     --------
     >>> restrict(Grid(4), 2)(np.array([1.0, 3.0, 5.0, 9.0]))
@@ -175,6 +187,10 @@ def prolong(grid: Grid, factor: int | Sequence[int], interpolation: str = "const
         If the factor is not a whole number >= 1 that divides the shape.
     ValueError
         If `interpolation` is another word.
+
+    See Also
+    --------
+    restrict, sample
 
     Examples
     --------
@@ -227,6 +243,10 @@ def component(grid: Grid, axis: int | str) -> Operator:
     ------
     ValueError
         If the grid has no such axis.
+
+    See Also
+    --------
+    average
 
     Examples
     --------

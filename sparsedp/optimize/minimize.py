@@ -181,6 +181,11 @@ def minimize(
     ImportError
         If `progress` is given and tqdm is not installed.
 
+    See Also
+    --------
+    value_and_grad, update_direction, physical_gradient, smoothness, total_variation, certified, convergence, flatten,
+    ensemble
+
     Examples
     --------
     >>> import autograd.numpy as anp

@@ -52,6 +52,10 @@ def physical_gradient(
     ShapeError
         In the backward pass, if the inverse returns another shape than x.
 
+    See Also
+    --------
+    minimize, update_direction
+
     Notes
     -----
     The value is y = physics(x). For a cotangent g = dL/dy the rule returns

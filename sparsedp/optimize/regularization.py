@@ -59,6 +59,10 @@ def total_variation(grid: Grid, eps: float, solid: ArrayLike | None = None) -> C
     NonFiniteError
         On use, if a slope is NaN or infinite.
 
+    See Also
+    --------
+    smoothness, minimize
+
     Notes
     -----
     The value is the sum over cells of volume (sqrt(g^2 + eps^2) - eps). g^2 is the sum over the axes of the mean of the
@@ -114,6 +118,10 @@ def smoothness(grid: Grid, solid: ArrayLike | None = None) -> Callable[[Any], An
         On use, if u is complex.
     NonFiniteError
         On use, if a squared slope is NaN or beyond 1.8e308.
+
+    See Also
+    --------
+    total_variation, minimize
 
     Notes
     -----

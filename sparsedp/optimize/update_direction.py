@@ -256,6 +256,10 @@ def update_direction(
     ShapeError
         If g has another shape than the outputs.
 
+    See Also
+    --------
+    minimize, physical_gradient
+
     Notes
     -----
     With the singular values s of J the gradient J^T g is multiplied by (s^2 + damping)^(-power) in each singular

@@ -43,6 +43,10 @@ def distribute(grid: Grid, comm: Any = None) -> Grid:
     TypeError
         If `comm` is no communicator.
 
+    See Also
+    --------
+    Grid, ensemble, gather
+
     Examples
     --------
     >>> from sparsedp import Grid
@@ -92,6 +96,10 @@ def gather(u: Any) -> np.ndarray:
     ------
     ShapeError
         If `u` is neither a field nor an array.
+
+    See Also
+    --------
+    distribute
 
     Examples
     --------

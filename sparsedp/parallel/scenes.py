@@ -73,6 +73,10 @@ def ensemble(
     IndexError
         On use, if there is no scene with a number.
 
+    See Also
+    --------
+    rollout, minimize, distribute, set_threads
+
     Notes
     -----
     Sums are taken in the order of the scenes, within a chunk and over chunks: the result is the same to the last bit

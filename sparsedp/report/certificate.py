@@ -235,6 +235,10 @@ def certify(loss: Callable[[Any], Any], x: Any, target: float = TARGET) -> Certi
     ValueError
         If `target` is not between 0 and 1. All that the loss raises passes through.
 
+    See Also
+    --------
+    certified, explain, check.gradient
+
     Notes
     -----
     Cost: one gradient, two loose correction solves (relative residual 1e-2) for each pair of solves, one more
@@ -394,6 +398,10 @@ def certified(fraction: float = 0.1, tolerance: float = 1e-8) -> Certified:
     ------
     ValueError
         If `fraction` or `tolerance` is out of range, or a gradient is given to `minimize`: its solves are not seen.
+
+    See Also
+    --------
+    minimize, certify
 
     Notes
     -----

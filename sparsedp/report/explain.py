@@ -76,6 +76,10 @@ def explain(loss: Callable[[Any], Any], x: Any, gradient: bool = True) -> Plan:
     ShapeError
         If the loss is not a scalar.
 
+    See Also
+    --------
+    rollout, certify, work_precision
+
     Notes
     -----
     Kinds: forward, vjp, jvp (applications of operators and rules); solve, adjoint (each solve), iterations,

@@ -84,6 +84,10 @@ def plot(
     ImportError
         If matplotlib is not installed.
 
+    See Also
+    --------
+    animate, convergence, from_image
+
     Examples
     --------
     >>> from sparsedp import Grid
@@ -160,6 +164,10 @@ def animate(
         If matplotlib is not installed.
     OSError
         If the file cannot be written.
+
+    See Also
+    --------
+    plot
 
     Examples
     --------
@@ -304,6 +312,10 @@ def convergence(best: Minimum, ax: Any = None, against: str = "iteration") -> An
     ImportError
         If matplotlib is not installed.
 
+    See Also
+    --------
+    v_curve, minimize, plot
+
     Examples
     --------
     >>> import autograd.numpy as anp
@@ -349,6 +361,10 @@ def v_curve(audit: Audit, ax: Any = None) -> Any:
         If it is something else.
     ImportError
         If matplotlib is not installed.
+
+    See Also
+    --------
+    convergence, check.gradient
 
     Examples
     --------

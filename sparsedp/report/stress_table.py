@@ -67,6 +67,10 @@ def stress(
     DerivativeError
         If x has no floating leaf.
 
+    See Also
+    --------
+    check.gradient
+
     Notes
     -----
     passed: finite, and the gradient agrees with differences to 1e-5 along a random direction in each leaf (in all

@@ -128,6 +128,10 @@ def work_precision(
     TypeError
         If the problem does not give (loss, x); on several ranks.
 
+    See Also
+    --------
+    explain
+
     Notes
     -----
     Every run is warm: it is repeated until its time has settled, and one that does not settle has the status

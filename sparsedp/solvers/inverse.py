@@ -105,6 +105,10 @@ def inverse(
     NonFiniteError
         On use, if the right-hand side holds NaN or infinity, or the solution cannot be represented.
 
+    See Also
+    --------
+    laplacian, Operator, elliptic_solver, matrix_solver, implicit, matrix_power
+
     Notes
     -----
     Null space: one vector for each connected component, found from the entries. Data are projected

@@ -196,6 +196,10 @@ def elliptic_solver(
     ConvergenceError
         On use, as for `inverse`.
 
+    See Also
+    --------
+    harmonic_average, inverse, matrix_solver
+
     Notes
     -----
     **Derivatives.** With A = shift - D diag(k) G, A x = b and A^T y = g: the cotangent of b is y, of shift -y * x
@@ -476,6 +480,10 @@ def matrix_solver(
         On use, if data or b holds NaN or infinity.
     ConvergenceError, IncompatibleError
         On use, as for `inverse`.
+
+    See Also
+    --------
+    inverse, elliptic_solver
 
     Notes
     -----

@@ -108,6 +108,10 @@ def implicit(
         `jacobian` or `sparsity` does not fit the residual at the root, or if something else that the residual uses
         has changed since the solve.
 
+    See Also
+    --------
+    inverse, steady, differentiable, stepper
+
     Notes
     -----
     **Derivative.** J x' = -F_p p'. For a cotangent g of x: J^T y = g and p_bar = -F_p^T y, one adjoint solve for all
@@ -174,6 +178,10 @@ def steady(residual: Callable[..., Any], guess: Any, *params: Any, **options: An
         If Newton's method and pseudo-time fail, or the Jacobian is singular: at a fold, or where a constant is free.
     NonFiniteError
         If the guess, a parameter or the residual at the guess holds NaN or infinity.
+
+    See Also
+    --------
+    implicit
 
     Notes
     -----

@@ -42,6 +42,10 @@ def matrix_exponential(op: Operator, time: float = 1.0) -> Operator:
     NonFiniteError
         If `time` is not finite, or the exponential leaves the range of floats.
 
+    See Also
+    --------
+    matrix_function, matrix_power, stepper
+
     Notes
     -----
     With A = V diag(e) V^-1: exp(t A) = V diag(exp(t e)) V^-1. Its transpose is exp(t A^T).
@@ -84,6 +88,10 @@ def matrix_power(op: Operator, exponent: float) -> Operator:
         If `exponent` is not one real number.
     NonFiniteError
         If `exponent` is not finite, or the power leaves the range of floats.
+
+    See Also
+    --------
+    matrix_exponential, matrix_function, inverse
 
     Notes
     -----
@@ -138,6 +146,10 @@ def matrix_function(op: Operator, f: Callable[[NDArray[Any]], ArrayLike]) -> Ope
         If f is not a function, or its values are not real numbers.
     NonFiniteError
         If a value is NaN or infinite.
+
+    See Also
+    --------
+    matrix_exponential, matrix_power
 
     Notes
     -----

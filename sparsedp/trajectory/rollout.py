@@ -111,6 +111,10 @@ def rollout(
     BudgetWarning
         If at most twice the memory would reduce the runs of steps to a third; it says how much is needed.
 
+    See Also
+    --------
+    flow_step, stepper, ensemble, explain
+
     Notes
     -----
     Cost: n steps forward; backward n steps on a tape of their own, unless it is kept, plus those run again:
