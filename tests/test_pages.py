@@ -22,7 +22,8 @@ import sparsedp
 from sparsedp.__main__ import main
 
 DOCS = ROOT / "docs"
-PAGES = sorted(path.name for path in DOCS.glob("*.md"))
+GUIDES = sorted(path.relative_to(DOCS).as_posix() for path in DOCS.glob("guides/*.md"))
+PAGES = [*sorted(path.name for path in DOCS.glob("*.md")), *GUIDES]
 RUN = [name for name in PAGES if "```python" in (DOCS / name).read_text(encoding="utf-8")]
 QUICK = "/(ensemble|heat_rod|new_operator|plan|update_directions|velocity_recovery)"  # examples that are run here
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -67,6 +68,8 @@ def test_commands_of_the_pages():
             check_install(words[3:])
         elif words[:3] == ["python", "-m", "pytest"]:
             assert (ROOT / words[-1]).exists()
+        elif words[0] == "python" and words[1].startswith("examples/"):
+            assert (ROOT / words[1]).exists()
         else:
             assert words[:4] in (["python", "-m", "sparsedp", "demo"], ["python", "-m", "sphinx", "-W"])
 

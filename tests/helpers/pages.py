@@ -3,7 +3,7 @@
 A python block is executed, after the ones before it. The text block that follows (at once, or after one line that
 ends in a colon) is its real output: words are compared with white space normalised, numbers with a relative
 tolerance, ``...`` stands for anything. A line ``<!-- rtol=1e-3 atol=1e-12 -->`` before the text block sets the
-tolerances.
+tolerances. A block that imports a library of an extra is skipped where that library is missing.
 """
 
 import contextlib
@@ -24,7 +24,8 @@ else:
 
 SHELL = ("sh", "bash", "shell", "console")
 NUMBER = r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w])"
-MESHES = importlib.util.find_spec("skfem") is not None  # in the extra `test`; a block that needs it is left out without
+LIBRARIES = ("PIL", "jax", "matplotlib", "pyevtk", "skfem", "torch", "xarray")  # of extras
+MISSING = [name for name in LIBRARIES if importlib.util.find_spec(name) is None]
 
 
 @dataclass(frozen=True)
@@ -82,13 +83,18 @@ def same(wanted, got, **tolerance):
     return found is not None and all(math.isclose(a, float(b), **tolerance) for a, b in zip(numbers, found.groups()))
 
 
+def needs_missing_library(code):
+    """Return whether a block imports a library of an extra that is not installed."""
+    return any(re.search(rf"^(import|from) {name}\b", code, re.MULTILINE) for name in MISSING)
+
+
 def run_blocks(path):
     """Execute the python blocks of a page in order; the printed text must be the text of the page."""
     all_blocks = blocks(path.read_text(encoding="utf-8"))
     space = {"__name__": "__page__"}
     assert any(block.language == "python" for block in all_blocks), f"{path.name} has no python block"
     for block, following in zip(all_blocks, [*all_blocks[1:], Block("", "", 0, "")]):
-        if block.language != "python" or ("import skfem" in block.text and not MESHES):
+        if block.language != "python" or needs_missing_library(block.text):
             continue
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):
