@@ -27,10 +27,10 @@ import scipy.sparse as sp
 from sparsedp.errors import ShapeError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Sequence
 
 __all__ = [
-    "Structure",
+    "TreeStructure",
     "branches_mapped",
     "child",
     "copied",
@@ -58,52 +58,95 @@ LARGE = 2.0**200
 MOST_EXPONENT = 1023  # of a power of two that is a float
 
 
-class Structure:
-    """The containers of a tree without its leaves: builds, names and pairs trees of the same structure.
+class TreeStructure:
+    """The containers of a tree, and its leaves that are not variables: names, takes apart and builds such trees.
 
     Parameters
     ----------
     tree : tree
     root : str
         Name of the tree in messages.
+    is_variable : callable, optional
+        ``is_variable(leaf)``: whether the leaf is a variable, which differs between trees of this structure. Default:
+        every leaf is one.
+    keep : callable, optional
+        ``keep(leaf)``: what is stored of a leaf that is not a variable. Default: the leaf itself.
 
     Attributes
     ----------
-    count : int
-        Of leaves.
+    places : list of int
+        Positions of the variables among the leaves.
+    statics : tuple
+        All leaves, None in place of the variables: a structure that is kept must not hold a trace or a large array.
+    template : tree
+        The tree with these leaves.
+    is_leaf, is_flat : bool
+        Whether the tree is one variable and nothing else, or a tuple of variables.
 
     Examples
     --------
-    >>> structure = Structure({"u": (1.0, 2.0), "n": 3}, "x")
+    >>> structure = TreeStructure({"u": (1.0, 2.0), "n": 3}, "x", lambda leaf: isinstance(leaf, float))
     >>> structure.names
-    ["x['u'][0]", "x['u'][1]", "x['n']"]
-    >>> structure.build("abc")
-    {'u': ('a', 'b'), 'n': 'c'}
-    >>> structure.leaves_of({"n": 0, "u": [5, 6]})
-    [5, 6, 0]
+    ["x['u'][0]", "x['u'][1]"]
+    >>> structure.build("ab")
+    {'u': ('a', 'b'), 'n': 3}
+    >>> structure.variables({"n": 0, "u": [5.0, 6.0]})
+    [5.0, 6.0]
     """
 
-    def __init__(self, tree: Any, root: str = "tree"):
+    def __init__(
+        self,
+        tree: Any,
+        root: str = "tree",
+        is_variable: Callable[[Any], bool] | None = None,
+        keep: Callable[[Any], Any] | None = None,
+    ) -> None:
         self.root = root
-        self.count = len(leaves(tree))
-        self._numbered = _build(tree, iter(range(self.count)))
+        self.places: list[int] = []
+        statics: list[Any] = []
+        for place, leaf in enumerate(leaves(tree)):
+            if is_variable is None or is_variable(leaf):
+                self.places.append(place)
+                statics.append(None)
+            elif keep is None:
+                statics.append(leaf)
+            else:
+                statics.append(keep(leaf))
+        self.statics = tuple(statics)
+        self.template = _build(tree, iter(statics))
+        has_only_variables = len(self.places) == len(statics)
+        self.is_leaf = has_only_variables and keys(tree) is None
+        self.is_flat = has_only_variables and type(tree) is tuple and all(keys(branch) is None for branch in tree)
+
+    @cached_property
+    def labels(self) -> list[str]:
+        """Names of all leaves, as one would write them: ``x['u'][0]``."""
+        return labels(self.template, self.root)
 
     @cached_property
     def names(self) -> list[str]:
-        """Names of the leaves, as one would write them: ``x['u'][0]``."""
-        return self.names_under(self.root)
+        """Names of the variables, as one would write them."""
+        return [self.labels[place] for place in self.places]
 
     def names_under(self, root: str) -> list[str]:
-        """Return the names of the leaves of a tree with this structure and another name."""
-        return labels(self._numbered, root)
+        """Return the names of the variables of a tree with this structure and another name."""
+        all_names = labels(self.template, root)
+        return [all_names[place] for place in self.places]
 
-    def build(self, values: Iterable) -> Any:
-        """Return the tree with these leaves."""
-        return _build(self._numbered, iter(values))
+    def variables(self, tree: Any, name: str = "tree", **options: Any) -> list:
+        """Return the variables of a tree that must have this structure, in its order: see `paired`."""
+        entries = paired(tree, self.template, name, **options)
+        return [entries[place] for place in self.places]
 
-    def leaves_of(self, tree: Any, name: str = "tree", **options: Any) -> list:
-        """Return the leaves of a tree that must have this structure, in its order: see `paired`."""
-        return paired(tree, self._numbered, name, **options)
+    def build(self, variables: Sequence, statics: Sequence | None = None) -> Any:
+        """Return the tree with these variables, and with its own other leaves unless others are given."""
+        if self.is_leaf:
+            return variables[0]
+        if self.is_flat:
+            return tuple(variables)
+        if statics is None:
+            statics = self.statics
+        return _build(self.template, iter(placed(statics, self.places, variables)))
 
 
 # ---- containers ------------------------------------------------------------------------------------------------------

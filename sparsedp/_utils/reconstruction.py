@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from copy import deepcopy
+from dataclasses import fields, is_dataclass
 from functools import cached_property, update_wrapper
 from threading import local
 from types import MethodType
@@ -64,6 +65,8 @@ def _check_importable(owner, part):
     """
     if isinstance(part, dict):
         part = list(part.values())
+    if is_dataclass(part) and not callable(part) and not isinstance(part, Reconstructible):
+        part = [getattr(part, field.name) for field in fields(part)]
     if isinstance(part, (tuple, list)):
         for entry in part:
             _check_importable(owner, entry)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from functools import cached_property
-from itertools import accumulate, compress
+from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp._utils.pytree import Structure, copied, leaves
+from sparsedp._utils.pytree import TreeStructure, copied, leaves
 from sparsedp._utils.reconstruction import ReconstructibleFunction
 from sparsedp._utils.validation import check_finite, check_leaves, check_native, check_shape
 from sparsedp.autodiff.tape import cast, is_variable, isbox
@@ -90,7 +89,7 @@ def _traced_leaf(part, value):
     return cast(anp.reshape(numbers, value.shape), value.dtype)
 
 
-class Packing:
+class Packing(TreeStructure):
     """How the floating leaves of a tree lie in one vector.
 
     Leaves that are not floating (int, bool, None, str) are kept as they are. A complex leaf takes two
@@ -110,11 +109,8 @@ class Packing:
         Whether one of them is complex.
     eps : float
         Rounding of the coarsest dtype.
-    count, size : int
-        Number of leaves, and of numbers in the vector.
-    structure : Structure
-    form : tree
-        Of the same structure, the number of each leaf in its place; other trees are paired with it.
+    size : int
+        Number of numbers in the vector.
 
     Raises
     ------
@@ -131,15 +127,11 @@ class Packing:
     """
 
     def __init__(self, tree: Any, root: str = "x"):
-        self.root = root
-        self.structure = Structure(tree, root)
-        self._leaves = leaves(tree)
-        self.count = self.structure.count
-        check_native(root, *self._leaves)
+        check_native(root, *leaves(tree))
         check_leaves(root, tree)
-        self.form = self.structure.build(range(self.count))
-        self._floating = [is_variable(leaf) for leaf in self._leaves]
-        self.values = [np.asarray(leaf) for leaf in compress(self._leaves, self._floating)]
+        super().__init__(tree, root, is_variable)
+        self._originals = self.variables(tree)
+        self.values = [np.asarray(leaf) for leaf in self._originals]
         if not self.values:
             raise DerivativeError(f"floating values are needed, and {root} holds none; write np.asarray({root}, float)")
         self.complex = any(map(np.iscomplexobj, self.values))
@@ -148,22 +140,9 @@ class Packing:
         self.size = ends[-1]
         self._parts = [slice(start, end) for start, end in zip(ends, ends[1:])]
 
-    @cached_property
-    def names(self) -> list[str]:
-        """Names of the floating leaves, as one would write them: ``x['u'][0]``."""
-        return self.names_under(self.root)
-
-    def names_under(self, root: str) -> list[str]:
-        """Return the names of the floating leaves of a tree of the same structure with another name."""
-        return list(compress(self.structure.names_under(root), self._floating))
-
-    def floating(self, tree: Any, name: str = "tree", **options: Any) -> list:
-        """Return the leaves of a tree of the same structure in the places of the floating ones, see `paired`."""
-        return list(compress(self.structure.leaves_of(tree, name, **options), self._floating))
-
     def pack(self, tree: Any) -> np.ndarray:
         """Return a tree of the same structure as a flat vector of doubles."""
-        return joined(self.floating(tree))
+        return joined(self.variables(tree))
 
     def slopes(self, gradient: Any) -> list[np.ndarray]:
         """Return the floating leaves of a gradient, dL/dRe + i dL/dIm for complex ones.
@@ -181,7 +160,7 @@ class Packing:
             If a leaf has another shape, or holds no numbers.
         """
         advice = f"; return a tree like {self.root}"
-        derivatives = self.floating(gradient, "gradient", advice=advice, error=DerivativeError)
+        derivatives = self.variables(gradient, "gradient", advice=advice, error=DerivativeError)
         slopes = []
         for name, derivative, x in zip(self.names_under("gradient"), derivatives, self.values):
             g = np.asarray(derivative)
@@ -201,7 +180,7 @@ class Packing:
 
     def traced(self, tree: Any) -> Any:
         """Return the floating leaves of a tree that may be traced as one traced vector."""
-        return anp.concatenate([anp.reshape(leaf, (-1,)) for leaf in self.floating(tree)])
+        return anp.concatenate([anp.reshape(leaf, (-1,)) for leaf in self.variables(tree)])
 
     def split(self, vector: Any) -> list:
         """Return the part of a flat vector that belongs to each floating leaf, as views."""
@@ -217,9 +196,7 @@ class Packing:
 
     def tree(self, arrays: Any) -> Any:
         """Return the tree with these floating leaves, numbers where the original has numbers."""
-        values = iter(arrays)
-        pairs = zip(self._leaves, self._floating)
-        return self.structure.build(_like(leaf, next(values)) if floating else leaf for leaf, floating in pairs)
+        return self.build(list(map(_like, self._originals, arrays)))
 
     def unpack(self, vector: np.ndarray) -> Any:
         """Return a flat vector as a fresh tree; every leaf has the type, shape and dtype of its original."""

@@ -13,6 +13,7 @@ instead of G^T g, and g = 0.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from sparsedp.operators.operator import Operator
+    from sparsedp.solvers.choose_method import SolveSettings
 
 __all__ = ["ProjectionSetup", "faces_that", "pressure_conditions"]
 
@@ -50,8 +52,8 @@ class ProjectionSetup(Reconstructible):
     grid : Grid
     solid, boundary
         As `projection` takes them.
-    settings : dict
-        Of the pressure solve, from `check_settings`.
+    settings : SolveSettings
+        Of the pressure solve.
 
     Attributes
     ----------
@@ -71,7 +73,7 @@ class ProjectionSetup(Reconstructible):
 
     passes: tuple[OperatorPasses | CompiledPasses, ...]
 
-    def __init__(self, grid: Grid, solid: ArrayLike | None, boundary: Any, settings: dict[str, Any]) -> None:
+    def __init__(self, grid: Grid, solid: ArrayLike | None, boundary: Any, settings: SolveSettings) -> None:
         self.grid = grid
         self.sides = resolve(grid, boundary, no_slip)
         if solid is None:
@@ -224,17 +226,17 @@ class ProjectionSetup(Reconstructible):
                     raise ValueError(f"the inflow on the {name} enters a region without an outflow; open a side of it")
 
 
-def _pressure_inverse(op: Operator, settings: dict[str, Any]) -> Any:
+def _pressure_inverse(op: Operator, settings: SolveSettings) -> Any:
     """Return the inverse for the pressure.
 
     Transforms are preferred on small grids too, because the compiled passes need them.
     """
-    if settings["method"] == "auto" and op.domain.size < FEW_CELLS and op.separable and op.backend.whole_fields:
+    if settings.method == "auto" and op.domain.size < FEW_CELLS and op.separable and op.backend.whole_fields:
         try:
-            return _pressure_inverse(op, settings | {"method": "separable"})
+            return _pressure_inverse(op, replace(settings, method="separable"))
         except ValueError:  # an axis that cannot be diagonalised accurately
             pass
-    return build(op, name="pressure solve", **settings)
+    return build(op, settings, "pressure solve")
 
 
 def pressure_conditions(grid: Grid, sides: tuple) -> dict[str, tuple]:

@@ -46,7 +46,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp._utils.counters import note, thread
-from sparsedp._utils.pytree import flatten, is_uniform, labels, leaves, mapped, paired
+from sparsedp._utils.pytree import TreeStructure, flatten, is_uniform, labels, leaves, mapped, paired
 from sparsedp._utils.validation import number_beside
 from sparsedp.autodiff.backend import NUMPY, backend_of, replicated
 from sparsedp.autodiff.derivative import push
@@ -679,7 +679,7 @@ class Adaptive(Scheme):
         return perturb, evaluate
 
 
-class FlatDeviation:
+class FlatDeviation(TreeStructure):
     """The deviations of the differentiated leaves of a tree from their values, as one flat array of floats.
 
     Parameters
@@ -692,25 +692,22 @@ class FlatDeviation:
     """
 
     def __init__(self, tree: Any, has_derivative: Callable[[Any], bool], sizes: Sequence) -> None:
-        self.entries, self.rebuild = flatten(tree)
-        self.form = self.rebuild(range(len(self.entries)))
-        self.differentiated = []  # (place, value, unit)
+        super().__init__(tree, "rate", has_derivative)
+        self.values = [plain(leaf) for leaf in self.variables(tree)]
         self.units = []
         shapes = []
-        for place, (leaf, size) in enumerate(zip(self.entries, sizes, strict=True)):
-            if has_derivative(leaf):
-                unit = np.where(size > 0, size, 1.0)
-                self.differentiated.append((place, plain(leaf), unit))
-                self.units.append(unit)
-                shapes += [np.shape(leaf)] * (2 if np.iscomplexobj(plain(leaf)) else 1)
+        for place, value in zip(self.places, self.values, strict=True):
+            self.units.append(np.where(sizes[place] > 0, sizes[place], 1.0))
+            shapes.append(np.shape(value))
+            if np.iscomplexobj(value):
+                shapes.append(np.shape(value))
         self.space = Space(None, parts=shapes)
 
     def deviation(self, tree: Any) -> Any:
         """Return the deviations of a tree, flat."""
-        entries = paired(tree, self.form, "rate")
         parts = []
-        for place, value, unit in self.differentiated:
-            part = replicated(_deviation(entries[place], value) / unit)
+        for leaf, value, unit in zip(self.variables(tree, "rate"), self.values, self.units, strict=True):
+            part = replicated(_deviation(leaf, value) / unit)
             if np.iscomplexobj(value):
                 parts += [anp.real(part), anp.imag(part)]
             else:
@@ -719,14 +716,14 @@ class FlatDeviation:
 
     def tree(self, flat: Any) -> Any:
         """Return the tree with these deviations."""
-        entries = list(self.entries)
+        variables = []
         parts = iter(self.space.split(flat))
-        for place, value, unit in self.differentiated:
+        for value, unit in zip(self.values, self.units, strict=True):
             part = next(parts)
             if np.iscomplexobj(value):
                 part = part + 1j * next(parts)
-            entries[place] = value + cast(unit * part, dtype_of(value))
-        return self.rebuild(entries)
+            variables.append(value + cast(unit * part, dtype_of(value)))
+        return self.build(variables)
 
 
 def _deviation(leaf: Any, value: Any) -> Any:

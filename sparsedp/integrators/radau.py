@@ -58,6 +58,7 @@ if TYPE_CHECKING:
 
     from sparsedp.integrators.events import Event
     from sparsedp.integrators.problem import Problem
+    from sparsedp.solvers.choose_method import SolveSettings
 
 __all__ = ["Radau"]
 
@@ -88,7 +89,7 @@ ENTRIES = 2**20  # of an array of them
 FAST = 0.03  # ratio of two corrections up to which the Jacobian is used for the next step
 
 
-class Flat:
+class FlatProblem:
     """A problem on flat unknowns, and its derivatives.
 
     Parameters
@@ -104,31 +105,31 @@ class Flat:
         require_arrays(name, map(plain, leaves(u)))
         self.problem = problem
         self.timed = problem.timed
-        self.layout = Unknowns(u, name)
-        self.size = self.layout.size
+        self.unknowns = Unknowns(u, name)
+        self.size = self.unknowns.size
         if self.size > UNKNOWNS:
             raise ShapeError(
                 f"{name} solves full systems of at most {UNKNOWNS} unknowns, got {self.size}; take tr_bdf2"
             )
-        self.is_vector = self.layout.shapes == [(self.size,)]
+        self.is_vector = self.unknowns.shapes == [(self.size,)]
 
     def state(self, v: Any) -> Any:
         """Return the tree of flat unknowns."""
         if self.is_vector:
             return v
-        return self.layout.split(v)
+        return self.unknowns.split(v)
 
     def __call__(self, v: Any, params: Any, t: Any) -> Any:
         """Return the flat rate."""
         rate = self.problem(self.state(v), params, t)
         if self.is_vector:
             return rate
-        return self.layout.flat(rate)
+        return self.unknowns.flat(rate)
 
     def rows(self, points: Iterable[tuple], params: Any, moving: Sequence[bool]) -> tuple[np.ndarray, np.ndarray]:
         """Return the rates at points (v, t), and their derivatives in the state, the moving params, and the time."""
         trees = [(self.state(v), params, t) for v, t in points]
-        is_differentiated = [*[True] * len(self.layout.shapes), *moving, True]
+        is_differentiated = [*[True] * len(self.unknowns.shapes), *moving, True]
         return jacobians_of(lambda tree: self.problem(*tree), trees, is_differentiated)
 
 
@@ -144,7 +145,7 @@ class Radau(Adaptive):
         As `Adaptive`; None: one step.
     floor : None, number, or tree like the state
         As `Adaptive`.
-    settings : dict
+    settings : SolveSettings
         rtol and maxiter, of Newton's method where there is no error control.
 
     Attributes
@@ -184,7 +185,7 @@ class Radau(Adaptive):
         jacobian: Callable | None,
         tolerance: Any,
         floor: Any,
-        settings: Any,
+        settings: SolveSettings,
         max_step: float | None = None,
     ) -> None:
         super().__init__(Scheme(problem, "radau", 5), tolerance, floor, max_step)
@@ -193,11 +194,11 @@ class Radau(Adaptive):
         if tolerance:
             self.newton_tolerance = NEWTON * tolerance
         else:
-            self.newton_tolerance = settings["rtol"]
+            self.newton_tolerance = settings.rtol
         if tolerance:
             self.max_iterations = ITERATIONS
         else:
-            self.max_iterations = settings["maxiter"] or 50
+            self.max_iterations = settings.maxiter or 50
         self.compared = EMBEDDED
         self.ratio = 1.0
         self.weight = 1.0
@@ -214,10 +215,10 @@ class Radau(Adaptive):
     def interval(self, u: Any, params: Any, t: Any, h: Any) -> tuple[Radau, tuple]:
         """Return a copy for an interval, and its arguments: flat unknowns, moving params, time and length."""
         run = copy(self)
-        run.problem = Flat(self.problem, u, self.name)
+        run.problem = FlatProblem(self.problem, u, self.name)
         run.params = constant(untraced(params))
         run.moving = [isbox(leaf) for leaf in leaves(params)]
-        v = run.problem.layout.space.join(*(cast(leaf, float) for leaf in leaves(u)))
+        v = run.problem.unknowns.space.join(*(cast(leaf, float) for leaf in leaves(u)))
         if v.size:
             run.check(u, params, t, h)
         moving = [leaf for leaf in leaves(params) if isbox(leaf)]
@@ -249,7 +250,7 @@ class Radau(Adaptive):
 
     def rounded(self, v: Any) -> Any:
         """Return the state at the end of an interval."""
-        return self.problem.layout.rounded(v)
+        return self.problem.unknowns.rounded(v)
 
     def partial_step(self, step: AcceptedStep, arguments: tuple, length: float) -> AcceptedStep | None:
         """Return the step from the same state with another length, to rounding; None if there is none."""
@@ -564,7 +565,7 @@ class Radau(Adaptive):
         n = self.problem.size
         params = unsided(self.params)
         point = self.problem.state(step.new), params, t + length
-        moving = [*[True] * len(self.problem.layout.shapes), *self.moving[: len(leaves(params))], True]
+        moving = [*[True] * len(self.problem.unknowns.shapes), *self.moving[: len(leaves(params))], True]
         _, rows = jacobians_of(lambda point: event.value(point[0], unsided(point[1]), point[2]), [point], moving)
         of_state, of_params, of_time = np.split(rows[0, 0], [n, rows.shape[2] - 1])
         change = float(of_state @ stretch[0] + of_time[0])

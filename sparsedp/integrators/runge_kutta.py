@@ -65,6 +65,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from sparsedp.integrators.problem import Problem
+    from sparsedp.solvers.choose_method import SolveSettings
 
 __all__ = [
     "EXPLICIT",
@@ -252,8 +253,7 @@ class Resolvent:
         L, from a space to itself.
     name : str
         For messages and counts.
-    settings : dict
-        method, rtol, maxiter, nullspace, options: as in `inverse`.
+    settings : SolveSettings
     most : int
         Number of set-ups that are kept.
     log : SolveLog, optional
@@ -264,7 +264,9 @@ class Resolvent:
     info : SolveLog
     """
 
-    def __init__(self, op: Operator, name: str, settings: dict, most: int = 2, log: SolveLog | None = None) -> None:
+    def __init__(
+        self, op: Operator, name: str, settings: SolveSettings, most: int = 2, log: SolveLog | None = None
+    ) -> None:
         from sparsedp.operators.masks_and_lift import identity  # not needed by explicit schemes
 
         self.op = op
@@ -301,7 +303,7 @@ class Resolvent:
 
     def _set_up(self, z: float) -> Operator:
         """Return the inverse of 1 - z L."""
-        inverse = build(self._one - z * self.op, name=self.name, log=self.info, **self.settings)
+        inverse = build(self._one - z * self.op, self.settings, self.name, self.info)
         self._check_sign(inverse.structure.solver.system)
         P = self._projection
         if P is None:
@@ -328,7 +330,7 @@ class Resolvent:
     @cached_property
     def _projection(self) -> Operator | None:
         """Return the projection along the null space of L; None where there is none, or L is unsymmetric."""
-        system = self.op.backend.implementation(System)(self.op, self.settings["rtol"], None)
+        system = self.op.backend.implementation(System)(self.op, self.settings.rtol, None)
         if not self.op.structure.has_entries or system.complex or system.weights is None:
             return None
         null = system.null_space
@@ -408,13 +410,14 @@ class Linear(Stages):
     problem : Problem
     name : str
         One of IMPLICIT.
-    settings, most
-        As `Resolvent` takes them.
+    settings : SolveSettings
+    most : int
+        As `Resolvent` takes it.
     """
 
     dyadic = True
 
-    def __init__(self, problem: Problem, name: str, settings: dict, most: int) -> None:
+    def __init__(self, problem: Problem, name: str, settings: SolveSettings, most: int) -> None:
         super().__init__(problem, name)
         self.info = SolveLog()
         self.resolvents = {}
@@ -453,14 +456,13 @@ class Nonlinear(Stages):
         One of IMPLICIT, except imex.
     jacobian : callable or None
         ``jacobian(u, params)`` or ``jacobian(u, params, t)``: df/du.
-    settings : dict
-        As `Resolvent` takes them.
+    settings : SolveSettings
     """
 
-    def __init__(self, problem: Problem, name: str, jacobian: Callable | None, settings: dict) -> None:
+    def __init__(self, problem: Problem, name: str, jacobian: Callable | None, settings: SolveSettings) -> None:
         super().__init__(problem, name)
-        options = (settings | settings["options"]).items()
-        options = {word: value for word, value in options if word != "options" and value is not None}
+        options = vars(settings) | settings.options
+        options = {word: value for word, value in options.items() if word != "options" and value is not None}
 
         def residual(x: Any, b: Any, h: Any, params: Any, t: Any) -> Any:
             return combine(x, (-1.0, b), (-h, problem(x, params, t)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from sparsedp.integrators.adaptive import Adaptive
+    from sparsedp.solvers.choose_method import SolveSettings
 
 __all__ = ["METHODS", "Step", "stepper"]
 
@@ -275,10 +277,10 @@ def stepper(
     return Step(method, dt, scheme, limits, arguments)
 
 
-def _solver_settings(solver: str, rtol: float, maxiter: int | None, options: dict) -> dict:
+def _solver_settings(solver: str, rtol: float, maxiter: int | None, options: dict) -> SolveSettings:
     """Return the settings of solves; `implicit` alone takes the option sparsity."""
     checked = {word: value for word, value in options.items() if word != "sparsity"}
-    return check_settings(solver, rtol, maxiter, "raise", checked) | {"options": options}
+    return replace(check_settings(solver, rtol, maxiter, "raise", checked), options=options)
 
 
 def _check_interruptions(arguments: dict) -> None:
@@ -308,7 +310,7 @@ def _rebuilt(arguments: dict) -> Step:
     return stepper(**named, **arguments["options"])
 
 
-def _scheme(method: str, arguments: dict, settings: dict) -> Any:
+def _scheme(method: str, arguments: dict, settings: SolveSettings) -> Any:
     """Return the scheme of a method; modules that only some methods need are imported for those alone."""
     if method == "leapfrog":
         from sparsedp.integrators.leapfrog import Leapfrog
@@ -335,7 +337,7 @@ def _scheme(method: str, arguments: dict, settings: dict) -> Any:
 
 
 def _fixed_scheme(
-    method: str, problem: Problem, jacobian: Callable | None, settings: dict, has_tolerance: bool
+    method: str, problem: Problem, jacobian: Callable | None, settings: SolveSettings, has_tolerance: bool
 ) -> Scheme:
     """Return a scheme without error control."""
     if method in ("imex", "etdrk4") and not problem.stiff:

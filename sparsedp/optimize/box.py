@@ -90,7 +90,7 @@ class Box:
 
 def _flat_side(side, without_bound, packing, name):
     """Return one side of the bounds as a flat vector; a number or None may stand for a whole branch of start."""
-    bounds = packing.floating(side, name, advice="; write one number, None, or a tree like start", prefix=is_uniform)
+    bounds = packing.variables(side, name, advice="; write one number, None, or a tree like start", prefix=is_uniform)
     arrays = []
     for bound, x, bound_name, x_name in zip(bounds, packing.values, packing.names_under(name), packing.names):
         if bound is None:

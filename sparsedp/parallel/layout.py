@@ -138,9 +138,10 @@ class Layout(Partition, Backend):
         }
         return replacements.get(default, default)
 
-    def system_and_choice(self, op: Any, rtol: Any, maxiter: Any, method: str, options: Any, solves: Any) -> Any:
+    def system_and_choice(self, op: Any, settings: Any, solves: Any) -> Any:
         """Return the System of an operator on ranks, and that PETSc solves it."""
-        return self.system(op, rtol, maxiter, method, options), Choice("petsc", str(self))
+        system = self.system(op, settings.rtol, settings.maxiter, settings.method, settings.options)
+        return system, Choice("petsc", str(self))
 
     def minimize(self, *given: Any) -> Any:
         """`minimize` of unknowns on ranks."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 __all__ = [
     "METHODS",
     "Choice",
+    "SolveSettings",
     "check_options",
     "check_settings",
     "check_unknowns",
@@ -102,17 +104,28 @@ class Choice(NamedTuple):
 # ---- settings ----
 
 
+@dataclass(frozen=True, eq=False)
+class SolveSettings:
+    """The checked settings of a solve; see `inverse`."""
+
+    method: str
+    rtol: float
+    maxiter: int | None
+    nullspace: str
+    options: dict[str, Any]
+
+
 def check_settings(
     method: str, rtol: float, maxiter: int | None, nullspace: str, options: dict[str, Any]
-) -> dict[str, Any]:
-    """Check the settings of a solve, and return them as keywords of `build`."""
+) -> SolveSettings:
+    """Check the settings of a solve."""
     check_choice("method", method, ("auto", *METHODS), _method_advice(method))
     rtol = check_number("rtol", rtol, "between 0 and 1", "; the default is 1e-10")
     if maxiter is not None:
         maxiter = check_whole("maxiter", maxiter, 1, "; None leaves it to the method")
     check_choice("nullspace", nullspace, ("raise", "project"))
     check_options(method, options)
-    return dict(method=method, rtol=rtol, maxiter=maxiter, nullspace=nullspace, options=copied(options))
+    return SolveSettings(method, rtol, maxiter, nullspace, copied(options))
 
 
 def _method_advice(method: Any) -> str:

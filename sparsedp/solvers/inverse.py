@@ -22,6 +22,7 @@ from sparsedp.operators.operator import Operator
 from sparsedp.operators.structure.base import Structure, result_dtype
 from sparsedp.solvers.choose_method import (
     Choice,
+    SolveSettings,
     check_options,
     check_settings,
     check_unknowns,
@@ -134,7 +135,7 @@ def inverse(
     if not fits(op.domain, op.codomain):
         raise ShapeError(f"inverse takes a square operator, got one from {op.domain} to {op.codomain}; write op.T @ op")
     settings = check_settings(method, rtol, maxiter, nullspace, options)
-    return collectively("inverse", (op,), lambda: build(op, **settings))
+    return collectively("inverse", (op,), lambda: build(op, settings))
 
 
 # ---- set-up ----
@@ -142,24 +143,19 @@ def inverse(
 
 def build(
     op: Operator,
-    method: str,
-    rtol: float,
-    maxiter: int | None,
-    nullspace: str,
-    options: dict[str, Any],
+    settings: SolveSettings,
     name: str | None = None,
     log: SolveLog | None = None,
     solves: str = "many",
     near: Engine | None = None,
     all_rows: bool = True,
 ) -> Inverse:
-    """Set up an inverse with settings that are checked.
+    """Set up an inverse.
 
     Parameters
     ----------
     op : Operator
-    method, rtol, maxiter, nullspace, options
-        See `inverse`.
+    settings : SolveSettings
     name : str, optional
         Of the inverse in messages and counts.
     log : SolveLog, optional
@@ -174,31 +170,30 @@ def build(
     """
     start_time = perf_counter()
     choose = op.backend.implementation(system_and_choice)
-    system, choice = choose(op, rtol, maxiter, method, options, solves)
+    system, choice = choose(op, settings, solves)
     if system.complex and choice.method not in ("direct", "krylov"):
         raise ValueError(f"{choice.method} takes real operators, {op} is complex; write method='direct' or 'krylov'")
     if all_rows:
         check_unknowns(system)
-    engine = engine_of(system, choice, options, near)
+    engine = engine_of(system, choice, settings.options, near)
     name = name or f"inverse({op.name})"
-    made = build, (op, method, rtol, maxiter, nullspace, options, name, None, solves, None, all_rows)
-    solver = Solver(system, engine, nullspace, log or SolveLog(), name, made, choice.reason)
+    made = build, (op, settings, name, None, solves, None, all_rows)
+    solver = Solver(system, engine, settings.nullspace, log or SolveLog(), name, made, choice.reason)
     _record_set_up(solver, start_time)
     return Inverse(Solution(solver))
 
 
-def system_and_choice(
-    op: Operator, rtol: float, maxiter: int | None, method: str, options: dict, solves: str
-) -> tuple[System, Choice]:
+def system_and_choice(op: Operator, settings: SolveSettings, solves: str) -> tuple[System, Choice]:
     """Return the System of an operator, and the method that solves it: see `build`."""
-    system = System(op, rtol, maxiter)
+    method = settings.method
+    system = System(op, settings.rtol, settings.maxiter)
     if method in ("krylov", "separable"):
         system.splitting = None  # these solve for all unknowns, without looking at the entries
     if method == "auto":
         choice = choose_method(system, solves)
     else:
         choice = Choice(method, "as asked")
-    check_options(choice.method, options)
+    check_options(choice.method, settings.options)
     return system, choice
 
 

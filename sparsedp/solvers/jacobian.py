@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from sparsedp.solvers.choose_method import SolveSettings
     from sparsedp.solvers.engine import Engine
     from sparsedp.solvers.records import SolveInfo
     from sparsedp.solvers.solve import Solver
@@ -171,8 +172,8 @@ class Jacobians:
         ``jacobian(x, *params)``, supplied by the user.
     sparsity : sparse matrix or None
         Supplied by the user.
-    settings : dict
-        Keywords of `build`.
+    settings : SolveSettings
+        Of the linear solves.
 
     Attributes
     ----------
@@ -180,10 +181,11 @@ class Jacobians:
         How the Jacobians are obtained; empty before the first one.
     """
 
-    def __init__(self, name: str, jacobian: Callable[..., Any] | None, sparsity: Any, settings: dict[str, Any]) -> None:
+    def __init__(self, name: str, jacobian: Callable[..., Any] | None, sparsity: Any, settings: SolveSettings) -> None:
         self.name = name
         self.user_jacobian = jacobian
-        self.settings = dict(settings, name=f"{name}.jacobian")
+        self.settings = settings
+        self.solver_name = f"{name}.jacobian"
         self.sparsity: Any = None if sparsity is None else pattern_like(sparsity)
         self.description = ""
         # The values of `by_rows` of ColouredPattern that the residual allows: True by VJPs, False by JVPs.
@@ -256,14 +258,14 @@ class Jacobians:
         solver = self._matrices.find(key)
         if solver is not None:
             return solver
-        if op.shape[0] <= DENSE_UP_TO and self.settings["method"] in ("auto", "direct"):
-            solver = build_dense(op, self.settings["rtol"], self.settings["nullspace"], self.settings["name"])
+        if op.shape[0] <= DENSE_UP_TO and self.settings.method in ("auto", "direct"):
+            solver = build_dense(op, self.settings.rtol, self.settings.nullspace, self.solver_name)
         if solver is None:
             solver = self._build(op, near)
         return self._matrices.put(key, solver)
 
     def _build(self, op, near):
-        return build(op, **self.settings, solves="few", near=near, all_rows=False).solver
+        return build(op, self.settings, self.solver_name, solves="few", near=near, all_rows=False).solver
 
     def check_after_slow_step(self, linearisation: Linearisation) -> bool:
         """Do the same as `complete_pattern`, unless the user supplied the Jacobian: it may be a simpler one."""
@@ -321,7 +323,7 @@ class Jacobians:
     def _operator(self, equation, x, leaves):
         """Return J as an Operator, explicit where its entries are known, and whether it is certainly exact."""
         unknowns = equation.unknowns
-        name = self.settings["name"]
+        name = self.solver_name
         if self.user_jacobian is not None:
             self.description = "given"
             jacobian = self.user_jacobian(unknowns.split(x), *equation.params(leaves))
@@ -400,7 +402,7 @@ class Jacobians:
             self.description = "assembled on the pattern given"
             check_shape(f"the sparsity of {self.name}", self.sparsity, (size, size))
             return self._store_coloured(self.sparsity, equation, x, leaves)
-        if self.settings["method"] == "krylov":
+        if self.settings.method == "krylov":
             self.description = "products only, as asked"
             return self._store(unknowns.space, KnownPattern(None, None))
         if size <= FULL_UP_TO:
@@ -411,7 +413,7 @@ class Jacobians:
         if self._is_stencil(equation, points, leaves):
             return self._patterns[unknowns.space]
         pattern = self._probed_pattern(equation, points, leaves)
-        if pattern is None and self.settings["method"] == "auto" and size > FULL_AT_MOST:
+        if pattern is None and self.settings.method == "auto" and size > FULL_AT_MOST:
             self.description = f"products only: {size} unknowns and a Jacobian that is not sparse"
             return self._store(unknowns.space, KnownPattern(None, None))
         if pattern is None:

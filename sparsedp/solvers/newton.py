@@ -44,7 +44,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp._utils.counters import note
-from sparsedp._utils.pytree import flatten, keys, leaves, paired, placed
+from sparsedp._utils.pytree import TreeStructure, keys, leaves
 from sparsedp._utils.validation import check_finite, check_leaves, check_plain, check_precision, number_beside
 from sparsedp.autodiff.backend import as_field, backend_of, replicated
 from sparsedp.autodiff.derivative import pullback, push
@@ -88,8 +88,8 @@ TINY = 1e-8  # an iterate that shrinks to less than this share of the last one m
 # ---- the residual as a function of flat unknowns ---------------------------------------------------------------------
 
 
-class Unknowns:
-    """How the unknowns, an array or a tree of arrays, are stored in one flat float64 array or distributed field.
+class Unknowns(TreeStructure):
+    """The unknowns, an array or a tree of arrays, and how they lie in one flat float64 array or distributed field.
 
     Parameters
     ----------
@@ -100,8 +100,6 @@ class Unknowns:
 
     Attributes
     ----------
-    tree : tree
-        The structure of the unknowns, with None for each array.
     shapes : list of tuples of int
     dtypes : list of dtype
         Of the solution.
@@ -114,13 +112,10 @@ class Unknowns:
     """
 
     def __init__(self, guess: Any, name: str) -> None:
-        arrays, rebuild = flatten(guess)
-        arrays = [plain(leaf) for leaf in arrays]
+        super().__init__(guess, "x")
+        arrays = [plain(leaf) for leaf in leaves(guess)]
         for leaf in arrays:
             _check_unknown(leaf, name)
-        # Rebuilt without values: caches refer to this object, and it must hold neither a trace nor a large array.
-        self.tree = rebuild([None] * len(arrays))
-        _, self.rebuild = flatten(self.tree)
         self.shapes = [np.shape(leaf) for leaf in arrays]
         self.dtypes = [_solution_dtype(leaf) for leaf in arrays]
         self.is_scalar = isinstance(guess, (int, float)) and not isinstance(guess, np.generic)
@@ -135,7 +130,7 @@ class Unknowns:
 
     def split(self, x: Any) -> Any:
         """Return the tree of unknowns of a flat array, which may be traced."""
-        return self.rebuild(self._fields(x))
+        return self.build(self._fields(x))
 
     def _fields(self, x):
         return self.backend.split(self.space, x)
@@ -161,7 +156,7 @@ class Unknowns:
         if self.is_scalar and not isbox(x):
             return float(x[0])
         convert = np.array if type(x) is np.ndarray else cast
-        return self.rebuild(map(convert, self._fields(x), self.dtypes))
+        return self.build(list(map(convert, self._fields(x), self.dtypes)))
 
 
 def space_of_unknowns(name: str, fields: Sequence[Any]) -> Space:
@@ -200,8 +195,8 @@ class Equation:
 
     Attributes
     ----------
-    statics : list
-        The leaves of the parameters, with None for each floating one.
+    parameters : TreeStructure
+        Of the parameters; their floating leaves are its variables.
     root_residual : float or None
         Norm of the residual at the root, once Newton's method has found it.
     """
@@ -213,10 +208,7 @@ class Equation:
         self.unknowns = unknowns
         self.name = name
         check_leaves(f"parameters of {name}", params, containers=False)
-        param_leaves, rebuild = flatten(params)
-        self._variable_places = [place for place, leaf in enumerate(param_leaves) if is_variable(leaf)]
-        self.statics = [None if is_variable(leaf) else constant(leaf) for leaf in param_leaves]
-        _, self._rebuild = flatten(rebuild(self.statics))  # caches refer to equations, which must hold no trace
+        self.parameters = TreeStructure(params, "params", is_variable, constant)
 
     @property
     def size(self) -> int:
@@ -225,8 +217,7 @@ class Equation:
 
     def variables(self, params: Sequence[Any]) -> list[Any]:
         """Return the floating leaves of parameters of this structure, traced or not."""
-        param_leaves = leaves(params)
-        return [param_leaves[place] for place in self._variable_places]
+        return self.parameters.variables(params)
 
     def check_finite(self, values: Sequence[Any]) -> None:
         """Raise NonFiniteError if a plain parameter holds NaN or infinity."""
@@ -237,7 +228,7 @@ class Equation:
 
     def params(self, values: Sequence[Any]) -> tuple[Any, ...]:
         """Return the tuple of parameters with these floating leaves."""
-        return self._rebuild(placed(self.statics, self._variable_places, values))
+        return self.parameters.build(values)
 
     def __call__(self, x: Any, *values: Any) -> Any:
         """Return the flat residual; differentiable in x and in the leaves."""
@@ -259,14 +250,14 @@ class Equation:
 
         A residual of another structure than the unknowns, such as one array or a list, is taken in its own order.
         """
-        tree = self.unknowns.tree
+        tree = self.unknowns.template
         if keys(result) is None or keys(tree) is None or isinstance(result, dict) != isinstance(tree, dict):
             return leaves(result)
         if isinstance(result, (tuple, list)) != isinstance(tree, (tuple, list)):
             return leaves(result)
         if isinstance(result, (tuple, list)) and len(result) != len(tree):
             return leaves(result)
-        return paired(result, tree, "residual", f" of {self.name}", "; return a tree like x")
+        return self.unknowns.variables(result, "residual", owner=f" of {self.name}", advice="; return a tree like x")
 
     def _flat(self, result):
         parts = self._residual_leaves(result)

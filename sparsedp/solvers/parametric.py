@@ -45,6 +45,7 @@ from sparsedp.solvers.sparsity import pattern_like
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
+    from sparsedp.solvers.choose_method import SolveSettings
     from sparsedp.solvers.inverse import Inverse
 
 __all__ = ["Elliptic", "EllipticSolver", "MatrixSolver", "elliptic_solver", "matrix_solver"]
@@ -62,8 +63,7 @@ class ParametricSolver(Reconstructible):
     Parameters
     ----------
     D, G : Operator
-    settings : dict
-        Checked settings of `build`.
+    settings : SolveSettings
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class ParametricSolver(Reconstructible):
     all_rows = True  # refuse an operator with an equation that no unknown can satisfy: see `build`
     _operator: Any
 
-    def __init__(self, D: Operator, G: Operator, settings: dict[str, Any]) -> None:
+    def __init__(self, D: Operator, G: Operator, settings: SolveSettings) -> None:
         self.D = D
         self.G = G
         self.info = SolveLog()
@@ -122,7 +122,7 @@ class ParametricSolver(Reconstructible):
         scaled_k = shifted(k, -exponent) if exponent else k.copy()
         scaled_shift = shifted(np.atleast_1d(shift), -exponent).reshape(np.shape(shift))
         op = self._operator(scaled_k, scaled_shift)
-        inverse = build(op, name=self.name, log=self.info, solves="few", all_rows=self.all_rows, **self._settings)
+        inverse = build(op, self._settings, self.name, self.info, solves="few", all_rows=self.all_rows)
         inverse.solver.system.exponent += exponent  # solutions are scaled back by it
         return self._cache.put((k, shift), inverse)
 
@@ -342,7 +342,7 @@ class EllipticSolver(ParametricSolver):
         name = f"{shift_name} - {self.D.name} @ diag(k) @ {self.G.name}"
         is_real = np.result_type(k, shift).kind == "f"
         is_constant = is_real and not shift.ndim and k.size and np.all(k == k[0])
-        if is_constant and self._divergence_of_gradient.separable and self._settings["method"] != "direct":
+        if is_constant and self._divergence_of_gradient.separable and self._settings.method != "direct":
             # Constant coefficients: the operator remains a sum of 1-D factors.
             op = -k[0] * self._divergence_of_gradient + float(shift) * identity(self.G.domain)
             return Operator(op.structure, self.G.domain, self.D.codomain, name)
@@ -588,8 +588,7 @@ class MatrixSolver(ParametricSolver):
     ----------
     pattern : csr_array
     domain : Space
-    settings : dict
-        Checked settings of `build`.
+    settings : SolveSettings
     assembly : Operator, optional
 
     Attributes
@@ -608,7 +607,7 @@ class MatrixSolver(ParametricSolver):
         self,
         pattern: sp.csr_array,
         domain: Space,
-        settings: dict[str, Any],
+        settings: SolveSettings,
         assembly: Operator | None = None,
     ) -> None:
         self.domain = domain

@@ -12,6 +12,7 @@ Both linear solves are derivative rules themselves, of b, x and p: see adjoint.p
 from __future__ import annotations
 
 from contextlib import contextmanager
+from dataclasses import replace
 from threading import get_ident
 from typing import TYPE_CHECKING, Any
 
@@ -37,6 +38,7 @@ from sparsedp.solvers.solve import Run
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
+    from sparsedp.solvers.choose_method import SolveSettings
     from sparsedp.solvers.jacobian import Linearisation
 
 __all__ = ["Root", "implicit", "steady"]
@@ -143,8 +145,8 @@ def implicit(
     if jacobian is not None:
         check_function("implicit, as jacobian,", jacobian, "lambda x: ...")
     settings = check_settings(method, rtol, maxiter, nullspace, options)
-    check_whole("maxiter", maxiter, 1, "; the default is 50")
-    return Root(residual, jacobian, sparsity, settings.pop("maxiter"), settings)
+    maxiter = check_whole("maxiter", maxiter, 1, "; the default is 50")
+    return Root(residual, jacobian, sparsity, maxiter, replace(settings, maxiter=None))
 
 
 def steady(residual: Callable[..., Any], guess: Any, *params: Any, **options: Any) -> Any:
@@ -224,8 +226,8 @@ class Root(Reconstructible):
     ----------
     residual, jacobian, sparsity, maxiter
         As in `implicit`.
-    settings : dict
-        Checked settings of the linear solves.
+    settings : SolveSettings
+        Of the linear solves.
 
     Attributes
     ----------
@@ -239,17 +241,17 @@ class Root(Reconstructible):
         jacobian: Callable[..., Any] | None,
         sparsity: Any,
         maxiter: int,
-        settings: dict[str, Any],
+        settings: SolveSettings,
     ) -> None:
         self.residual = residual
-        self.rtol: float = settings["rtol"]
+        self.rtol: float = settings.rtol
         self.maxiter = maxiter
         self.name = f"implicit({getattr(residual, '__name__', type(residual).__name__)})"
         self.info = SolveLog()
         self._settings = settings
         # For each thread inside `series`: number of unknowns -> Jacobian of the last solve.
         self._series: dict[int, dict[int, Linearisation]] = {}
-        self._jacobians = Jacobians(self.name, jacobian, sparsity, dict(settings, maxiter=None))
+        self._jacobians = Jacobians(self.name, jacobian, sparsity, settings)
         self._solution = Rule(self.name, self._forward, self._vjp, self._jvp)
 
     def recipe(self) -> tuple[type[Root], tuple[Any, ...]]:

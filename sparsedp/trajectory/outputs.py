@@ -23,7 +23,7 @@ from sparsedp.trajectory.specification import fingerprint, owned, refuse_mask, s
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from sparsedp.trajectory.specification import Layout
+    from sparsedp.trajectory.specification import ArgumentForm
     from sparsedp.trajectory.step_runner import State, StepRunner
 
 __all__ = ["AllStates", "FunctionOfStates", "LastState", "SelectedStates", "make_outputs"]
@@ -31,14 +31,14 @@ __all__ = ["AllStates", "FunctionOfStates", "LastState", "SelectedStates", "make
 NOT_REPEATABLE = "keep returns something else when it is called again; it must depend on its arguments only"
 
 
-def make_outputs(keep: Any, layout: Layout, n: int) -> LastState:
+def make_outputs(keep: Any, form: ArgumentForm, n: int) -> LastState:
     """Return the kind of output that `keep` of a rollout of n steps asks for; refuse anything else."""
     if isinstance(keep, str) and keep == "last":
-        return LastState(layout)
+        return LastState(form)
     if isinstance(keep, str) and keep == "all":
-        return AllStates(layout, range(n + 1))
+        return AllStates(form, range(n + 1))
     if callable(keep):
-        return FunctionOfStates(layout, keep)
+        return FunctionOfStates(form, keep)
     if not isinstance(keep, (list, tuple, range, np.ndarray)):
         raise ValueError(f'keep must be "last", "all", a list of states or a function of (index, state), got {keep!r}')
     numbers = list(keep)
@@ -46,7 +46,7 @@ def make_outputs(keep: Any, layout: Layout, n: int) -> LastState:
         raise ValueError(f"keep needs at least one state, numbers from 0 on, got {keep!r}")
     if numbers[-1] > n or any(later <= number for number, later in pairwise(numbers)):
         raise ValueError(f"keep needs rising numbers of states from 0 to n = {n}, got {keep!r}")
-    return SelectedStates(layout, numbers)
+    return SelectedStates(form, numbers)
 
 
 class LastState:
@@ -54,15 +54,15 @@ class LastState:
 
     Parameters
     ----------
-    layout : Layout
+    form : ArgumentForm
     """
 
     enters_everywhere = False  # whether cotangents may enter at any state, not at the last one alone
     is_exact = True  # whether the states of the backward pass have the same bits as those of the forward pass
     holds_all_states = False  # whether every state is returned, and thereby kept
 
-    def __init__(self, layout: Layout) -> None:
-        self.layout = layout
+    def __init__(self, form: ArgumentForm) -> None:
+        self.form = form
         self._statics: Any = None
 
     def start(self, runner: StepRunner) -> None:
@@ -80,12 +80,12 @@ class LastState:
     def tree(self, arrays: Sequence) -> Any:
         """Return the user's result, from arrays as `finish` returns them."""
         values = []
-        for value, is_python_float in zip(arrays, self.layout.is_float, strict=True):
+        for value, is_python_float in zip(arrays, self.form.is_float, strict=True):
             if is_python_float and not isbox(value):
                 values.append(float(value))
             else:
                 values.append(value)
-        return self.layout.build(values, self._statics)
+        return self.form.build(values, self._statics)
 
     def sources(self, n: int, cotangents: list) -> Callable[[State], list | None]:
         """Return a function from a state to the cotangents that enter there, or None; n is the last state."""
@@ -110,15 +110,15 @@ class SelectedStates(LastState):
 
     Parameters
     ----------
-    layout : Layout
+    form : ArgumentForm
     numbers : sequence of int
         Rising.
     """
 
     enters_everywhere = True
 
-    def __init__(self, layout: Layout, numbers: Sequence[int]) -> None:
-        super().__init__(layout)
+    def __init__(self, form: ArgumentForm, numbers: Sequence[int]) -> None:
+        super().__init__(form)
         self._rows = {number: row for row, number in enumerate(numbers)}
         self._places: list = []  # of each variable: the place of its stack, or the slice of its states
 
@@ -128,7 +128,7 @@ class SelectedStates(LastState):
         self._blocks: list = []
         self._statics = []
         self._is_stored = bool(runner.specification.differentiated)
-        for shape, dtype, value in zip(self.layout.shapes, self.layout.dtypes, runner.first.values, strict=True):
+        for shape, dtype, value in zip(self.form.shapes, self.form.dtypes, runner.first.values, strict=True):
             if runner.outer or is_distributed(value):
                 self._blocks.append([None] * n)
             else:
@@ -185,7 +185,7 @@ class SelectedStates(LastState):
     def tree(self, arrays: Sequence) -> Any:
         """Return the user's result, from arrays as `finish` returns them."""
         statics = [_along_trajectory(leaf) for leaf in zip(*self._statics, strict=True)]
-        return self.layout.build(self._grouped(arrays), statics)
+        return self.form.build(self._grouped(arrays), statics)
 
     def sources(self, n: int, cotangents: list) -> Callable[[State], list | None]:
         """Return a function from a state to the cotangents that enter there, or None."""
@@ -233,14 +233,14 @@ class FunctionOfStates(LastState):
 
     Parameters
     ----------
-    layout : Layout
+    form : ArgumentForm
     function : callable
     """
 
     enters_everywhere = True
 
-    def __init__(self, layout: Layout, function: Callable) -> None:
-        super().__init__(layout)
+    def __init__(self, form: ArgumentForm, function: Callable) -> None:
+        super().__init__(form)
         self.function = function
         self._fingerprints: list = []  # of the results, to compare with those of further calls
         self._trees: list = []  # the results, with a _StackedResult in place of each floating leaf
@@ -322,7 +322,7 @@ class FunctionOfStates(LastState):
         """Return a function from a state to the cotangents that enter there."""
 
         def source(state: State) -> list:
-            tree = self.layout.build(state.values, state.statics)
+            tree = self.form.build(state.values, state.statics)
             first = self._trees[state.i]
 
             def function(tree: Any) -> list:
@@ -337,6 +337,6 @@ class FunctionOfStates(LastState):
                 else:
                     entering.append(None)
             pulled = pull(entering)
-            return [pulled[place] for place in self.layout.places]
+            return [pulled[place] for place in self.form.places]
 
         return source

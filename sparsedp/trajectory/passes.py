@@ -251,8 +251,8 @@ def check_repeated(specification: RolloutSpecification, fingerprints: list, earl
     """Refuse a state that differs from the same state of an earlier run; both as fingerprints."""
     if fingerprints == earlier:
         return
-    layout = specification.state
-    names = [*layout.names, *[layout.root] * len(fingerprints)]
+    form = specification.state
+    names = [*form.names, *[form.root] * len(fingerprints)]
     name = next(name for name, a, b in zip(names, fingerprints, earlier, strict=False) if a != b)
     raise DerivativeError(f"the step gives another {name} when it is run again; it must depend on its arguments only")
 
@@ -331,7 +331,7 @@ class RolloutRule(Rule):
     def again(self, *args: Any) -> Any:
         """Run the same steps from other values, which may be on any trace, without `progress` and `record`."""
         old = self.specification
-        specification = RolloutSpecification(old.step, old.layouts, old.n, old.truncate, innermost(args))
+        specification = RolloutSpecification(old.step, old.forms, old.n, old.truncate, innermost(args))
         rule = RolloutRule(specification, self.plan, copy(self.outputs), False, None)
         return through(rule, specification.differentiated, *args)
 

@@ -24,7 +24,7 @@ from sparsedp.trajectory.checkpoint_plan import (
 )
 from sparsedp.trajectory.outputs import make_outputs
 from sparsedp.trajectory.passes import RolloutRule
-from sparsedp.trajectory.specification import Layout, RolloutSpecification
+from sparsedp.trajectory.specification import ArgumentForm, RolloutSpecification, contiguous
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -149,7 +149,7 @@ def rollout(
     trees = {"state": state, "params": params}
     if inputs is not None:
         trees["inputs"] = inputs
-    layouts = [Layout(tree, name) for name, tree in trees.items()]
+    forms = [ArgumentForm(tree, name) for name, tree in trees.items()]
     _check_inputs(inputs, n)
     if inputs is None:
         check_takes("rollout", step, 2, "lambda state, params: ...")
@@ -157,23 +157,23 @@ def rollout(
         check_takes("rollout", step, 3, "lambda state, params, input: ...")
     args = []
     memory_beside = 0  # of params and inputs, and of their gradients
-    for layout, tree in zip(layouts, trees.values()):
-        variables = layout.variables(tree)
+    for form, tree in zip(forms, trees.values()):
+        variables = list(map(contiguous, form.variables(tree)))
         args += variables
-        if layout is not layouts[0]:
-            memory_beside += (1 + any(map(isbox, variables))) * layout.nbytes
+        if form is not forms[0]:
+            memory_beside += (1 + any(map(isbox, variables))) * form.nbytes
     traced = [position for position, arg in enumerate(args) if isbox(arg)]
     if traced:  # the backward pass must see the values of the forward pass
         args = constant_args(args, traced)
     if truncate is not None:
         check_whole("truncate of rollout", truncate, 1, "; leave it out and nothing is cut")
-    outputs = make_outputs(keep, layouts[0], n)
-    plan = _checkpoint_plan(step, memory, max(layouts[0].nbytes, 1), n, memory_beside, outputs.holds_all_states)
+    outputs = make_outputs(keep, forms[0], n)
+    plan = _checkpoint_plan(step, memory, max(forms[0].nbytes, 1), n, memory_beside, outputs.holds_all_states)
     outputs.is_exact = not plan.is_reversing
-    specification = RolloutSpecification(step, layouts, n, truncate, innermost(args))
+    specification = RolloutSpecification(step, forms, n, truncate, innermost(args))
     _check_values(specification, args, traced)
     if specification.differentiated and plan.slots:
-        _warn_of_repeats(memory, max(layouts[0].nbytes, 1), n, memory_beside)
+        _warn_of_repeats(memory, max(forms[0].nbytes, 1), n, memory_beside)
     rule = RolloutRule(specification, plan, outputs, progress, record)
     for hook in thread.loop_hooks:
         hook(step, state, params, inputs, n)
@@ -238,8 +238,8 @@ def _warn_of_repeats(memory: Any, state_bytes: int, n: int, beside: int) -> None
 
 def _check_values(specification: RolloutSpecification, args: Sequence, traced: Sequence[int]) -> None:
     """Refuse values that are not finite, and traced ones without a derivative."""
-    for layout, values in zip(specification.layouts, specification.split(args), strict=False):
-        layout.check_finite(values, "rollout")
+    for form, values in zip(specification.forms, specification.split(args), strict=False):
+        form.check_finite(values, "rollout")
     for position in traced:
         dtype = dtype_of(args[position])
         if dtype.kind not in "fc":

@@ -1,19 +1,18 @@
 """What a rollout computes: its step, the forms of its arguments, and which of them are differentiated.
 
-A `Layout` says where the numbers of a tree are, and whether another tree has the same form. A `RolloutSpecification`
-holds the layouts of state, params and inputs; it does not change while the rollout runs.
+An `ArgumentForm` is the structure of an argument, and says whether another tree has the same form. A
+`RolloutSpecification` holds the forms of state, params and inputs; it does not change while the rollout runs.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp._utils.pytree import child, described, flatten, is_branch, keys, labels, leaves, paired
+from sparsedp._utils.pytree import TreeStructure, child, described, is_branch, keys, leaves, paired
 from sparsedp._utils.validation import check_finite, check_leaves, check_native, hidden_leaves
 from sparsedp.autodiff.backend import array_types, as_field, is_distributed
 from sparsedp.autodiff.derivative import is_finite
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
 __all__ = [
-    "Layout",
+    "ArgumentForm",
     "RolloutSpecification",
     "contiguous",
     "fingerprint",
@@ -41,8 +40,8 @@ OTHER_FOLD = 521  # where an axis of the array is a multiple of the first
 WHOLE = 8192  # bytes up to which a fingerprint is that of all bytes
 
 
-class Layout:
-    """The form of a tree: which leaves are variables (floating numbers and arrays) and which are static.
+class ArgumentForm(TreeStructure):
+    """The structure of an argument of a rollout, and the shapes and dtypes of its variables, the floating leaves.
 
     Parameters
     ----------
@@ -52,12 +51,6 @@ class Layout:
 
     Attributes
     ----------
-    places : list of int
-        Positions of the variables among the leaves.
-    statics : tuple
-        All leaves, None in place of the variables.
-    is_leaf, is_flat : bool
-        The tree is one variable and nothing else, or a tuple of variables.
     is_open : bool
         Some branch is a dict or a list, whose entries could be changed.
     shapes, dtypes, is_float : list
@@ -72,36 +65,17 @@ class Layout:
     rounds = False
 
     def __init__(self, tree: Any, root: str) -> None:
-        entries, rebuild = flatten(tree)
-        self.root = root
-        self.places: list[int] = []
-        self.shapes: list[tuple] = []
-        self.dtypes: list[np.dtype] = []
-        self.is_float: list[bool] = []
-        self.nbytes = 0
-        statics = []
-        for place, leaf in enumerate(entries):
-            if not is_variable(leaf):
-                statics.append(constant(leaf))
-                continue
-            statics.append(None)  # a layout that is kept must not hold a trace or a large array
-            value = plain(leaf)
-            self.places.append(place)
-            self.shapes.append(np.shape(value))
-            self.dtypes.append(dtype_of(value))
-            self.is_float.append(type(value) is float)
-            self.nbytes += as_field(value).nbytes
-        self.statics = tuple(statics)
-        self._template = rebuild(self.statics)
-        self.is_leaf = bool(self.places) and keys(tree) is None
-        self.is_flat = type(tree) is tuple and len(self.places) == len(entries) == len(tree)
-        if self.is_flat:
-            for branch in tree:
-                self.is_flat = self.is_flat and keys(branch) is None
-        self._check(tree, entries)
+        super().__init__(tree, root, is_variable, constant)
+        values = [plain(leaf) for leaf in self.variables(tree)]
+        self.shapes: list[tuple] = [np.shape(value) for value in values]
+        self.dtypes: list[np.dtype] = [dtype_of(value) for value in values]
+        self.is_float: list[bool] = [type(value) is float for value in values]
+        self.nbytes: int = sum(as_field(value).nbytes for value in values)
+        self._check(tree)
         self.is_open = _is_open(tree)
 
-    def _check(self, tree: Any, entries: list) -> None:
+    def _check(self, tree: Any) -> None:
+        entries = leaves(tree)
         for place, leaf in enumerate(entries):
             if isinstance(leaf, np.ma.MaskedArray):
                 refuse_mask(f"rollout takes plain arrays, got a masked array as {self.labels[place]}", leaf)
@@ -111,42 +85,9 @@ class Layout:
             for hidden in hidden_leaves(leaf):
                 if isbox(hidden):
                     raise DerivativeError(
-                        f"{labels(tree, self.root)[place]} of rollout is a {type(leaf).__name__} with a traced value, "
+                        f"{self.labels[place]} of rollout is a {type(leaf).__name__} with a traced value, "
                         "which is not a tree; write a dict, a NamedTuple or a plain dataclass"
                     )
-
-    @cached_property
-    def labels(self) -> list[str]:
-        """Return the names of all leaves, as one would write them: ``state["ink"][0]``."""
-        return labels(self._template, self.root)
-
-    @property
-    def names(self) -> list[str]:
-        """Return the names of the variables."""
-        return [self.labels[place] for place in self.places]
-
-    def variables(self, tree: Any) -> list:
-        """Return the variables of the tree from which the layout was built, contiguous."""
-        entries = leaves(tree)
-        values = []
-        for place in self.places:
-            values.append(contiguous(entries[place]))
-        return values
-
-    def build(self, variables: Sequence, statics: Sequence | None = None) -> Any:
-        """Return the tree of variables, of which there may be more than needed, and of the other leaves."""
-        if self.is_leaf:
-            return variables[0]
-        if self.is_flat:
-            return tuple(variables[: len(self.places)])
-        entries = list(self.statics if statics is None else statics)
-        for place, value in zip(self.places, variables):
-            entries[place] = value
-        return self._rebuild(entries)
-
-    @cached_property
-    def _rebuild(self) -> Callable:
-        return flatten(self._template)[1]
 
     def take(self, tree: Any, origin: str, number: int, outer: set[int]) -> tuple:
         """Take a tree of the same form apart.
@@ -202,7 +143,7 @@ class Layout:
     def _separated(self, tree: Any, origin: str) -> tuple[list, tuple]:
         """Return the variables and the other leaves of a tree of the same form."""
         advice = "; return a state like the first one"
-        entries = paired(tree, self._template, self.root, f" after {origin}", advice)
+        entries = paired(tree, self.template, self.root, f" after {origin}", advice)
         variables = [entries[place] for place in self.places]
         if len(variables) == len(entries):
             return variables, self.statics
@@ -253,7 +194,7 @@ class RolloutSpecification:
     Parameters
     ----------
     step : callable
-    layouts : list of Layout
+    forms : list of ArgumentForm
         Of state, params and, where there are any, inputs.
     n : int
         Number of steps.
@@ -263,7 +204,7 @@ class RolloutSpecification:
 
     Attributes
     ----------
-    state, params, inputs : Layout
+    state, params, inputs : ArgumentForm
         `inputs` is None where there are none.
     cuts : range
         Indices of the states that truncation makes constants for the steps after them.
@@ -274,22 +215,22 @@ class RolloutSpecification:
     """
 
     step: Callable
-    layouts: list[Layout]
+    forms: list[ArgumentForm]
     n: int
     truncate: int | None
     differentiated: list[int]
-    state: Layout = field(init=False)
-    params: Layout = field(init=False)
-    inputs: Layout | None = field(init=False)
+    state: ArgumentForm = field(init=False)
+    params: ArgumentForm = field(init=False)
+    inputs: ArgumentForm | None = field(init=False)
     cuts: range = field(init=False)
     first_traced: int = field(init=False)
     is_open: bool = field(init=False, default=False)
 
     def __post_init__(self) -> None:
-        self.state = self.layouts[0]
-        self.params = self.layouts[1]
-        if len(self.layouts) == 3:
-            self.inputs = self.layouts[2]
+        self.state = self.forms[0]
+        self.params = self.forms[1]
+        if len(self.forms) == 3:
+            self.inputs = self.forms[2]
         else:
             self.inputs = None
         if self.truncate:
@@ -297,9 +238,9 @@ class RolloutSpecification:
         else:
             self.cuts = range(0)
         self.state.rounds = False
-        for layout in self.layouts:
-            self.is_open = self.is_open or layout.is_open
-            self.state.rounds = self.state.rounds or True in layout.is_float
+        for form in self.forms:
+            self.is_open = self.is_open or form.is_open
+            self.state.rounds = self.state.rounds or True in form.is_float
         if not self.differentiated:
             self.first_traced = self.n + 1
         elif self.differentiated[0] < len(self.state.places):
@@ -310,7 +251,7 @@ class RolloutSpecification:
     @property
     def names(self) -> list[str]:
         """Return the names of all variables."""
-        return [name for layout in self.layouts for name in layout.names]
+        return [name for form in self.forms for name in form.names]
 
     def split(self, variables: Sequence) -> tuple[list, list, list]:
         """Return the variables of state, params and inputs, from those of all arguments."""

@@ -183,8 +183,8 @@ class StepRunner:
         earlier = State(state.i - 1, state.values, state.statics)
         self.current = earlier
         result = self.specification.step.back(*self._plain_arguments(earlier))  # type: ignore[attr-defined]
-        layout = self.specification.state
-        _, values, _, statics = layout.take(result, "the reversed step", self.number, self.outer)
+        form = self.specification.state
+        _, values, _, statics = form.take(result, "the reversed step", self.number, self.outer)
         return State(earlier.i, values, statics)
 
     def state_tree(self, state: State) -> Any:
@@ -215,14 +215,14 @@ class StepRunner:
 
     def _build_params(self, roots: list) -> Any:
         """Return the params of a step. Floats of Python stay such: as float64 they would widen a state of float32."""
-        layout = self.specification.params
+        form = self.specification.params
         values = []
-        for value, is_python_float in zip(self.params, layout.is_float, strict=True):
+        for value, is_python_float in zip(self.params, form.is_float, strict=True):
             if is_python_float and not isbox(value):
                 values.append(float(value))
             else:
                 values.append(frozen(value))
-        return layout.build(boxed(values, roots, self.number))
+        return form.build(boxed(values, roots, self.number))
 
     def _step_values(self, state: State) -> list:
         """Return the variables of state and inputs that a step gets; constants where the derivative is cut."""
@@ -236,12 +236,13 @@ class StepRunner:
 
     def _arguments(self, state: State, values: Sequence, params: Any) -> tuple:
         """Return the arguments of a step, from the variables of state and inputs."""
+        form = self.specification.state
         inputs = self.specification.inputs
-        tree = self.specification.state.build(values, state.statics)
         if inputs is None:
-            return tree, params
+            return form.build(values, state.statics), params
+        n = len(state.values)
         statics = [leaf[state.i] if isinstance(leaf, np.ndarray) else leaf for leaf in inputs.statics]
-        return tree, params, inputs.build(values[len(state.values) :], statics)
+        return form.build(values[:n], state.statics), params, inputs.build(values[n:], statics)
 
     def _plain_arguments(self, state: State) -> tuple:
         """Return the arguments of the step from a state, on no trace of the rollout."""
@@ -294,7 +295,7 @@ class StepRunner:
         if self.current is None:
             return None
         entries, rebuild = flatten(self._plain_arguments(self.current))
-        names = [name for layout in self.specification.layouts for name in layout.labels]
+        names = [name for form in self.specification.forms for name in form.labels]
         for position, name in enumerate(names):
             if not isinstance(entries[position], np.ndarray):
                 continue

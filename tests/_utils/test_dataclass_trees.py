@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
-from sparsedp._utils.pytree import Structure, flatten, keys, labels, leaves, paired
+from sparsedp._utils.pytree import TreeStructure, flatten, keys, labels, leaves, paired
 from sparsedp.autodiff.tape_constants import constant
 from sparsedp.errors import DerivativeError, ShapeError
 
@@ -58,9 +58,9 @@ def test_leaves_paths_and_pairs():
     for other in ((1.0, 2.0, "a"), {"k": 1.0, "u": 2.0, "name": "a"}, 1.0):
         with pytest.raises(ShapeError, match="^x: expected a Model of k, u, name, got"):
             paired(other, Model(0, 0), "x")
-    structure = Structure(tree, "x")
-    assert structure.names == labels(tree, "x") and structure.count == 4
-    assert structure.leaves_of(structure.build("abcd")) == list("abcd")
+    structure = TreeStructure(tree, "x")
+    assert structure.names == structure.labels == labels(tree, "x")
+    assert structure.variables(structure.build("abcd")) == list("abcd")
 
 
 def test_what_cannot_be_rebuilt_is_a_leaf():

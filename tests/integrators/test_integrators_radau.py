@@ -12,7 +12,7 @@ from sparsedp.autodiff.derivative import pushforward, value_and_grad
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError
 from sparsedp.integrators import jacobians
 from sparsedp.integrators.problem import untraced
-from sparsedp.integrators.radau import A, C, Flat, Radau
+from sparsedp.integrators.radau import A, C, FlatProblem, Radau
 
 RATES = np.array([0.04, 1e4, 3e7])
 SMALL = {"Robertson": np.array([1e-6, 1e-11, 1e-2])}
@@ -209,7 +209,7 @@ def test_all_rows_at_once(rate):
     points = np.random.default_rng(0).uniform(0.3, 2.5, (9, 3))
     p = np.array([0.7, 1.6])
     problem = dp.stepper("radau", rate, 1.0).problem
-    rates, rows = Flat(problem, points[0], "radau").rows([(u, 0.0) for u in points], p, [True])
+    rates, rows = FlatProblem(problem, points[0], "radau").rows([(u, 0.0) for u in points], p, [True])
     for u, f, found in zip(points, rates, rows, strict=True):
         _, pull = dp.vjp(lambda u, p: 1.0 * rate(u, p) + 0.0 * u * p[0], u, p)
         wanted = np.array([[*np.concatenate(pull(e)), 0.0] for e in np.eye(3)])

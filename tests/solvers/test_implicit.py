@@ -189,7 +189,7 @@ def test_the_cache_holds_no_traced_values():
     first = pushforward(slope, problem.params, directions(problem.params))[1]
     for key, known in root._jacobians._points._entries:
         equation, x, values = known.point
-        assert not any(map(isbox, (*key, x, *values, *equation.statics, *leaves(equation.params(values)))))
+        assert not any(map(isbox, (*key, x, *values, *equation.parameters.statics, *leaves(equation.params(values)))))
     second = pushforward(slope, problem.params, directions(problem.params))[1]
     np.testing.assert_array_equal(flat(first), flat(second))
 
