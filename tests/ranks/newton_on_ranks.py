@@ -15,6 +15,7 @@ from flow_on_ranks import COMM, close, derivatives, lying, on_both, refused
 
 import sparsedp as dp
 from sparsedp.autodiff.tape import plain
+from sparsedp.solvers.choose_method import check_settings
 from sparsedp.solvers.jacobian import Jacobians
 from sparsedp.solvers.newton import Equation, Unknowns
 
@@ -173,7 +174,7 @@ def bits():
             unknowns = Unknowns(start, "f")
             params = (lying(grid.cells, np.ones(grid.shape)), 0.7)
             equation = Equation(make(grid), unknowns, params, "f")
-            settings = dict(method="auto", rtol=1e-10, maxiter=None, nullspace="raise", options={})
+            settings = check_settings("auto", 1e-10, None, "raise", {})
             x = unknowns.distribute(np.sin(np.arange(float(unknowns.size))))
             J = Jacobians("f", None, None, settings).evaluate(equation, x, equation.variables(params))
             found.update(dp.gather(J.product(x)).tobytes())

@@ -37,8 +37,9 @@ def test_implicit_steps_take_one_adjoint_solve_each():
 def test_without_diffusion_no_diffusion_solve():
     """nu = 0: the identity; nothing set up, nothing solved, and it is said."""
     from sparsedp.integrators.runge_kutta import Resolvent
+    from sparsedp.solvers.choose_method import check_settings
 
-    spread = Resolvent(L, "diffusion", dict(method="auto", rtol=1e-10, maxiter=None, nullspace="raise", options={}))
+    spread = Resolvent(L, "diffusion", check_settings("auto", 1e-10, None, "raise", {}))
     plan = dp.explain(lambda u: anp.sum(spread(0.0, u) ** 2), U)
     assert plan.totals["set-ups built"] == plan.totals["forward solves"] == plan.totals["adjoint solves"] == 0
     assert any("no solve and no set-up" in sentence for sentence in plan.skipped)
