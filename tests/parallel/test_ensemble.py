@@ -1,13 +1,17 @@
 """Sums over scenes: the bits, derivatives and errors that one process has, from every executor."""
 
 import multiprocessing
+import os
 import pickle
+import subprocess
 import sys
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 
 import autograd.numpy as np
 import numpy as onp
 import pytest
+from pages import blocks
+from sources import ROOT
 
 import sparsedp as dp
 from sparsedp._utils.pytree import leaves
@@ -116,6 +120,19 @@ def test_the_same_bits_from_other_processes(workers):
     wanted = bits(dp.ensemble(loss, SCENES, weights=WEIGHTS))
     with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
         assert bits(dp.ensemble(loss, SCENES, pool, WEIGHTS)) == wanted
+
+
+@pytest.mark.whole
+def test_the_file_of_the_guide(tmp_path):
+    page = (ROOT / "docs" / "guides" / "ranks_and_ensembles.md").read_text(encoding="utf-8")
+    [code] = [block.text for block in blocks(page) if "with ProcessPoolExecutor" in block.text]
+    (tmp_path / "experiments.py").write_text(code, encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "experiments.py"]
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.stdout == "the same bits: True\n", done.stderr
 
 
 def test_dask():
