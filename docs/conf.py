@@ -38,7 +38,6 @@ default_role = "code"
 autodoc_mock_imports = [name for name in ("jax", "torch", "xarray") if find_spec(name) is None]
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"
-napoleon_custom_sections = ["Source"]
 napoleon_use_rtype = False
 napoleon_use_ivar = True
 add_module_names = False

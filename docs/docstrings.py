@@ -1,11 +1,13 @@
 """From the docstrings of the package, which are read in a terminal, to what Sphinx reads."""
 
+import inspect
 import re
-from inspect import unwrap
+from functools import reduce
 
 import sparsedp
 
 CODE = r"(``.*?``|`[^`]*`)"
+VALUES = ("attribute", "data", "property")  # napoleon takes the text before a colon in their first line for a type
 
 
 def plain(line):
@@ -17,17 +19,44 @@ def plain(line):
 
 
 def rewrite(app, what, name, thing, options, lines):
-    """Text is no markup; each line of a `Source` stays a line. Examples stay as they are."""
-    example = source = False
-    for index, line in enumerate(lines):
+    """Text is not markup, names of See Also are links with a summary. Examples and literal blocks stay as they are."""
+    result = []
+    example = literal = False
+    for line in lines:
         example = line.lstrip().startswith(">>>") or (example and bool(line.strip()))
-        if not line.strip():
-            source = False
-        if source and set(line) != {"-"}:
-            lines[index] = "| " + plain(line)
-        elif not example:
-            lines[index] = plain(line)
-        source = source or line == "Source"
+        literal = literal and (not line.strip() or line.startswith(" "))
+        result.append(line if example or literal else plain(line))
+        literal = literal or (line.endswith("::") and not example)
+    if what in VALUES and ":" in lines[0]:
+        result.insert(0, "\\ ")
+    lines[:] = with_links(result)
+
+
+def see_also(text):
+    """Names in the section See Also of a docstring."""
+    found = re.search(r"(?m)^See Also\n-{3,}\n((?:.+\n?)+)", text)
+    return [name.strip() for name in found[1].replace("\n", " ").split(",")] if found else []
+
+
+def with_links(lines):
+    """Replace the section See Also by links, each with the first line of the docstring that it leads to."""
+    if "See Also" not in lines:
+        return lines
+    start = lines.index("See Also")
+    end = next((index for index in range(start, len(lines)) if not lines[index].strip()), len(lines))
+    links = [".. seealso::", ""]
+    for name in see_also("\n".join(lines[start:end])):
+        links += [f"   :obj:`{name} <sparsedp.{name}>`", f"      {plain(summary(name))}", ""]
+    return [*lines[:start], *links, *lines[end:]]
+
+
+def summary(name):
+    """First line of the docstring of a public name; of a bridge whose library is not installed, its name."""
+    try:
+        value = reduce(getattr, name.split("."), sparsedp)
+    except ImportError:
+        return name
+    return inspect.getdoc(value).splitlines()[0]
 
 
 def defined_in(app, module, name):
@@ -40,7 +69,7 @@ def defined_in(app, module, name):
     for part in name.split("."):
         value = getattr(value, part, None)
     if hasattr(value, "__wrapped__"):
-        return unwrap(value).__module__
+        return inspect.unwrap(value).__module__
     if module == "sparsedp" and getattr(value, "__module__", None) == "sparsedp.errors":
         return module
     return None

@@ -18,6 +18,7 @@ import autograd.numpy as np
 import docstrings
 from matplotlib import pyplot
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 from sphinx_gallery.scrapers import figure_rst
 
 import sparsedp as dp
@@ -25,6 +26,10 @@ import sparsedp as dp
 ROOT = Path(__file__).parent.parent
 STAGE = Path(__file__).parent / "_build" / "examples"  # the scripts with a title; Sphinx-Gallery runs these
 DRAWN = Path(__file__).parent / "_build" / "drawn"  # what they write with --out
+CARDS = Path(__file__).parent / "_build" / "cards"  # one panel of each picture, at the size of a card of the gallery
+CARD_SIZE = (4.0, 2.8)  # in inches: text of 10 points is readable on a card
+CARD_DPI = 150
+PANELS = {"obstacle": 1, "plume": 1}  # the panel for the card, where it is not the first one
 HEADER = "GALLERY_HEADER.rst"
 INTRODUCTION = """Gallery
 =======
@@ -145,22 +150,47 @@ def pictures(block, block_vars, gallery_conf):
         names.append(str(Path(next(paths)).with_suffix(path.suffix)))
         shutil.move(path, names[-1])
     if names:
+        draw_card(Path(block_vars["src_file"]).stem)
         pyplot.close("all")  # what was saved is not shown twice
     return figure_rst(names, gallery_conf["src_dir"])
 
 
+def draw_card(name):
+    """Draw one panel of the first open figure of an example for its card: a whole figure would be too small to read."""
+    if not pyplot.get_fignums():
+        return
+    figure = pyplot.figure(pyplot.get_fignums()[0])
+    panels = [ax for ax in figure.axes if ax.get_label() != "<colorbar>"]
+    panel = panels[PANELS.get(name, 0)]
+    for ax in figure.axes:
+        if ax is not panel:
+            ax.remove()
+    figure.set_size_inches(CARD_SIZE)
+    panel.set_subplotspec(figure.add_gridspec(1, 1)[0])
+    figure.suptitle("")
+    panel.set_title("")  # the card has a title
+    panel.set_anchor("C")
+    for axis in (panel.xaxis, panel.yaxis):
+        axis.set_minor_formatter(NullFormatter())  # labels between the decades would overlap
+    CARDS.mkdir(parents=True, exist_ok=True)
+    figure.savefig(CARDS / f"{name}.png", dpi=CARD_DPI)
+
+
 def thumbnails(app):
-    """For an example without a picture: what it printed, small."""
+    """The cards: one panel of the picture of an example or, without a picture, what it printed."""
     gallery = Path(app.srcdir) / "gallery"
     for page in (gallery / folder(title) / f"{Path(name).stem}.rst" for title, _, rows in sections() for name in rows):
         text = page.read_text(encoding="utf-8")
+        card = page.parent / "images" / "thumb" / f"sphx_glr_{page.stem}_thumb.png"
+        if (CARDS / f"{page.stem}.png").exists():
+            shutil.copy(CARDS / f"{page.stem}.png", card)
         if ".. image-sg::" in text:
             continue
         printed = re.search(r"rst-class:: sphx-glr-script-out\s+\.\. code-block:: none\n\n(.*?)\n\n\n", text, re.DOTALL)
         lines = textwrap.dedent(printed[1] if printed else page.stem).splitlines()[:12]
-        figure = Figure(figsize=(4, 2.8), facecolor="#f3f4f5")
+        figure = Figure(figsize=CARD_SIZE, facecolor="#f3f4f5")
         figure.text(0.04, 0.94, "\n".join(line[:38] for line in lines), va="top", family="monospace", size=9)
-        figure.savefig(page.parent / "images" / "thumb" / f"sphx_glr_{page.stem}_thumb.png", dpi=100)
+        figure.savefig(card, dpi=CARD_DPI)
 
 
 def membrane(method, cells):

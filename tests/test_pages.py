@@ -200,7 +200,7 @@ LOOK = """() => ({
     over: document.documentElement.scrollWidth - document.documentElement.clientWidth,
     broken: [...document.images].filter(i => i.complete && !i.naturalWidth).map(i => i.src),
     flat: [...document.querySelectorAll("article math")].filter(m => m.getBoundingClientRect().height < 5).length,
-    cut: [...document.querySelectorAll(".wide, article .highlight pre")].filter(e => e.scrollWidth > e.clientWidth + 1)
+    cut: [...document.querySelectorAll("article .highlight pre")].filter(e => e.scrollWidth > e.clientWidth + 1)
         .map(e => e.textContent.slice(0, 60)),
 })"""
 
@@ -241,6 +241,20 @@ loss, start = lambda u: np.sum(solve(u) ** 3), np.linspace(1.0, 2.0, 12)
 """
 
 
+TABLES = """() => [...document.querySelectorAll("table")].map(table => {
+    const wide = table.scrollWidth > table.clientWidth + 1;
+    table.scrollLeft = 10000;
+    const [box, first, last] = [table, ...["first", "last"].map(end => table.querySelector(`tr > :${end}-child`))]
+        .map(element => element.getBoundingClientRect());
+    table.scrollLeft = 0;
+    return {
+        wide: wide,
+        scrolls: getComputedStyle(table).overflowX === "auto",
+        inside: box.left >= 0 && box.right <= innerWidth && first.left >= box.left - 1 && last.right <= box.right + 1,
+    };
+})"""
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("width", WIDTHS)
 def test_the_report_in_a_browser(tmp_path, browser, width):
@@ -251,6 +265,9 @@ def test_the_report_in_a_browser(tmp_path, browser, width):
     tab.goto((tmp_path / "report.html").as_uri())
     seen = tab.evaluate(LOOK)
     assert seen["over"] <= 0 and not seen["broken"] and not seen["cut"] and not wrong, (seen, wrong)
+    tables = tab.evaluate(TABLES)  # a wide one scrolls in its own box, beside its first column
+    assert len(tables) > 3 and all(table["inside"] and (table["scrolls"] or not table["wide"]) for table in tables)
+    assert any(table["wide"] for table in tables) == (width == "phone")
     assert tab.locator("body > *").nth(1).inner_text().startswith("agrees")
     assert not tab.locator("details li").first.is_visible()
     tab.locator("summary").first.click()

@@ -392,7 +392,10 @@ class Audit(Result):
         return f"<gradient {self.verdict}: {'; '.join(details) or f'{self.digits} digits'}>"
 
     def _table_of_gaps(self) -> Table:
-        """Return the table of |difference - g . d| relative to the derivative, over steps (down) and directions."""
+        """Return the table of |difference - g . d| relative to the derivative, over steps (down) and directions.
+
+        A step that fewer than half of the directions were evaluated at is omitted, unless one of them relies on it.
+        """
         cells: dict[float, dict[str, Any]] = {}
         for row in self.rows:
             if row["note"]:
@@ -400,7 +403,9 @@ class Audit(Result):
             else:
                 gap = abs(row["gap"])
             cells.setdefault(row["step"], {})[row["direction"]] = gap
-        rows = [{"step": step, **cells[step]} for step in sorted(cells, reverse=True)]
+        essential = {direction.step for direction in self.lines}
+        shown = [step for step in cells if 2 * len(cells[step]) >= len(self.lines) or step in essential]
+        rows = [{"step": step, **cells[step]} for step in sorted(shown, reverse=True)]
         return table_of(rows, ["step", *(direction.direction for direction in self.lines)])
 
     def _table_of_directions(self) -> Table:

@@ -17,29 +17,22 @@ body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 0 auto; p
 h1 { margin-bottom: 0; }
 .verdict { border-left: 0.5rem solid; padding: 0.5rem 1rem; font-size: 1.2rem; }
 .agrees { border-color: #009e73; } .disagrees { border-color: #d55e00; } .inconclusive { border-color: #e69f00; }
-.wide { overflow-x: auto; }
-table { border-collapse: collapse; margin: 1rem 0; font-size: 0.85rem; font-variant-numeric: tabular-nums; }
+table { display: block; overflow-x: auto; width: max-content; max-width: 100%;
+  background: linear-gradient(to left, Canvas 40%, transparent) right / 3rem 100% no-repeat local,
+    linear-gradient(to left, #888a, transparent) right / 0.8rem 100% no-repeat scroll;
+  border-collapse: collapse; margin: 1rem 0; font-size: 0.85rem; font-variant-numeric: tabular-nums; }
 th, td { padding: 0.15rem 0.6rem; text-align: left; border-bottom: 1px solid #8884; }
+td { min-width: 3rem; } td:not([nowrap]) { min-width: 11rem; }
+:is(th, td):first-child { position: sticky; left: 0; background: Canvas; min-width: 0; }
 th { cursor: pointer; white-space: nowrap; }
 th[aria-sort=ascending]::after { content: " \\2191"; } th[aria-sort=descending]::after { content: " \\2193"; }
 figure { margin: 1rem 0; } img, svg { max-width: 100%; height: auto; } img { background: white; width: 44rem; }
 figcaption { font-size: 0.9rem; }
-.stacked thead tr { display: flex; flex-wrap: wrap; }
-.stacked tbody tr { display: block; padding: 0.5rem 0; border-bottom: 1px solid #8884; }
-.stacked td { display: flex; border: 0; white-space: normal; overflow-wrap: anywhere; }
-.stacked td::before { content: attr(data-name); flex: 0 0 35%; padding-right: 0.6rem; opacity: 0.75; }
-.stacked td:empty { display: none; }
-.stacked, .stacked tbody { display: block; }
 """
 
-# A click on the name of a column sorts its table by it: numbers by size, words by letters, what is empty last. Tables
-# that are too wide for the window are stacked.
+# A click on the name of a column sorts its table by it: numbers by size, words by letters, what is empty last.
 SORTING = """
 for (const table of document.querySelectorAll("table")) {
-  const names = [...table.querySelectorAll("th")].map(head => head.textContent);
-  for (const row of table.tBodies[0].rows) {
-    [...row.cells].forEach((cell, column) => { cell.dataset.name = names[column] || ""; });
-  }
   table.querySelectorAll("th").forEach((head, column) => {
     head.tabIndex = 0;
     const sort = () => {
@@ -59,17 +52,6 @@ for (const table of document.querySelectorAll("table")) {
     head.addEventListener("keydown", event => { if (event.key === "Enter") sort(); });
   });
 }
-// A table that is wider than the window has its cells below each other.
-const fit = () => {
-  for (const box of document.querySelectorAll(".wide")) {
-    for (const table of box.querySelectorAll("table")) {
-      table.classList.remove("stacked");
-      table.classList.toggle("stacked", table.scrollWidth > box.clientWidth);
-    }
-  }
-};
-window.addEventListener("resize", fit);
-fit();
 """
 
 
@@ -86,7 +68,7 @@ def section(title: str, result: Result, files: Sequence[Path], caption: str) -> 
         figure = f"<figure>{picture}<figcaption>{cell(caption)}</figcaption></figure>"
     else:
         figure = ""
-    return f'<section><h2>{cell(title)}</h2>{figure}<div class="wide">{result.html()}</div></section>'
+    return f"<section><h2>{cell(title)}</h2>{figure}{result.html()}</section>"
 
 
 def page(title: str, verdict: str, meaning: str, sections: Sequence[str], skipped: Sequence[str]) -> str:
@@ -113,7 +95,7 @@ def page(title: str, verdict: str, meaning: str, sections: Sequence[str], skippe
 <h1>{cell(title)}</h1>
 <p class="verdict {verdict}"><strong>{verdict}</strong>. {cell(meaning)}</p>
 {"".join(sections)}
-{folded("What was left out", skipped)}
+{folded("What this report left out", skipped)}
 <script>{SORTING}</script>
 </body>
 </html>

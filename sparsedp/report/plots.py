@@ -41,6 +41,7 @@ __all__ = [
 MOST_ARROWS = 24  # along an axis of a face field
 MOST_MARKERS = 64  # points of a line that are marked
 LARGEST_FACTOR = 2.0  # growth factor at the red end of the colours
+MOST_TICKS = 6  # labels along a logarithmic axis; more overlap where three charts stand side by side
 
 
 def plot(
@@ -281,9 +282,20 @@ def _labelled_curves(
         ax.plot(*np.reshape(points, (-1, 2)).T, marker=".", markersize=4, linewidth=1, label=name)
     ax.set(xlabel=xlabel, ylabel=ylabel, title=title, xscale=xscale)
     ax.set_yscale("log", nonpositive="mask")  # 0 has no logarithm, and leaves a gap
+    _thin_out(ax.xaxis)
     ax.grid(visible=True, color="0.93")
-    ax.legend(frameon=False, fontsize="small")
+    if ax.lines:
+        ax.legend(frameon=False, fontsize="small")
     return ax
+
+
+def _thin_out(axis: Any) -> None:
+    """Label few powers of ten along a logarithmic axis of many decades."""
+    low, high = axis.get_view_interval()
+    if axis.get_scale() == "log" and np.log10(high / low) > MOST_TICKS:
+        ticker = _matplotlib(".ticker")
+        axis.set_major_locator(ticker.LogLocator(numticks=MOST_TICKS))
+        axis.set_minor_locator(ticker.NullLocator())
 
 
 def convergence(best: Minimum, ax: Any = None, against: str = "iteration") -> Any:
@@ -375,6 +387,7 @@ def v_curve(audit: Audit, ax: Any = None) -> Any:
     """
     check_type("v_curve", audit, Audit, "what check.gradient returns", "dp.v_curve(dp.check.gradient(loss, x))")
     lines, xlabel, ylabel = audit.curves()
+    lines = {name: points for name, points in lines.items() if any(gap > 0 for _, gap in points)}
     if audit.culprit:
         title = f"{audit.verdict}: {audit.culprit}"
     else:

@@ -63,7 +63,8 @@ def write_report(scene: SceneFile, folder: Path, force: bool = False) -> tuple[s
     meaning = MEANINGS[verdict]
     degraded = getattr(results[-1], "counts", {}).get("degraded")
     if degraded:
-        meaning += f" {degraded} stiff or extreme cases are degraded, see below."
+        cases = "case is" if degraded == 1 else "cases are"
+        meaning += f" {degraded} stiff or extreme {cases} degraded, see below."
     text = [f"# {scene.name}: {verdict}", "", meaning]
     lines = []
     sections = []

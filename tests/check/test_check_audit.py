@@ -1,7 +1,7 @@
 """The audit of a gradient: nested leaves, dtypes, the table, and what it refuses."""
 
 import json
-from collections import namedtuple
+from collections import Counter, namedtuple
 
 import autograd.numpy as anp
 import numpy as np
@@ -112,6 +112,17 @@ def test_table_and_data():
     assert data["verdict"] == "agrees" and len(data["rows"]) == len(result.rows) == 40
     steps = [row["step"] for row in result.rows if row["direction"] == "random 1"]
     assert len(steps) >= 8 and max(steps) / min(steps) >= 1e8
+
+
+def test_the_table_omits_steps_of_single_directions():
+    """One direction of six needs finer steps; they are in `rows`. The step of each plateau is in the table."""
+    result = AUDIT(lambda u: anp.sum(anp.cos(30 * u)), 0.1 * np.arange(9.0))
+    counts = Counter(row["step"] for row in result.rows)
+    assert len(result.lines) == 6 and sorted(set(counts.values())) == [1, 6]
+    table = str(result).partition("largest entry\n")[2].partition("  direction ")[0]
+    printed = [line.split()[0] for line in table.splitlines()]
+    shown = {step for step, count in counts.items() if count == 6} | {direction.step for direction in result.lines}
+    assert printed == [f"{step:.2g}" for step in sorted(shown, reverse=True)] and len(shown) < len(counts)
 
 
 def test_own_steps_and_bad_arguments():

@@ -67,22 +67,57 @@ def test_it_shows_the_gradient_table_and_its_verdict(finished):
     assert re.search(r"^verdict: agrees", finished[1].stdout, re.MULTILINE)
 
 
-def test_it_prints_few_iterations_and_the_last_one_of_each_grid(finished):
-    lines = re.findall(r"^ +(\d+) +[\d.]+ +[\d.]+ +[\d.]+$", finished[1].stdout, re.MULTILINE)
-    with open(finished[0] / "table.csv", newline="") as stream:
-        counts = [int(row["iterations"]) for row in csv.DictReader(stream)]
-    printed = [sorted({*(n for n in story.PRINTED if n <= count), count}) for count in counts]
-    assert lines == [str(number) for numbers in printed for number in numbers]
-    assert len(finished[1].stdout.splitlines()) < 90
+def rows_of(finished, name):
+    with open(finished[0] / name, newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_it_prints_one_line_for_the_iterations_of_each_grid(finished):
+    line = r"^ +(\d+) iterations, [\d.]+ s: misfit/noise ([\d.]+), error [\d.]+$"
+    lines = re.findall(line, finished[1].stdout, re.MULTILINE)
+    rows = rows_of(finished, "table.csv")
+    assert [int(number) for number, _ in lines] == [int(row["iterations"]) for row in rows]
+    assert [misfit for _, misfit in lines] == [f"{float(row['misfit']):.3f}" for row in rows]
+    assert len(finished[1].stdout.splitlines()) < 60
+
+
+def test_iterations_of_the_picture(finished):
+    """Every iteration of every grid, the last ones as in the table."""
+    iterations = rows_of(finished, "convergence.csv")
+    for row in rows_of(finished, "table.csv"):
+        run = [iteration for iteration in iterations if iteration["grid"] == row["grid"]]
+        assert [int(iteration["iterations"]) for iteration in run] == list(range(1, int(row["iterations"]) + 1))
+        assert [run[-1][name] for name in ("seconds", "misfit", "error")] == [
+            row["seconds"],
+            row["misfit"],
+            row["error"],
+        ]
 
 
 def test_the_seconds_contain_no_compilation(finished):
     """The first iteration takes a few times what the others take; compiling the loops takes seconds."""
-    parts = finished[1].stdout.split("iteration   misfit/noise   error   seconds")[1:]
-    for part in parts:
-        found = re.findall(r"^ +(\d+) +[\d.]+ +[\d.]+ +([\d.]+)$", part, re.MULTILINE)
-        first, (number, last) = float(found[0][1]), found[-1]
-        assert first <= 0.1 + 10 * float(last) / int(number)
+    iterations = rows_of(finished, "convergence.csv")
+    for row in rows_of(finished, "table.csv"):
+        first = next(float(iteration["seconds"]) for iteration in iterations if iteration["grid"] == row["grid"])
+        assert first <= 0.1 + 10 * float(row["seconds"]) / int(row["iterations"])
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.mark.parametrize("stream", [Terminal, io.StringIO])
+def test_a_terminal_shows_a_bar_of_iterations(monkeypatch, stream):
+    """A log does not."""
+    pytest.importorskip("tqdm")
+    monkeypatch.setattr(sys, "stderr", stream())
+    monkeypatch.setattr(story, "ITERATIONS", 2)
+    monkeypatch.setattr(dp.check, "gradient", audit("agrees"))
+    ground = terrain.Terrain(relief(), "relief")
+    study = story.prepare(ground, story.grids_for(ground, 12))
+    story.recover(study, study.grids[0])
+    assert ("6 x 5 cells:   0%" in sys.stderr.getvalue()) == sys.stderr.isatty()
 
 
 def test_it_ends_with_what_to_try_next(finished):
@@ -104,8 +139,8 @@ def test_a_log_is_written_before_each_long_piece_of_work(monkeypatch):
     monkeypatch.setattr(dp, "minimize", lambda *given, **how: seen.append(raw.getvalue()) or real(*given, **how))
     story.recover(study, study.grids[0])
     warm_up, measured = seen
-    assert b"Is the gradient right?" in warm_up and measured.endswith(b"seconds\n")
-    assert raw.getvalue().endswith(b" setups\n\n")  # the counts, before the next grid
+    assert warm_up == measured and warm_up.endswith(b"Is the gradient right?\n  agrees\n")
+    assert re.search(rb"error [\d.]+\n\n$", raw.getvalue())  # the result, before the next grid
 
 
 def test_table(finished):

@@ -158,7 +158,8 @@ def test_what_a_report_leaves_out_and_what_is_degraded(tmp_path, capsys):
     assert line in printed.splitlines()
     degraded = int(re.search(r"(\d+) degraded", printed)[1])
     page = (tmp_path / "out" / "report.md").read_text(encoding="utf-8")
-    assert (f"{degraded} stiff or extreme cases are degraded, see below." in page) == (degraded > 0)
+    cases = "case is" if degraded == 1 else "cases are"
+    assert (f"{degraded} stiff or extreme {cases} degraded, see below." in page) == (degraded > 0)
 
 
 def test_a_report_of_a_loss_that_does_not_run(scene, tmp_path, capsys):

@@ -162,6 +162,29 @@ def test_curves_mark_the_best_so_far(ax):
     assert np.array_equal(x, [1.0, 2.0, 4.0]) and np.array_equal(y, [3.0, 2.0, 1.0])
 
 
+def test_labels_of_a_narrow_audit_do_not_overlap():
+    """Beside two others, as in examples/audit.py."""
+    picture = plots.figure()
+    picture.set_size_inches(13, 3.8)
+    ax = picture.subplots(1, 3)[0]
+    dp.v_curve(dp.check.gradient(lambda u: np.sum(u**3), np.ones(3), gradient=lambda u: 3 * u**2), ax)
+    picture.canvas.draw()
+    low, high = ax.get_xlim()
+    labels = [label for label, place in zip(ax.get_xticklabels(), ax.get_xticks()) if low <= place <= high]
+    boxes = [label.get_window_extent() for label in labels]
+    assert len(boxes) >= 3 and all(left.x1 + 2 < right.x0 for left, right in zip(boxes, boxes[1:]))
+
+
+def test_an_audit_names_no_curve_that_is_not_drawn(ax):
+    """Where difference and gradient are equal in all digits at every step, a logarithmic axis has no point."""
+    audit = dp.check.gradient(lambda u: u[0] + 0.0 * u[1], np.zeros(2), gradient=lambda u: np.array([1.0, 0.0]))
+    drawn = [name for name, points in audit.curves()[0].items() if any(gap > 0 for _, gap in points)]
+    dp.v_curve(audit, ax)
+    assert len(drawn) < len(audit.lines)
+    assert [line.get_label() for line in ax.lines] == drawn
+    assert (ax.get_legend() is None) == (not drawn)
+
+
 def test_wrong_shape(ax):
     with pytest.raises(
         dp.errors.ShapeError,

@@ -13,6 +13,7 @@ import numpy as np
 
 import sparsedp as dp
 from sparsedp._utils.counters import recording
+from sparsedp._utils.progress import bar
 from sparsedp.check.table import table_of
 from sparsedp.io.atomic_files import write_file
 from sparsedp.report import plots
@@ -29,8 +30,7 @@ LARGEST = 512
 THINNEST = 0.25  # shortest side of the box
 ITERATIONS = 80
 WARM_UP = 2  # iterations whose time is not measured
-PRINTED = (1, 2, 5, 10, 20, 40, 80)  # iterations
-ARRAYS = ("table.csv", "recovered.npy")
+ARRAYS = ("table.csv", "convergence.csv", "recovered.npy")
 PICTURES = ("truth.png", "recovery.png", "convergence.png")
 FILES = (*ARRAYS, *PICTURES)
 COUNTED = {"solves_forward": "solve", "solves_adjoint": "adjoint", "setups": "setup"}
@@ -76,8 +76,8 @@ def prepare(terrain: Terrain, grids: list[dp.Grid]) -> Study:
     return Study(terrain, grids, survey(fine, hidden), remap(fine, grids[-1])(hidden))
 
 
-def recover(study: Study, grid: dp.Grid) -> tuple[np.ndarray, dict[str, Any], list[tuple[float, float]]]:
-    """Check the gradient, then find the ground by L-BFGS, and print some iterations.
+def recover(study: Study, grid: dp.Grid) -> tuple[np.ndarray, dict[str, Any], list[dict[str, Any]]]:
+    """Check the gradient, then find the ground by L-BFGS, with a progress bar on a terminal.
 
     Two iterations run beforehand, on a ground of their own: the seconds do not contain compilation.
 
@@ -88,29 +88,28 @@ def recover(study: Study, grid: dp.Grid) -> tuple[np.ndarray, dict[str, Any], li
     row : dict
         Of the table. Misfit: root mean square of (computed - read) / noise, 1 is a fit within the noise. Error:
         distance from the truth, relative, 1 for the flat start.
-    curve : list of (float, float)
-        Seconds and error of each iteration.
+    iterations : list of dict
+        The grid, number, seconds, misfit and error of each iteration.
     """
     loss = objective(Ground(grid, study.data.wells, study.data.sensors), study.data)
     check = _check_gradient(study, grid, loss)
-    progress = _Progress(study, grid)
     _warm_up(study, grid)
-    print("  iteration   misfit/noise   error   seconds", flush=True)  # a log is read while it is written
-    with recording() as calls:
+    progress = _Progress(study, grid)
+    with recording() as calls, progress:
         best = dp.minimize(loss, np.zeros(grid.shape), maxiter=ITERATIONS, callback=progress.note, memory=20)
     if best.message.startswith("interrupted"):  # minimize keeps its best point; the demo ends
         raise KeyboardInterrupt
     rows = progress.rows
     if best.history[-1].iteration > len(rows):  # the iteration that meets the tolerance is not reported
         progress.note(best.history[-1], best.x)
-    if len(rows) not in PRINTED:
-        progress.show(rows[-1])
+    last = rows[-1]
+    misfit_and_error = f"misfit/noise {last['misfit']:.3f}, error {last['error']:.3f}"
+    print(f"  {last['iterations']} iterations, {last['seconds']:.2f} s: {misfit_and_error}\n", flush=True)
     counts = {name: total(calls, kind) for name, kind in COUNTED.items()}
-    print(f"  {', '.join(f'{count} {name}' for name, count in counts.items())}\n", flush=True)
-    row = {"grid": " x ".join(map(str, grid.shape)), "unknowns": best.x.size, **rows[-1], **counts}
+    row = {**last, "unknowns": best.x.size, **counts}
     row["gradient"] = check.verdict
     row["gradient_error"] = max((line.share for line in check.lines), default=np.nan)
-    return best.x, row, [(point["seconds"], point["error"]) for point in rows]
+    return best.x, row, rows
 
 
 def _check_gradient(study: Study, grid: dp.Grid, loss: Any) -> Any:
@@ -119,10 +118,10 @@ def _check_gradient(study: Study, grid: dp.Grid, loss: Any) -> Any:
     check = dp.check.gradient(loss, 0.5 * np.sin(5 * x + 1) * np.cos(4 * y), directions=1)
     # one table is enough
     if grid is study.grids[-1]:
-        shown = check
+        shown = str(check)
     else:
-        shown = check.verdict
-    print(f"On {grid}. Is the gradient right?", shown, sep="\n", end="\n\n", flush=True)
+        shown = f"  {check.verdict}"
+    print(f"On {grid}. Is the gradient right?", shown, sep="\n", flush=True)  # a log is read while it is written
     return check
 
 
@@ -134,26 +133,32 @@ def _warm_up(study: Study, grid: dp.Grid) -> None:
 
 
 class _Progress:
-    """The iterations of one run: noted, and some of them printed."""
+    """The iterations of one run, noted, and counted by a bar on a terminal that has tqdm."""
 
     def __init__(self, study: Study, grid: dp.Grid) -> None:
+        self.name = " x ".join(map(str, grid.shape))
         self.truth = study.truth
         self.roughness = regulariser(grid)
         self.to_finest = remap(grid, study.grids[-1])
         self.rows: list[dict[str, Any]] = []
 
+    def __enter__(self) -> _Progress:
+        title = f"  {self.name} cells"
+        self.bar = bar(needed=False, total=ITERATIONS, desc=title, unit="iteration", leave=False, disable=None)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.bar is not None:
+            self.bar.close()
+
     def note(self, record: Any, logk: np.ndarray) -> None:
         """Note an iteration."""
         misfit = float(np.sqrt(max(0.0, 2 * (record.value - self.roughness(logk)))))
         error = distance(self.to_finest(logk), self.truth)
-        number = len(self.rows) + 1
-        self.rows.append({"iterations": number, "seconds": record.seconds, "misfit": misfit, "error": error})
-        if number in PRINTED:
-            self.show(self.rows[-1])
-
-    def show(self, row: dict[str, Any]) -> None:
-        """Print an iteration."""
-        print("  {iterations:9d}   {misfit:12.3f}   {error:5.3f}   {seconds:7.2f}".format(**row), flush=True)
+        numbers = {"iterations": len(self.rows) + 1, "seconds": record.seconds, "misfit": misfit, "error": error}
+        self.rows.append({"grid": self.name, **numbers})
+        if self.bar is not None:
+            self.bar.update()
 
 
 # ---------------------------------------------------------------- what the reader sees
@@ -183,20 +188,21 @@ def tell(study: Study, folder: Path, force: bool) -> bool:
     """
     print(INTRODUCTION.format(s=study, d=study.data, noise=100 * NOISE), flush=True)
     rows = []
-    curves = []
+    runs = []
     for grid in study.grids:
-        logk, row, curve = recover(study, grid)
+        logk, row, run = recover(study, grid)
         rows.append(row)
-        curves.append(curve)
+        runs.append(run)
     print("Error against run time. Misfit/noise 1: the readings are met to the noise. Error 1: the flat start.")
     print(table_of(rows, SHOWN), end="\n\n")
     claim_folder(folder, FILES, force)  # again: files may have appeared during the run
     write_file(folder / "table.csv", table_of(rows).csv())
+    write_file(folder / "convergence.csv", table_of([iteration for run in runs for iteration in run]).csv())
     write_file(folder / "recovered.npy", lambda stream: np.save(stream, logk, allow_pickle=False))
     try:
         plots.write_picture(folder / "truth.png", partial(_map, study, "Hidden ground", study.truth))
         plots.write_picture(folder / "recovery.png", partial(_map, study, "Recovered", logk))
-        plots.write_picture(folder / "convergence.png", partial(_convergence, rows, curves))
+        plots.write_picture(folder / "convergence.png", partial(_convergence, runs))
     except ImportError as error:
         print(f"No pictures: {error}")
     print(f"Written to {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}", NEXT, sep="\n")
@@ -226,7 +232,7 @@ def _map(study: Study, title: str, field: np.ndarray, ax: Any) -> Any:
     return ax
 
 
-def _convergence(rows: list[dict[str, Any]], curves: list[Any], ax: Any) -> Any:
+def _convergence(runs: list[list[dict[str, Any]]], ax: Any) -> Any:
     """Draw error against run time, one curve for each grid."""
-    lines = {f"{row['grid']} cells": curve for row, curve in zip(rows, curves)}
+    lines = {f"{run[0]['grid']} cells": [(row["seconds"], row["error"]) for row in run] for run in runs}
     return plots.curves(lines, ax, "run time [s]", "relative error of log conductivity (flat start: 1)")
