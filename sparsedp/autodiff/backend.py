@@ -12,7 +12,8 @@ a field                 `Backend.split`, `Backend.join`, `Backend.volumes`; `as_
                         `replicated`
 a reduction             NumPy's functions: a field of another backend implements ``np.sum``, ``np.max``, ...
 an application          `Backend.apply`, `Backend.reference`; `match_value` for its derivative
-a solve                 `Backend.implementation`: the class or function that the backend uses instead of a default
+a solve                 `Backend.local_structure`; `Backend.implementation`: the class or function that the backend uses
+                        instead of a default
 the tape                `ArrayKind`: derivative formulas of calls with fields that are no NumPy arrays
 a public call           `collectively`: all processes run it, or all raise
 ======================  ============================================================================================
@@ -99,6 +100,10 @@ class Backend:
         """Return a field of values that every process holds."""
         return values
 
+    def combinable(self, value: Any) -> Any:
+        """Return a value, traced or not, in a form that can be combined with fields of this backend."""
+        return replicated(value)
+
     def flat(self, field: Any) -> Any:
         """Return a field as an array with one axis, without a copy."""
         return field.reshape(-1)
@@ -108,6 +113,10 @@ class Backend:
     def apply(self, op: Any, u: Any, out: np.ndarray | None = None) -> Any:
         """Return the result of an Operator for a plain field."""
         return op.apply_array(u, out)
+
+    def local_structure(self, op: Any) -> Any:
+        """Return the Structure of an Operator on the entries of fields that this process holds."""
+        return op.structure
 
     def reference(self, u: Any) -> Any:
         """Return what the VJP of an Operator must know of its argument to return a gradient of the same form."""

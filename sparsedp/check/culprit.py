@@ -311,7 +311,7 @@ def _entries_of_operator(op: Operator, rng: np.random.Generator) -> str:
     in_result = largest_gaps(gap_in_result, [g.shape], 1)
     words = ""
     for name, found, space in (("argument", in_argument, op.domain), ("result", in_result, op.codomain)):
-        if space.grid is not None and space.backend.whole_fields:
+        if space.grid is not None:
             spaces = [space]
         else:
             spaces = []

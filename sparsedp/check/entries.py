@@ -61,7 +61,7 @@ class EntryGap(NamedTuple):
     region: Block | None = None
 
     @property
-    def rank(self) -> float:
+    def sort_key(self) -> float:
         """Key that sorts the largest gap first, and unknown ones last."""
         if isnan(self.gap):
             return inf
@@ -106,7 +106,7 @@ def largest_gaps(
             if entry is None:
                 break
             entries.append(entry)
-    return sorted(entries, key=lambda entry: entry.rank)
+    return sorted(entries, key=lambda entry: entry.sort_key)
 
 
 class _Bisection(NamedTuple):
@@ -281,7 +281,7 @@ def spaces_of(function: Callable[[Any], Any], x: Any) -> list[Any]:
             for actor in actors.values():
                 for name in ("domain", "codomain"):
                     space: Any = getattr(actor, name, None)
-                    if getattr(space, "grid", None) is not None and space.backend.whole_fields:
+                    if getattr(space, "grid", None) is not None:
                         spaces.setdefault(str(space), space)
     return list(spaces.values())
 

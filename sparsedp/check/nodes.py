@@ -131,7 +131,7 @@ def bytes_held(nodes: Iterable[Any]) -> int:
 
 
 def _owner(array: Any) -> Any:
-    """Return the array that owns the memory of a view; a field on ranks has no views."""
+    """Return the array that owns the memory of a view; a distributed field has no views."""
     base = getattr(array, "base", None)
     while isinstance(base, np.ndarray):
         array = base

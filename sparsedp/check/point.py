@@ -36,7 +36,7 @@ def root_mean_square(vector: NDArray[Any]) -> float:
 
 
 def _as_numpy(leaf: Any) -> Any:
-    """Return a leaf as a number or array of NumPy; of a field on ranks all of it.
+    """Return a leaf as a number or array of NumPy; of a distributed field all of it.
 
     Python's numbers refuse to divide by 0 and do not take complex steps.
     """

@@ -19,18 +19,15 @@ from __future__ import annotations
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from sparsedp._utils.reconstruction import Frozen
 from sparsedp.flow.projection_setup import ProjectionSetup
 from sparsedp.grid.boundary_conditions import no_slip
 from sparsedp.grid.grid import check_grid
 from sparsedp.operators.operator import Operator
-from sparsedp.operators.structure.base import Turning
 from sparsedp.solvers.choose_method import check_settings
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
     from sparsedp.grid.grid import Grid
 
@@ -102,32 +99,8 @@ def projection(
     """
     check_grid("projection", grid)
     settings = check_settings(method, rtol, maxiter, "project", options)
-    return Projection(ProjectionSetup(grid, solid, boundary, settings))
-
-
-class ProjectionStructure(Turning):
-    """P or P^T on flat face fields, for a `ProjectionSetup`; solved in double precision and rounded once."""
-
-    def act(self, x: NDArray, out: NDArray) -> None:
-        """Set `out` to the projection of x."""
-        self.inner.split(x, out, self.transposed)
-
-
-class PressureStructure(Turning):
-    """The map from a face field to the p with P v = v + G p, or its transpose.
-
-    Where only the slope of p is determined, its average is 0.
-    """
-
-    def act(self, x: NDArray, out: NDArray) -> None:
-        """Set `out` to the pressure of x."""
-        setup = self.inner
-        scale = 2.0**setup.exponent
-        if self.transposed:
-            setup.pressure_transpose(scale * x, out)
-        else:
-            p = setup.split(x, np.empty(x.size))
-            np.multiply(scale, setup.inverse.solver.system.null_space.project(p), out=out)
+    set_up = grid.backend.implementation(ProjectionSetup)
+    return Projection(set_up(grid, solid, boundary, settings))
 
 
 class Projection(Operator):
@@ -142,12 +115,7 @@ class Projection(Operator):
 
     def __init__(self, setup: ProjectionSetup) -> None:
         faces = setup.grid.faces
-        structure: Any
-        if faces.backend.whole_fields:
-            structure = ProjectionStructure(setup, (faces.size, faces.size))
-        else:
-            structure = setup.operators()[0].structure
-        super().__init__(structure, faces, faces, "projection", "matrix-free")
+        super().__init__(setup.structure(), faces, faces, "projection", "matrix-free")
         Frozen.__init__(self, setup=setup)
 
     def recipe(self) -> tuple:
@@ -167,13 +135,7 @@ class Projection(Operator):
     @cached_property
     def pressure(self) -> Operator:
         """Operator from faces to cells: the p with P(v) = v + G(p) on free faces [velocity length]."""
-        cells = self.setup.grid.cells
-        structure: Any
-        if cells.backend.whole_fields:
-            structure = PressureStructure(self.setup, (cells.size, self.domain.size))
-        else:
-            structure = self.setup.operators()[1].structure
-        return Operator(structure, self.domain, cells, "pressure")
+        return Operator(self.setup.pressure_structure(), self.domain, self.setup.grid.cells, "pressure")
 
     def __str__(self) -> str:
         return str(self.setup.inverse)

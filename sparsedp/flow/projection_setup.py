@@ -13,6 +13,7 @@ instead of G^T g, and g = 0.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -26,7 +27,8 @@ from sparsedp.flow.projection_passes import CompiledPasses, OperatorPasses, comp
 from sparsedp.grid.boundary_conditions import inflow, no_slip, resolve
 from sparsedp.grid.grid import Grid
 from sparsedp.operators.difference import divergence, gradient
-from sparsedp.operators.masks_and_lift import check_solid, diagonal, solid_faces
+from sparsedp.operators.masks_and_lift import check_solid, solid_faces
+from sparsedp.operators.structure.base import Turning
 from sparsedp.solvers.inverse import build
 from sparsedp.solvers.scaling import exponent_of, in_range, largest, shifted
 
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from sparsedp.operators.operator import Operator
+    from sparsedp.operators.structure.base import Structure
     from sparsedp.solvers.choose_method import SolveSettings
 
 __all__ = ["ProjectionSetup", "faces_that", "pressure_conditions"]
@@ -90,44 +93,56 @@ class ProjectionSetup(Reconstructible):
         G = gradient(scaled_grid, self.pressure_conditions, self.solid)
         self._divergence = D
         self._gradient = G
-        self.inverse = _pressure_inverse(-D @ G, settings)
+        self.inverse = self._pressure_inverse(-D @ G)
         self._check_inflow_can_leave()
-        if not grid.backend.whole_fields:
-            return
+        self._set_up_passes()
+
+    def _pressure_inverse(self, op: Operator) -> Any:
+        """Return the inverse of A.
+
+        Transforms are preferred on small grids too, because the compiled passes need them.
+        """
+        settings = self.settings
+        if settings.method == "auto" and op.domain.size < FEW_CELLS and op.separable:
+            with suppress(ValueError):  # an axis that cannot be diagonalised accurately
+                return build(op, replace(settings, method="separable"), "pressure solve")
+        return build(op, settings, "pressure solve")
+
+    def _set_up_passes(self) -> None:
+        """Set up the passes of the forward and of the transposed projection."""
+        D = self._divergence
+        G = self._gradient
         kept = self.open.astype(float)
         self.products = (
             OperatorPasses(D.structure, G.structure, kept),
             OperatorPasses(G.T.structure, D.T.structure, kept),
         )
-        ones = np.ones(grid.faces.size)
+        ones = np.ones(self.grid.faces.size)
         self._magnitudes = [largest(products.first.magnitude()(ones)) for products in self.products]
         self.passes = self.products
         if self._is_separable:
-            forward, transposed = (compiled_passes(grid, products) for products in self.products)
+            forward, transposed = (compiled_passes(self.grid, products) for products in self.products)
             if forward is not None and transposed is not None:
                 self.passes = (forward, transposed)
 
     def recipe(self) -> tuple:
         """Return the call that builds an equal object, for pickling and copying."""
         conditions = {axis: pair for axis, pair in zip(self.grid.axes, self.sides, strict=True) if pair}
-        return ProjectionSetup, (self.grid, self.solid, conditions, self.settings)
+        return type(self), (self.grid, self.solid, conditions, self.settings)
 
     @property
     def info(self) -> Any:
         """SolveLog of the pressure solves."""
         return self.inverse.info
 
-    def operators(self) -> tuple[Operator, Operator]:
-        """Return P and its pressure as products of operators.
+    def structure(self) -> Structure:
+        """Return the linear map P on flat face fields."""
+        size = self.grid.faces.size
+        return ProjectionStructure(self, (size, size))
 
-        On ranks they replace the passes, which need the whole field.
-        """
-        K = diagonal(self._gradient.codomain, self.open)  # 0 times NaN is NaN, so the solve detects NaN everywhere
-        p = self.inverse @ self._divergence @ K
-        P = K + self._gradient @ p
-        if self.nothing_flows:
-            P = 0.0 * P
-        return P, 2.0**self.exponent * p
+    def pressure_structure(self) -> Structure:
+        """Return the linear map from flat face fields to the pressure."""
+        return PressureStructure(self, (self.grid.cells.size, self.grid.faces.size))
 
     @property
     def _is_separable(self) -> bool:
@@ -226,17 +241,29 @@ class ProjectionSetup(Reconstructible):
                     raise ValueError(f"the inflow on the {name} enters a region without an outflow; open a side of it")
 
 
-def _pressure_inverse(op: Operator, settings: SolveSettings) -> Any:
-    """Return the inverse for the pressure.
+class ProjectionStructure(Turning):
+    """P or P^T on flat face fields, for a `ProjectionSetup`; solved in double precision and rounded once."""
 
-    Transforms are preferred on small grids too, because the compiled passes need them.
+    def act(self, x: NDArray, out: NDArray) -> None:
+        """Set `out` to the projection of x."""
+        self.inner.split(x, out, self.transposed)
+
+
+class PressureStructure(Turning):
+    """The map from a face field to the p with P v = v + G p, or its transpose.
+
+    Where only the slope of p is determined, its average is 0.
     """
-    if settings.method == "auto" and op.domain.size < FEW_CELLS and op.separable and op.backend.whole_fields:
-        try:
-            return _pressure_inverse(op, replace(settings, method="separable"))
-        except ValueError:  # an axis that cannot be diagonalised accurately
-            pass
-    return build(op, settings, "pressure solve")
+
+    def act(self, x: NDArray, out: NDArray) -> None:
+        """Set `out` to the pressure of x."""
+        setup = self.inner
+        scale = 2.0**setup.exponent
+        if self.transposed:
+            setup.pressure_transpose(scale * x, out)
+        else:
+            p = setup.split(x, np.empty(x.size))
+            np.multiply(scale, setup.inverse.solver.system.null_space.project(p), out=out)
 
 
 def pressure_conditions(grid: Grid, sides: tuple) -> dict[str, tuple]:

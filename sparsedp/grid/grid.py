@@ -318,6 +318,12 @@ class Grid(Value, Uncached):
             f"{self} has axes 0 to {self.dim - 1}, got {axis!r}; write a number or a name of {', '.join(self.axes)}"
         )
 
+    def stored_by(self, backend: Backend) -> Grid:
+        """Return an equal grid whose fields are stored by a backend."""
+        grid = object.__new__(type(self))
+        Value.__init__(grid, **{**self.__getstate__(), "backend": backend})
+        return grid
+
     @property
     def layout(self) -> Any:
         """How fields are distributed over processes, with the communicator as ``layout.comm``; None on one process."""

@@ -69,7 +69,7 @@ def _numbers(name, field, value, dtypes):
     if numbers is None or numbers.dtype.kind not in "biufc":
         raise TypeError(
             f"{name} takes arrays of numbers, {field} is of type {type(value).__name__}; "
-            f"write np.asarray({field}), or dp.gather({field}) on ranks"
+            f"write np.asarray({field}), or dp.gather({field}) for a distributed field"
         )
     if dtypes and numbers.dtype.char not in dtypes:
         instead = f"{field}.astype(float)"

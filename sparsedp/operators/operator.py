@@ -170,6 +170,11 @@ class Operator(Frozen, Reconstructible):
         return out
 
     @cached_property
+    def local_structure(self) -> Structure:
+        """The linear map on the entries of fields that this process holds."""
+        return self.backend.local_structure(self)
+
+    @cached_property
     def _acting(self):
         """The structure that is applied in this form."""
         if self.form == "explicit":
@@ -385,7 +390,7 @@ class Operator(Frozen, Reconstructible):
     def _repr_html_(self):
         """Return HTML for a notebook: the spaces, the form, and a picture of the entries of a small operator."""
         entries: dict[str, Any] = {"from": self.domain, "to": self.codomain, "acts": self.form, "dtype": self.dtype}
-        if self.backend.whole_fields and self.structure.has_entries and max(self.shape) <= SPY_BELOW:
+        if self.structure.has_entries and max(self.shape) <= SPY_BELOW:
             matrix = self._acting.explicit()
             entries["entries"] = f"{matrix.nnz} of {self.shape[0]} x {self.shape[1]}"
             if matrix.nnz:

@@ -25,7 +25,7 @@ __all__ = ["Checkpoint"]
 
 FORMAT = "sparsedp optimization 5"
 STATES = 2  # how many are kept
-ROUNDING = 1e-6  # share of loss and gradient at the start by which other ranks or another version may differ
+ROUNDING = 1e-6  # share of loss and gradient at the start by which another number of processes or version may differ
 SHARE = 0.1  # a state is written when that takes at most this share of the time since the last one
 
 

@@ -12,7 +12,6 @@ import scipy.sparse as sp
 from sparsedp._utils.pytree import power_of_two
 from sparsedp._utils.reconstruction import ReconstructibleFunction
 from sparsedp._utils.validation import check_finite, check_kind, check_native, is_number
-from sparsedp.autodiff.backend import is_distributed
 from sparsedp.autodiff.tape import dtype_of, plain
 from sparsedp.autodiff.tape_constants import constant
 from sparsedp.grid.grid import Grid, check_grid
@@ -169,7 +168,7 @@ def _squared_slope(grid, name, solid):
         check_kind(f"u of {name}", dtype_of(u), "real numbers", "; add the values of u.real and u.imag")
         slopes = open_faces(slope(u))
         unit = 1.0
-        if small is not None and not is_distributed(u):
+        if small is not None:
             largest_slope = largest(np.asarray(plain(slopes)))
             if not np.isfinite(largest_slope):
                 largest_slope = 0.0

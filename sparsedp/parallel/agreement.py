@@ -15,30 +15,54 @@ import pickle
 import sys
 import traceback
 from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from itertools import zip_longest
 from numbers import Number
 from threading import Timer
-from types import SimpleNamespace
+from types import TracebackType
 from typing import Any
 from zlib import crc32
 
 import numpy as np
 from mpi4py import MPI
+from numpy.typing import ArrayLike, NDArray
 
 from sparsedp._utils.counters import count
 from sparsedp._utils.pytree import labels, leaves
 from sparsedp.autodiff.tape import plain
 from sparsedp.trajectory.specification import folded
 
-__all__ = ["Agreement", "course", "end_all", "end_all_after_error"]
+__all__ = ["Agreement", "end_all", "end_all_after_error", "state"]
 
 ROOM = 24  # bytes beside the mark
 FAILED = (-1).to_bytes(8, "little", signed=True)
 PATIENCE = 15.0  # seconds that a failed rank waits for the others: they may be inside PETSc and never answer
 
-# State of this process: `met`, the number of messages so far; `last`, the agreement built or used last; `begun`, the
-# number of messages before the outermost running call; `untold`, (name, arguments) of calls that are not compared yet.
-course: Any = SimpleNamespace(met=0, last=None, begun=None, untold=[])
+
+@dataclass
+class ProcessState:
+    """What this process has exchanged with others.
+
+    Attributes
+    ----------
+    messages : int
+        Number of messages so far.
+    last : Agreement or None
+        The one that was built or used last.
+    messages_before_call : int or None
+        Number of messages before the outermost running call; None outside of calls.
+    unrecorded : list of tuples
+        (name, arguments) of running calls that are not in a mark yet.
+    """
+
+    messages: int = 0
+    last: Agreement | None = None
+    messages_before_call: int | None = None
+    unrecorded: list[tuple[str, Any]] = field(default_factory=list)
+
+
+state = ProcessState()
 
 
 class Agreement:
@@ -51,34 +75,34 @@ class Agreement:
         Description of this rank that is added to its errors.
     """
 
-    def __init__(self, comm: Any, where: str) -> None:
+    def __init__(self, comm: MPI.Comm, where: str) -> None:
         self.comm = comm
         self.where = where
-        course.last = self
+        state.last = self
         self._mark = 0
-        self._log: deque = deque(maxlen=100)  # (label, mark) of each call of `tell` since the last message
+        self._log: deque = deque(maxlen=100)  # (label, mark) of each call of `record` since the last message
         self._mine = np.zeros(8 + ROOM, np.uint8)
         self._all = np.zeros((comm.size, 8 + ROOM), np.uint8)
 
     # ------------------------------------------------------------ what must be the same
 
-    def tell(self, label: str, content: bytes) -> None:
+    def record(self, label: str, content: bytes) -> None:
         """Add an action or argument of this rank to its mark, which the next message compares with other ranks."""
-        while course.untold:
-            name, arguments = course.untold.pop(0)
+        while state.unrecorded:
+            name, arguments = state.unrecorded.pop(0)
             for number, tree in enumerate(arguments):
-                self.tell_all(f"argument {number}", name, tree)
+                self.record_leaves(f"argument {number}", name, tree)
         self._mark = crc32(content, self._mark)
         self._log.append((label, self._mark))
 
-    def tell_all(self, root: Any, what: str, tree: Any) -> None:
+    def record_leaves(self, root: str, what: str, tree: Any) -> None:
         """Add the leaves of a tree, traced or not, to the mark; distributed fields are compared already."""
         for name, leaf in zip(labels(tree, root), leaves(tree)):
             value = plain(leaf)
             if isinstance(value, (Number, np.ndarray, np.generic, str)):
-                self.tell(f"{name} of {what}", folded(np.asarray(value)))
+                self.record(f"{name} of {what}", folded(np.asarray(value)))
 
-    def meet(self, label: str, content: bytes = b"") -> Any:
+    def synchronize(self, label: str, content: bytes = b"") -> bytes:
         """Send one message from each rank to all; return the bytes `content` of all ranks, in their order.
 
         Raises
@@ -88,9 +112,9 @@ class Agreement:
         ValueError
             If the marks of the ranks differ.
         """
-        self.tell(label, label.encode())
+        self.record(label, label.encode())
         mark = self._mark.to_bytes(8, "little")
-        marks = self._sent(mark, content)
+        marks = self._send(mark, content)
         if marks == mark * self.comm.size:
             self._log.clear()
         elif FAILED in (marks[k : k + 8] for k in range(0, len(marks), 8)):
@@ -99,10 +123,10 @@ class Agreement:
             self._refuse()
         return self._all[:, 8 : 8 + len(content)].tobytes()
 
-    def _sent(self, head, content):
+    def _send(self, head: bytes, content: bytes) -> bytes:
         """Send a mark and bytes from this rank to all; return the marks of all ranks."""
-        course.met = course.met + 1
-        course.last = self
+        state.messages += 1
+        state.last = self
         self._mine[: 8 + len(content)] = np.frombuffer(head + content, np.uint8)
         self.comm.Allgather(self._mine, self._all)
         return self._all[:, :8].tobytes()
@@ -122,8 +146,8 @@ class Agreement:
             )
         else:
             message = (
-                f"rank {rank} came to {other} where rank 0 came to {first}; let nothing depend on the number of "
-                "the rank, on a clock or on numbers of one rank"
+                f"rank {rank} has {other}, rank 0 has {first}; write no branches that depend on the number of the "
+                "rank, on a clock or on numbers of one rank"
             )
         raise _marked(ValueError(message))
 
@@ -134,53 +158,53 @@ class Agreement:
 
     # ------------------------------------------------------------ numbers
 
-    def reduced(self, number: Any, act: Any) -> Any:
+    def reduce(self, number: ArrayLike, act: np.ufunc) -> Any:
         """Reduce the numbers of all ranks by a ufunc, in their order: every rank gets the same bits."""
         count("ranks", "reduction")
         number = np.asarray(number)
         content = number.tobytes()
         label = f"{act.__name__} of shape {number.shape}, {number.dtype}"
         if len(content) <= ROOM:
-            contents = self.meet(label, content)
+            contents = self.synchronize(label, content)
         else:
-            contents = b"".join(self.gathered(content, label))
-        numbers = np.ndarray((self.comm.size, *number.shape), number.dtype, contents)
+            contents = b"".join(self.gather(content, label))
+        numbers: NDArray = np.ndarray((self.comm.size, *number.shape), number.dtype, contents)
         return act.reduce(numbers, axis=0)[()]
 
-    def gathered(self, value: Any, label: str = "gather") -> Any:
+    def gather(self, value: Any, label: str = "gather") -> list[Any]:
         """Return the values of all ranks as a list, on every rank."""
-        self.meet(label)
+        self.synchronize(label)
         return self.comm.allgather(value)
 
     # ------------------------------------------------------------ errors
 
-    def agreed(self, label: str, act: Any, *args: Any, at_once: bool = False) -> Any:
+    def run(self, label: str, act: Callable, *args: Any, at_once: bool = False) -> Any:
         """Call ``act(*args)``, which may fail on one rank only; if it does, raise the error on all ranks.
 
-        Inside `together`, the outermost call tells the other ranks. With `at_once` they are told here, because the
-        caller catches the error and continues.
+        Inside `together`, the outermost call informs the other ranks. With `at_once` they are informed here, because
+        the caller catches the error and continues.
         """
-        alone = at_once or course.begun is None
+        informs = at_once or state.messages_before_call is None
         try:
             result = act(*args)
         except Exception as error:
-            if alone:
+            if informs:
                 self.fail(error)
             if not hasattr(error, "on_all_ranks"):
-                self.tell(f"an error in {label}", b"failed")  # if a caller catches it, the marks differ
+                self.record(f"an error in {label}", b"failed")  # if a caller catches it, the marks differ
             raise
-        if alone:
-            self.meet(label)
+        if informs:
+            self.synchronize(label)
         return result
 
-    def fail(self, error: Any) -> None:
+    def fail(self, error: Exception) -> None:
         """Raise an error on all ranks: the error of the lowest rank that failed, with the rank in its message."""
         if hasattr(error, "on_all_ranks"):
             raise error
         watch = Timer(PATIENCE, end_all, (type(error), error, error.__traceback__))
         watch.daemon = True
         watch.start()
-        self._sent(FAILED, b"")
+        self._send(FAILED, b"")
         self._raise_together(error, watch)
 
     def _raise_together(self, error=None, watch=None):
@@ -216,7 +240,7 @@ def _packed(error, where):
             continue  # the class takes other arguments, or cannot be unpickled on other ranks
 
 
-def end_all(kind: Any, error: Any, trace: Any) -> None:
+def end_all(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
     """End all ranks with the error of one, so that no rank waits for its messages."""
     comm = MPI.COMM_WORLD
     text = "".join(traceback.format_exception(kind, error, trace))

@@ -5,107 +5,137 @@ Every rank has the whole definition, and cuts out the rows of its own block:
     y[block] = A[block, reach] x[reach],        x[reach] by one exchange.
 
 The transpose is the transposed map, cut in the same way: it gathers too, so nothing is added up across ranks, and
-the bits of the result do not depend on how many there are.
+the bits of the result do not depend on the number of ranks.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from functools import cached_property
 from math import prod
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import NDArray
 
-from sparsedp.grid.space import components
+from sparsedp.grid.space import Space, components
+from sparsedp.kernels.reference import Rows as RowRecord
+from sparsedp.kernels.reference import Tridiagonal
 from sparsedp.operators.structure.base import Matrix, Structure, Turning, rows_of
 from sparsedp.operators.structure.factor import Factor
 from sparsedp.operators.structure.kronecker import Kronecker, Term
 from sparsedp.operators.structure.lazy import Chain, Diagonal, Mask, Sum
-from sparsedp.parallel.exchange import Exchange, of_boxes
-from sparsedp.parallel.partition import lengths, slices
+from sparsedp.parallel.exchange import Exchange, exchange_of_boxes
+from sparsedp.parallel.partition import Box, Partition, Shapes, lengths, slices
 from sparsedp.solvers.inverse import Solution
 from sparsedp.solvers.nullspace import Projector
 
-__all__ = ["Columns", "OwnRows", "Rows", "localized", "reads"]
+__all__ = ["Columns", "OwnRows", "Rows", "Storage", "local_structure", "reading", "storage"]
+
+# Where fields are stored: (partition, shapes of the components); None if every rank has all entries.
+Storage: TypeAlias = tuple[Partition, Shapes] | None
+Map: TypeAlias = Callable[[NDArray], NDArray]
+
+UNLIMITED = np.iinfo(int).max  # as an end of a side that nothing has limited yet
 
 
-NOTHING = np.iinfo(int).max  # as an end of a side: there is none
+def storage(space: Space) -> Storage:
+    """Return where the fields on a space are stored."""
+    layout: Any = space.backend
+    if layout.whole_fields:
+        return None
+    return layout, space.parts
 
 
-def localized(structure: Any, given: Any, made: Any) -> Any:
+def local_structure(structure: Structure, source: Storage, target: Storage) -> Structure:
     """Return the structure on blocks of a structure on whole fields.
 
     Parameters
     ----------
     structure : Structure
-    given, made : (layout, parts) or None
-        Where the field and the result are stored; None: every rank has all of it.
+    source, target : Storage
+        Of the field that it is applied to, and of the result.
 
     Raises
     ------
     TypeError
-        If the structure cannot be cut.
+        If the rows of the structure are not known.
     """
     if isinstance(structure, Chain):
-        sides = _between(structure.members, given, made)
-        return Chain([localized(m, b, a) for m, a, b in zip(structure.members, sides, sides[1:])])
+        stages = _storage_between(structure.members, source, target)
+        pairs = zip(structure.members, stages[1:], stages[:-1], strict=True)
+        return Chain([local_structure(member, before, after) for member, before, after in pairs])
     if isinstance(structure, Sum):
-        return Sum([localized(member, given, made) for member in structure.members])
+        return Sum([local_structure(member, source, target) for member in structure.members])
     if isinstance(structure, Diagonal):
-        if given:
-            return _of_diagonal(structure, *given)
-        return structure
-    shape = tuple(side[0].size(side[1]) if side else n for side, n in zip((made, given), structure.shape))
+        if source is None:
+            return structure
+        return _local_diagonal(structure, *source)
+    rows, columns = structure.shape
+    shape = (_local_size(target, rows), _local_size(source, columns))
     if isinstance(structure, OwnRows):
         return structure.inner[structure.transposed]
     if isinstance(structure, (Solution, Projector)):
         return OnBlocks(structure, shape)
-    if isinstance(structure, Kronecker) and given and made:
-        if (structure.in_parts, structure.out_parts) == (tuple(given[1]), tuple(made[1])):
-            return _of_factors(structure, shape, given[0], made[0])
-    if isinstance(structure, (Kronecker, Matrix)):  # of other components: it counts flat
-        return _of_matrix(structure.explicit(), shape, given, made)
+    if isinstance(structure, Kronecker) and source is not None and target is not None:
+        if (structure.in_parts, structure.out_parts) == (tuple(source[1]), tuple(target[1])):
+            return _local_kronecker(structure, shape, source[0], target[0])
+    if isinstance(structure, (Kronecker, Matrix)):  # of other components: a map of flat arrays
+        return _local_matrix(structure.explicit(), shape, source, target)
     raise TypeError(
-        f"{getattr(structure, 'name', type(structure).__name__)} cannot be cut for ranks, for no rank knows its rows; "
-        "make it of operators of the grid or of a matrix"
+        f"{getattr(structure, 'name', type(structure).__name__)} cannot be applied to fields on ranks, because its "
+        "rows are not known; build it from operators of the grid or from a matrix"
     )
 
 
-def _between(members, given, made):
-    """Return the sides of the members of a product, left to right; an unknown side is held whole by every rank."""
-    layout = (given or made)[0]
-    sides = [made, *[None] * (len(members) - 1), given]
+def _local_size(stored, size):
+    """Return the number of entries that this rank holds of a field of some size."""
+    if stored is None:
+        return size
+    partition, parts = stored
+    return partition.size(parts)
 
-    def side(member, parts, beyond):
+
+def _storage_between(members, source, target):
+    """Return the storage before and after each factor of a product, left to right.
+
+    Where it is not known, every rank holds all entries.
+    """
+    layout, _ = source or target
+    stages = [target, *[None] * (len(members) - 1), source]
+
+    def beside(member, attribute, beyond):
+        """Return the storage on one side of a factor; `beyond`: the storage on its other side."""
         if isinstance(member, (Diagonal, Projector)):
             return beyond
         if isinstance(member, Solution):
-            return member.solver.system.side
-        found = getattr(member, parts, ((),))
-        if len(found[0]) == len(layout.shape):
-            return layout, found
+            return storage(member.solver.system.op.domain)
+        parts = getattr(member, attribute, ((),))
+        if len(parts[0]) == len(layout.shape):
+            return layout, parts
         return None
 
     for place in range(len(members) - 1, 0, -1):
         left, right = members[place - 1 : place + 1]
-        sides[place] = side(right, "out_parts", sides[place + 1]) or side(left, "in_parts", None)
+        stages[place] = beside(right, "out_parts", stages[place + 1]) or beside(left, "in_parts", None)
     for place, member in enumerate(members[:-1]):
         if isinstance(member, (Diagonal, Projector)):
-            sides[place + 1] = sides[place]
-    return sides
+            stages[place + 1] = stages[place]
+    return stages
 
 
 class OnBlocks(Structure):
-    """What acts on blocks as it is: a solve on ranks, a projection of its data."""
+    """A structure that acts on blocks as it is: a solve on ranks, or a projection of its data."""
 
-    def __init__(self, whole: Any, shape: tuple) -> None:
+    def __init__(self, whole: Structure, shape: tuple[int, int]) -> None:
         self.whole = whole
         self.shape = shape
 
-    def apply(self, x: Any, out: Any) -> None:
+    def apply(self, x: NDArray, out: NDArray) -> None:
         self.whole.apply(x, out)
 
-    def explicit(self) -> None:
+    def explicit(self) -> sp.csr_array:
         raise _no_matrix(self.whole)
 
 
@@ -115,18 +145,19 @@ def _no_matrix(structure):
 
 
 class Rows(Structure):
-    """The rows that make the blocks of this rank: windows of what a structure makes of the numbers that are read.
+    """The rows of a structure for the blocks of this rank: windows of its result on the entries that are read.
 
     Parameters
     ----------
     inner : Structure
     shape : (rows, columns), of blocks
     read : function or None
-        Flat block -> what `inner` takes. None: every rank has all of it.
-    windows : list, one for each component of what `inner` makes
+        Maps a flat block to the argument of `inner`. None: every rank has all entries.
+    windows : sequence
+        One for each component of the result of `inner`.
     """
 
-    def __init__(self, inner: Any, shape: tuple, read: Any, windows: Any = (...,)) -> None:
+    def __init__(self, inner: Structure, shape: tuple[int, int], read: Map | None, windows: Sequence = (...,)) -> None:
         self.inner = inner
         self.shape = shape
         self.read = read
@@ -135,117 +166,167 @@ class Rows(Structure):
         self.dtype = inner.dtype
         self.takes_complex = inner.takes_complex
 
-    def act(self, x: Any, out: Any) -> None:
+    def act(self, x: NDArray, out: NDArray) -> None:
         """Write the product with x into `out`."""
         if self.read:
             x = self.read(x)
-        blocks = self._own(self.inner.product(x))
-        for block, target in zip(blocks, components(out, [block.shape for block in blocks])):
+        blocks = self._windows_of(self.inner.product(x))
+        for block, target in zip(blocks, components(out, [block.shape for block in blocks]), strict=True):
             target[...] = block
 
-    def _own(self, wide):
-        return [part[window] for part, window in zip(components(wide, self.parts), self.windows)]
+    def _windows_of(self, wide):
+        """Return the blocks of this rank of a result of `inner`."""
+        return [part[window] for part, window in zip(components(wide, self.parts), self.windows, strict=True)]
 
-    def explicit(self) -> Any:
+    def explicit(self) -> sp.csr_array:
         """Return the rows as a csr_array; its columns are the entries that are read."""
         if self.read is None:
             raise _no_matrix(self.inner)
-        blocks = self._own(np.arange(self.inner.shape[0]))
+        blocks = self._windows_of(np.arange(self.inner.shape[0]))
         return self.inner.explicit()[np.concatenate([block.reshape(-1) for block in blocks])]
 
-    def magnitude(self) -> Any:
-        """Return the structure of the absolute values of the entries."""
+    def magnitude(self) -> Map:
+        """Return the function that applies the absolute values of the entries."""
         entries = abs(self.explicit())
-        return lambda x: entries @ self.read(x)
+        read: Any = self.read
+
+        def bound(x: NDArray) -> NDArray:
+            return entries @ read(x)
+
+        return bound
 
 
-def _of_diagonal(structure, layout, parts):
-    layout.tell(structure.values)
+def _local_diagonal(structure, layout, parts):
+    """Return the block of this rank of a diagonal."""
+    layout.compare(structure.values)
     values = layout.take(structure.values, parts)
-    return Mask(layout.take(structure.keep, parts), values) if isinstance(structure, Mask) else Diagonal(values)
+    if isinstance(structure, Mask):
+        return Mask(layout.take(structure.keep, parts), values)
+    return Diagonal(values)
 
 
-def _of_matrix(matrix, shape, given, made):
-    """Return the rows of a matrix that make the blocks of this rank, or all rows where every rank has the result."""
-    (given or made)[0].tell(matrix.data)
-    if made:
-        matrix = matrix[made[0].take(np.arange(matrix.shape[0]), made[1])]
-    if not given:
+def _local_matrix(matrix, shape, source, target):
+    """Return the rows of a matrix for the blocks of this rank, or all rows if every rank has the result."""
+    layout, _ = source or target
+    layout.compare(matrix.data)
+    if target is not None:
+        target_layout, parts = target
+        matrix = matrix[target_layout.take(np.arange(matrix.shape[0]), parts)]
+    if source is None:
         return Rows(Matrix(matrix), shape, None)
-    places, exchange = reads(matrix.indices, *given)
-    inner = sp.csr_array((matrix.data, places, matrix.indptr), shape=(matrix.shape[0], exchange.read[0]))
+    exchange, places = reading(matrix.indices, *source)
+    inner = sp.csr_array((matrix.data, places, matrix.indptr), shape=(matrix.shape[0], exchange.read.size))
     return Rows(Matrix(inner), shape, exchange.forward)
 
 
-def reads(entries: np.ndarray, layout: Any, parts: Any) -> Any:
+def reading(entries: NDArray[np.integer], layout: Partition, parts: Shapes) -> tuple[Exchange, NDArray[np.integer]]:
     """Return the Exchange that reads some entries of a whole field, and the place of each entry in its result."""
     entries, places = np.unique(entries, return_inverse=True)
-    return places.reshape(-1), Exchange(layout, parts, entries.size, np.arange(entries.size), entries)
+    return Exchange(layout, parts, entries.size, np.arange(entries.size), entries), places.reshape(-1)
 
 
 class OwnRows(Turning):
     """A square matrix of which each rank holds only the rows of its own block.
 
-    `inner`: Rows; Columns, which send what the rows make to whom it belongs, where it is added; and the Stencil.
+    Attributes
+    ----------
+    inner : tuple
+        The matrix as Rows, its transpose as Columns, and its Stencil.
     """
 
-    stencil = property(lambda self: self.inner[2])
+    @property
+    def stencil(self) -> Any:
+        """The Stencil from which the matrix was assembled."""
+        return self.inner[2]
 
 
 class Columns(Structure):
-    """The transpose of Rows: what a structure makes of a block is sent back to where they read it."""
+    """The transpose of Rows: the product with a block is added to the entries that the rows read.
 
-    def __init__(self, inner: Any, shape: tuple, back: Any) -> None:
+    Parameters
+    ----------
+    inner : Structure
+        Maps a flat block to cotangents of the entries that were read.
+    shape : (rows, columns), of blocks
+    add_back : function
+        Sends these cotangents to the ranks that hold the entries, and adds them there.
+    """
+
+    def __init__(self, inner: Structure, shape: tuple[int, int], add_back: Map) -> None:
         self.inner = inner
         self.shape = shape
-        self.back = back
+        self.add_back = add_back
 
-    def act(self, x: Any, out: Any) -> None:
+    def act(self, x: NDArray, out: NDArray) -> None:
         """Write the product with x into `out`."""
-        out[...] = self.back(self.inner.product(x))
+        out[...] = self.add_back(self.inner.product(x))
 
-    def magnitude(self) -> Any:
-        """Return the structure of the absolute values of the entries."""
+    def magnitude(self) -> Map:
+        """Return the function that applies the absolute values of the entries."""
         entries = abs(self.inner.explicit())
-        return lambda x: self.back(entries @ x)
+
+        def bound(x: NDArray) -> NDArray:
+            return self.add_back(entries @ x)
+
+        return bound
 
 
 # ---- products of 1-D factors ----
 
 
-def _of_factors(structure, shape, layout, there):
-    """Return the rows of a Kronecker structure for the blocks of this rank on the layout `there`, by one exchange."""
-    own = [there.box(part) for part in structure.out_parts]
-    out, reach = _boxes(structure, own, layout.periodic)
-    read = of_boxes(layout, structure.in_parts, reach).forward
-    windows = [slices(inner, wide) for inner, wide in zip(own, out)]
-    return Rows(_Cut(structure, layout.periodic, out, reach), shape, read, windows)
+def _local_kronecker(structure, shape, source, target):
+    """Return the rows of a Kronecker structure for the blocks of this rank on the layout `target`, by one exchange."""
+    own = [target.box(part) for part in structure.out_parts]
+    computed, reach = _boxes(structure, own, source.periodic)
+    read = exchange_of_boxes(source, structure.in_parts, reach).forward
+    windows = [slices(inner, wide) for inner, wide in zip(own, computed, strict=True)]
+    return Rows(KroneckerOfBoxes(structure, source.periodic, computed, reach), shape, read, windows)
 
 
-class _Cut(Kronecker):
-    """A Kronecker structure between boxes: the same arithmetic in the same order, wherever the boxes lie."""
+class KroneckerOfBoxes(Kronecker):
+    """A Kronecker structure between boxes: the same arithmetic in the same order, wherever the boxes are.
 
-    def __init__(self, structure, periodic, out, reach):
-        self.out_parts, self.in_parts = tuple(map(lengths, out)), tuple(map(lengths, reach))
+    Parameters
+    ----------
+    structure : Kronecker
+    periodic : tuple of bool
+    computed, reach : lists of boxes
+        The rows and the columns to keep, one box for each component of the result and of the argument.
+    """
+
+    def __init__(
+        self, structure: Kronecker, periodic: tuple[bool, ...], computed: Sequence[Box], reach: Sequence[Box]
+    ) -> None:
+        self.out_parts = tuple(map(lengths, computed))
+        self.in_parts = tuple(map(lengths, reach))
         self.shape = (sum(map(prod, self.out_parts)), sum(map(prod, self.in_parts)))
         self.blocks = {}
         for (r, c), terms in structure.blocks.items():
-            sides = list(zip(out[r], reach[c], periodic, [*[False] * (len(periodic) - 1), True]))
-            self.blocks[r, c] = tuple(
-                Term(term.scale, tuple(f and _cut_factor(f, *side) for f, side in zip(term.factors, sides)))
-                for term in terms
-            )
+            sides = list(zip(computed[r], reach[c], periodic, strict=True))
+            self.blocks[r, c] = tuple(Term(term.scale, _factors_of_boxes(term.factors, sides)) for term in terms)
+
+
+def _factors_of_boxes(factors, sides):
+    """Return the factors of a term between the sides of two boxes; None stands for the identity."""
+    last_axis = len(sides) - 1
+    block_factors: list[FactorOfBlock | None] = []
+    for axis, (factor, (rows, columns, wraps)) in enumerate(zip(factors, sides, strict=True)):
+        block_factor = None
+        if factor is not None:
+            block_factor = FactorOfBlock(factor, rows, columns, wraps, axis == last_axis)
+        block_factors.append(block_factor)
+    return tuple(block_factors)
 
 
 def _boxes(structure, own, periodic):
-    """Boxes of the result to compute, and boxes of the field that they read.
+    """Return boxes of the result to compute, and boxes of the field that they read.
 
-    Where a term has no factor along an axis, both have the same side there. What is computed beyond the block itself is
-    not complete, and left out.
+    Where a term has no factor along an axis, both have the same side there. Entries beyond the block itself are not
+    complete and are dropped by the caller.
     """
-    # A side from a to b is held as (a, -b): then the minimum of several is the side around all of them.
-    out = np.array([[(a, -b) for a, b in box] for box in own])
-    reach = np.full((len(structure.in_parts), len(periodic), 2), NOTHING)
+    # A side from a to b is stored as (a, -b): then the minimum of several is the side around all of them.
+    computed = np.array([[(a, -b) for a, b in box] for box in own])
+    reach = np.full((len(structure.in_parts), len(periodic), 2), UNLIMITED)
     same = []
     for (r, c), terms in structure.blocks.items():
         if not prod(lengths(own[r])):
@@ -263,16 +344,24 @@ def _boxes(structure, own, periodic):
                 low = max(low, 0)
                 high = min(high, structure.in_parts[c][-1])
             np.minimum(reach[c, -1], (low, -high), out=reach[c, -1])
-    for _ in range(len(out) + len(reach)):
+    for _ in range(len(computed) + len(reach)):
         for c, r, axis in same:
-            out[r, axis] = reach[c, axis] = np.minimum(out[r, axis], reach[c, axis])
-    sides = [np.where(side == NOTHING, 0, side).tolist() for side in (out, reach)]
-    return [[tuple((a, -b) for a, b in box) for box in side] for side in sides]
+            common = np.minimum(computed[r, axis], reach[c, axis])
+            computed[r, axis] = common
+            reach[c, axis] = common
+    return _as_boxes(computed), _as_boxes(reach)
+
+
+def _as_boxes(sides):
+    """Return boxes from arrays of sides (a, -b); an unlimited side is empty."""
+    limited = np.where(sides == UNLIMITED, 0, sides).tolist()
+    return [tuple((a, -b) for a, b in box) for box in limited]
 
 
 def _entries(factor, side, wraps):
     """Return rows, columns and values of the entries in some rows of a factor, contiguous on a periodic axis."""
-    (n, columns), rows = factor.shape, np.arange(*side)
+    n, columns = factor.shape
+    rows = np.arange(*side)
     matrix = factor.matrix[rows % max(n, 1)]
     row = rows_of(matrix)
     column = matrix.indices.astype(np.int64)
@@ -282,15 +371,41 @@ def _entries(factor, side, wraps):
     return row, column, matrix.data
 
 
-def _cut_factor(factor, rows, columns, wraps, last):
-    """Return some rows and columns of a factor. It uses the loops of the whole factor, so that rounding is the same."""
-    row, column, data = _entries(factor, rows, wraps)
-    inside = (column >= columns[0]) & (column < columns[1])
-    entries = data[inside], (row[inside], column[inside] - columns[0])
-    found = Factor(sp.csr_array(entries, shape=(rows[1] - rows[0], columns[1] - columns[0])))
-    if factor.tridiagonal is None:
-        vars(found)["tridiagonal"] = None
-    if not (last and factor.rows.offsets.size):
+class FactorOfBlock(Factor):
+    """Some rows and columns of a factor, applied by the loops of the whole factor, so that rounding is the same.
+
+    Parameters
+    ----------
+    whole : Factor
+    rows, columns : (start, stop)
+    wraps : bool
+        Whether the axis is periodic.
+    is_last : bool
+        Whether it acts along the last axis.
+    """
+
+    def __init__(
+        self, whole: Factor, rows: tuple[int, int], columns: tuple[int, int], wraps: bool, is_last: bool
+    ) -> None:
+        row, column, values = _entries(whole, rows, wraps)
+        inside = (column >= columns[0]) & (column < columns[1])
+        entries = (values[inside], (row[inside], column[inside] - columns[0]))
+        super().__init__(sp.csr_array(entries, shape=(rows[1] - rows[0], columns[1] - columns[0])))
+        self._is_tridiagonal = whole.tridiagonal is not None
+        self._has_diagonals = is_last and whole.rows.offsets.size > 0
+
+    @cached_property
+    def tridiagonal(self) -> Tridiagonal | None:
+        """See `Factor`; None if the whole factor has none."""
+        if self._is_tridiagonal:
+            return super().tridiagonal
+        return None
+
+    @cached_property
+    def rows(self) -> RowRecord:
+        """See `Factor`; without diagonals where the whole factor is not applied by them."""
+        record = super().rows
+        if self._has_diagonals:
+            return record
         none = np.zeros(0, np.int64)
-        vars(found)["rows"] = found.rows._replace(offsets=none, start=none, stop=none, values=np.zeros((0, 0)))
-    return found
+        return record._replace(offsets=none, start=none, stop=none, values=np.zeros((0, 0)))

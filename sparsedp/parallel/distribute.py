@@ -14,7 +14,7 @@ from sparsedp.grid.grid import Grid, check_grid
 
 __all__ = ["distribute", "gather"]
 
-SIZES = "OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE"  # set by launchers: the number of processes
+SIZE_VARIABLES = "OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE"  # set by launchers: the number of processes
 
 
 def distribute(grid: Grid, comm: Any = None) -> Grid:
@@ -41,7 +41,7 @@ def distribute(grid: Grid, comm: Any = None) -> Grid:
     RuntimeError
         If mpi4py belongs to another MPI than the one that started the processes.
     TypeError
-        If `comm` is no communicator.
+        If `comm` is not a communicator.
 
     See Also
     --------
@@ -54,30 +54,33 @@ def distribute(grid: Grid, comm: Any = None) -> Grid:
     Grid(4 x 3 cells, size 4 x 3)
     """
     check_grid("distribute", grid)
-    told = max(int(os.environ.get(name, "1")) for name in SIZES)
-    if comm is None and told == 1 and "mpi4py.MPI" not in sys.modules:
+    started = max(int(os.environ.get(name, "1")) for name in SIZE_VARIABLES)
+    if comm is None and started == 1 and "mpi4py.MPI" not in sys.modules:
         return grid
     try:
         from mpi4py import MPI
 
-        if comm is None and told == MPI.COMM_WORLD.size == 1:
+        if comm is None and started == MPI.COMM_WORLD.size == 1:
             return grid
         from sparsedp.parallel.agreement import end_all_after_error
-        from sparsedp.parallel.layout import laid
+        from sparsedp.parallel.layout import grid_on_ranks
     except ImportError as error:
         raise ImportError(
             f"distribute on several processes needs mpi4py and petsc4py ({error}); install them, or start one process"
         ) from error
     if not isinstance(comm, (MPI.Comm, type(None))):
         raise TypeError(f"distribute takes a communicator, got {type(comm).__name__}; write mpi4py.MPI.COMM_WORLD")
-    if told > 1 and MPI.COMM_WORLD.size == 1:
+    if started > 1 and MPI.COMM_WORLD.size == 1:
         raise RuntimeError(
-            f"{told} processes were started, and mpi4py sees one: it belongs to another MPI; install it for this one"
+            f"{started} processes were started, but mpi4py belongs to another MPI and finds one; reinstall it for "
+            "this MPI"
         )
     if MPI.COMM_WORLD.size > 1:
         atexit.unregister(end_all_after_error)  # of an earlier call
         atexit.register(end_all_after_error)
-    return laid(grid, MPI.COMM_WORLD if comm is None else comm)
+    if comm is None:
+        comm = MPI.COMM_WORLD
+    return grid_on_ranks(grid, comm)
 
 
 def gather(u: Any) -> np.ndarray:

@@ -2,33 +2,52 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import prod
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
+from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from sparsedp._utils import buffers
 from sparsedp._utils.counters import count
 from sparsedp.operators.structure.kronecker import components
-from sparsedp.parallel.partition import lengths, slices
+from sparsedp.parallel.partition import Box, Partition, Shapes, lengths, slices
 
-__all__ = ["Exchange", "hold", "of_boxes"]
+__all__ = ["Exchange", "Windows", "exchange_of_boxes", "keep_petsc_communicator"]
 
-KINDS = {"f": MPI.FLOAT, "d": MPI.DOUBLE, "D": MPI.C_DOUBLE_COMPLEX}  # PETSc adds up no floats
+KINDS = {"f": MPI.FLOAT, "d": MPI.DOUBLE, "D": MPI.C_DOUBLE_COMPLEX}  # PETSc adds up no complex64
 
-HELD = MPI.Comm.Create_keyval()
+PETSC_COMMUNICATOR = MPI.Comm.Create_keyval()
 
 
-def hold(comm: Any) -> None:
+def keep_petsc_communicator(comm: MPI.Comm) -> None:
     """Keep PETSc's own copy of a communicator. Called by all ranks together.
 
     Otherwise PETSc frees the copy with the last object on it. Python drops that object at different times on different
     ranks, so a rank that has to build a new copy would wait for the others.
     """
-    if comm.Get_attr(HELD) is None:
-        comm.Set_attr(HELD, PETSc.Comm(comm).duplicate())
+    if comm.Get_attr(PETSC_COMMUNICATOR) is None:
+        comm.Set_attr(PETSC_COMMUNICATOR, PETSc.Comm(comm).duplicate())
+
+
+class Windows(NamedTuple):
+    """A window in each component of a flat array.
+
+    Attributes
+    ----------
+    size : int
+        Of the array.
+    shapes : list of tuples of int
+        Of the components.
+    windows : list of tuples of slices
+    """
+
+    size: int
+    shapes: Shapes
+    windows: Sequence[tuple[slice, ...]]
 
 
 class Exchange:
@@ -43,94 +62,101 @@ class Exchange:
         Number of entries that are read.
     leaves, entries : int arrays
         For the entries that are exchanged: their places in the result, and their numbers in the whole flat field.
-    shapes, windows : lists
-        For the entries that are copied, by component: the shape of the result, and their windows in the result and in
-        the block.
+    shapes : list of tuples of int
+        For the entries that are copied: the shapes of the components of the result.
+    windows, block_windows : lists of tuples of slices
+        For the entries that are copied: their windows in the components of the result and of the block.
     """
 
     def __init__(
         self,
-        layout: Any,
-        parts: Any,
+        layout: Partition,
+        parts: Shapes,
         size: int,
-        leaves: np.ndarray,
-        entries: np.ndarray,
-        shapes: Any = (),
-        windows: Any = (),
+        leaves: NDArray[np.integer],
+        entries: NDArray[np.integer],
+        shapes: Shapes = (),
+        windows: Sequence[tuple[slice, ...]] = (),
+        block_windows: Sequence[tuple[slice, ...]] = (),
     ) -> None:
         ranks, places = layout.owners(parts, entries)
         counts = np.array([leaves.size, np.count_nonzero(ranks != layout.comm.rank)])
         self.agreement = layout.agreement
         self.busy, self.crossing = map(int, layout.sum(counts))  # sums over all ranks
-        self.read = size, shapes, [there for there, _ in windows]
-        self.block = layout.size(parts), layout.shapes(parts), [here for _, here in windows]
+        self.read = Windows(size, shapes, windows)
+        self.block = Windows(layout.size(parts), layout.shapes(parts), block_windows)
         if self.busy:
             PETSc.garbage_cleanup(layout.comm)  # frees the objects that Python has dropped, on all ranks together
             self._forest = PETSc.SF().create(layout.comm)
             remote = np.stack([ranks, places], axis=1).astype(PETSc.IntType)
-            self._forest.setGraph(self.block[0], leaves.astype(PETSc.IntType), remote)
+            self._forest.setGraph(self.block.size, leaves.astype(PETSc.IntType), remote)
             self._forest.setUp()
 
-    def forward(self, flat: np.ndarray) -> Any:
+    def forward(self, flat: NDArray) -> NDArray:
         """Return the numbers that are read, flat, for a flat block."""
-        return self._sent("bcast", MPI.REPLACE, flat, self.placed(flat))
+        return self._exchange("bcast", MPI.REPLACE, flat, self.placed(flat))
 
-    def backward(self, read: Any) -> Any:
+    def backward(self, read: NDArray) -> NDArray:
         """Apply the transpose: add the cotangents of the numbers read to the entries that they were read from."""
-        return self._sent("reduce", MPI.SUM, read, self.taken(read))
+        return self._exchange("reduce", MPI.SUM, read, self.taken(read))
 
-    def placed(self, flat: np.ndarray) -> Any:
+    def placed(self, flat: NDArray) -> NDArray:
         """Return the numbers that are read from the block of this rank itself, zeros elsewhere."""
         return _copied(flat, self.block, self.read)
 
-    def taken(self, read: Any) -> Any:
+    def taken(self, read: NDArray) -> NDArray:
         """Apply the transpose of `placed`."""
         return _copied(read, self.read, self.block)
 
-    def _sent(self, word, act, given, out):
-        """Exchange entries with other ranks, combining them with the entries of `out` by `act`."""
+    def _exchange(self, operation: str, combine: Any, values: NDArray, out: NDArray) -> NDArray:
+        """Exchange entries with other ranks by an operation of PetscSF, combining them with the entries of `out`."""
         if self.busy:
-            self.agreement.meet("exchange")
-            if np.may_share_memory(out, given):
+            self.agreement.synchronize("exchange")
+            if np.may_share_memory(out, values):
                 out = out.copy()
-            for part in ("Begin", "End"):
-                getattr(self._forest, word + part)(KINDS[given.dtype.char], given, out, act)
+            for stage in ("Begin", "End"):
+                getattr(self._forest, operation + stage)(KINDS[values.dtype.char], values, out, combine)
         if self.crossing:
             count("ranks", "exchange")
-            count("ranks", "sent", self.crossing * given.itemsize)
+            count("ranks", "sent", self.crossing * values.itemsize)
         return out
 
 
-def _copied(flat, given, made):
+def _copied(flat: NDArray, source: Windows, target: Windows) -> NDArray:
     """Copy windows of a flat array into windows of another, zero elsewhere; without a copy if one fills the other."""
-    (_, shapes, windows), (size, others, places) = given, made
-    pieces = [part[window] for part, window in zip(components(flat, shapes), windows)]
-    if len(pieces) == 1 and pieces[0].size == size and pieces[0].flags.c_contiguous:
+    parts = components(flat, source.shapes)
+    pieces = [part[window] for part, window in zip(parts, source.windows)]
+    if len(pieces) == 1 and pieces[0].size == target.size and pieces[0].flags.c_contiguous:
         return pieces[0].reshape(-1)
-    out = buffers.empty((size,), flat.dtype)
-    if sum(piece.size for piece in pieces) < size:
+    out = buffers.empty((target.size,), flat.dtype)
+    if sum(piece.size for piece in pieces) < target.size:
         out[:] = 0
-    for piece, part, place in zip(pieces, components(out, others), places):
-        part[place] = piece
+    for piece, part, window in zip(pieces, components(out, target.shapes), target.windows):
+        part[window] = piece
     return out
 
 
-def of_boxes(layout: Any, parts: Any, boxes: Any) -> Any:
+def exchange_of_boxes(layout: Partition, parts: Shapes, boxes: Sequence[Box]) -> Exchange:
     """Return the Exchange for a box of each component, which may reach into other blocks."""
     leaves = [np.zeros(0, np.int64)]
     entries = [np.zeros(0, np.int64)]
     windows = []
-    start = first = 0
-    for part, box in zip(parts, boxes):
-        here = layout.box(part)
-        inner = [(max(a, c), max(min(b, d), a, c)) for (a, b), (c, d) in zip(box, here)]
-        windows.append((slices(inner, box), slices(inner, here)))
-        away = np.ones(lengths(box), dtype=bool)
-        away[windows[-1][0]] = False
-        index = [line + a for line, (a, _) in zip(np.nonzero(away), box)]
-        leaves.append(start + np.flatnonzero(away))
+    block_windows = []
+    start = 0  # of the component in the result
+    first = 0  # of the component in the whole field
+    for part, box in zip(parts, boxes, strict=True):
+        own = layout.box(part)
+        inner = [(max(a, c), max(min(b, d), a, c)) for (a, b), (c, d) in zip(box, own)]
+        windows.append(slices(inner, box))
+        block_windows.append(slices(inner, own))
+        is_away = np.ones(lengths(box), dtype=bool)
+        is_away[windows[-1]] = False
+        index = tuple(line + a for line, (a, _) in zip(np.nonzero(is_away), box))
+        leaves.append(start + np.flatnonzero(is_away))
         entries.append(first + np.ravel_multi_index(index, part, mode="wrap"))
-        start = start + away.size
-        first = first + prod(part)
-    shapes = list(map(lengths, boxes))
-    return Exchange(layout, parts, start, np.concatenate(leaves), np.concatenate(entries), shapes, windows)
+        start += is_away.size
+        first += prod(part)
+    shapes = [lengths(box) for box in boxes]
+    return Exchange(
+        layout, parts, start, np.concatenate(leaves), np.concatenate(entries), shapes, windows, block_windows
+    )

@@ -1,25 +1,28 @@
 """A field of which this rank holds a block: it behaves like one array of the whole shape.
 
 Elementwise arithmetic acts on the block; sums, means, maxima and norms are those of the whole field, with the same bits
-on every rank. What cannot be done on blocks (u[i, j], sorting, sums along an axis) is refused by name: nothing is
+on every rank. What cannot be computed from blocks (u[i, j], sorting, sums along an axis) raises TypeError: nothing is
 silently local, no program branches differently on two ranks, and every rank records the same tape. A plain array of the
-whole shape is a field that every rank knows: beside a field on ranks, each takes its own block.
+whole shape is a field that every rank holds: as the other operand of a field on ranks, each takes its own block of it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from functools import partial, partialmethod
 from operator import attrgetter
-from typing import Any
+from typing import Any, NoReturn
 
 import autograd.numpy as anp
 import numpy as np
+from numpy.typing import DTypeLike, NDArray
 
 from sparsedp._utils.pytree import leaves
 from sparsedp.autodiff.backend import ARRAY_KINDS, BOX, NUMPY, ArrayKind
 from sparsedp.autodiff.tape import VSpace, autograd_rules, isbox, linear, plain
 from sparsedp.errors import ShapeError
-from sparsedp.parallel.agreement import course
+from sparsedp.grid.space import Space
+from sparsedp.parallel.agreement import Agreement, state
 
 __all__ = ["DistributedField", "alike", "block", "everywhere", "total"]
 
@@ -29,9 +32,10 @@ class DistributedField(np.lib.mixins.NDArrayOperatorsMixin):
 
     __slots__ = ("__weakref__", "flat", "space")
 
-    def __init__(self, flat: np.ndarray, space: Any) -> None:
+    def __init__(self, flat: NDArray, space: Space) -> None:
         flat.flags.writeable = False
-        self.flat, self.space = flat, space
+        self.flat = flat
+        self.space = space
 
     layout = backend = property(lambda self: self.space.grid.backend)
     shape = property(lambda self: self.space.shape)
@@ -42,30 +46,30 @@ class DistributedField(np.lib.mixins.NDArrayOperatorsMixin):
     real = property(lambda self: self.like(self.flat.real))
     imag = property(lambda self: self.like(self.flat.imag))
 
-    def like(self, flat: np.ndarray) -> Any:
-        """Another field on the same space."""
+    def like(self, flat: NDArray) -> DistributedField:
+        """Return another field on the same space."""
         return DistributedField(np.ascontiguousarray(flat), self.space)
 
-    def copy(self) -> Any:
+    def copy(self) -> DistributedField:
         """Return the field itself: it is read-only."""
         return self
 
-    def astype(self, dtype: Any, copy: Any = True) -> Any:
+    def astype(self, dtype: DTypeLike, copy: bool = True) -> DistributedField:
         """Return the same field in another dtype."""
         return self.like(self.flat.astype(dtype))
 
-    def gather(self) -> Any:
+    def gather(self) -> NDArray:
         """Return the whole field on every rank, a plain array."""
         return self.layout.gather(self.flat, self.space.parts).reshape(self.shape)
 
-    def fingerprint(self) -> Any:
-        """Return a whole number for its bits, the same on every rank."""
+    def fingerprint(self) -> int:
+        """Return an integer for its bits, the same on every rank."""
         return int(self.layout.sum(np.int64(hash(self.flat.tobytes()) >> 16)))
 
-    def refuse(self, what: str, *args: Any, **options: Any) -> None:
-        """Return the answer to all that needs more than the block."""
+    def refuse(self, what: str | Callable, *args: Any, **options: Any) -> NoReturn:
+        """Raise TypeError for an operation that needs more than the block."""
         name = getattr(what, "__name__", what)
-        raise TypeError(f"{name} does not work on a field that lies on ranks; write dp.gather(u) for the whole array")
+        raise TypeError(f"{name} does not work on a field on ranks; write dp.gather(u) for the whole array")
 
     def __repr__(self):
         return f"<field on {self.space}, on rank {self.layout.comm.rank} of {self.layout.comm.size}>"
@@ -74,26 +78,32 @@ class DistributedField(np.lib.mixins.NDArrayOperatorsMixin):
         """Return the flat block of another operand; numbers are returned unchanged."""
         if np.ndim(value):
             return block(value, self.space).flat
-        self.layout.tell(value)
+        self.layout.compare(value)
         return value
 
     def __array_ufunc__(self, ufunc, method, *inputs, **options):
         if any(map(isbox, inputs)):
-            return NotImplemented  # autograd's turn
+            return NotImplemented  # autograd handles the call
         if method == "reduce" and options == {"axis": None} and ufunc in REDUCED:
             return REDUCED[ufunc](self)
         if method != "__call__" or ufunc.nout != 1 or ufunc.signature or not options.keys() <= {"dtype", "casting"}:
-            self.refuse(f"{ufunc.__name__} with {method if method != '__call__' else 'out= or where='}")
-        act = pow if ufunc is np.power and not options else ufunc  # the operator of arrays is quick for whole powers
+            option = method
+            if method == "__call__":
+                option = "out= or where="
+            self.refuse(f"{ufunc.__name__} with {option}")
+        act: Callable = ufunc
+        if ufunc is np.power and not options:
+            act = pow  # the operator of arrays is fast for small integer powers
         return self.like(act(*map(self.block_of, inputs), **options))
 
     def __array_function__(self, function, types, args, options):
         if any(map(isbox, args)):
             return NotImplemented
-        return FUNCTIONS.get(function, partial(self.refuse, function))(*args, **options)
+        implementation: Callable = FUNCTIONS.get(function, partial(self.refuse, function))
+        return implementation(*args, **options)
 
 
-for name, what in {
+REFUSED_METHODS = {
     "__getitem__": "u[...]",
     "__setitem__": "u[...] = value",
     "__array__": "conversion to an array",
@@ -101,19 +111,24 @@ for name, what in {
     "__bool__": "a truth value",
     "__iter__": "iteration",
     "__len__": "iteration",
-    **dict.fromkeys(["__float__", "__complex__", "__int__", "__index__"], "conversion to a number"),
-}.items():
-    setattr(DistributedField, name, partialmethod(DistributedField.refuse, what))
+    "__float__": "conversion to a number",
+    "__complex__": "conversion to a number",
+    "__int__": "conversion to a number",
+    "__index__": "conversion to a number",
+}
+for method_name, description in REFUSED_METHODS.items():
+    setattr(DistributedField, method_name, partialmethod(DistributedField.refuse, description))
 
 
-def block(value: Any, space: Any) -> Any:
+def block(value: Any, space: Space) -> DistributedField:
     """Return a field on ranks, from such a field, a number, or an array that every rank holds and that broadcasts."""
     if isinstance(value, DistributedField):
         if value.space.parts != space.parts or value.layout != space.grid.backend:
             raise ShapeError(f"a field on {space.described} is needed, got one on {value.space.described}")
         return value
-    value, layout = np.asarray(value), space.grid.backend
-    layout.tell(value)
+    value = np.asarray(value)
+    layout = space.grid.backend
+    layout.compare(value)
     if np.ndim(value) == 0:
         return DistributedField(np.full(layout.size(space.parts), value), space)
     try:
@@ -125,7 +140,7 @@ def block(value: Any, space: Any) -> Any:
     return DistributedField(layout.take(whole.reshape(-1), space.parts), space)
 
 
-# ---- what NumPy's functions do with them ----
+# ---- NumPy's functions of fields on ranks ----
 
 
 def _first(*values):
@@ -133,7 +148,7 @@ def _first(*values):
 
 
 def _over_all(function, act, x, axis=None, *others, **options):
-    """Return a function of a whole field; what asks for more, such as an axis, is refused."""
+    """Return ``act(x)`` for a reduction of a whole field; other arguments, such as an axis, are refused."""
     if axis is not None and options == {"keepdims": True} and x.shape[axis] == 1:
         return x  # along an axis of one entry
     if any(value is not None and value is not False for value in (axis, *others, *options.values())):
@@ -142,40 +157,68 @@ def _over_all(function, act, x, axis=None, *others, **options):
 
 
 def _sum(x):
-    """Sum of all entries."""
+    """Return the sum of all entries."""
     return x.layout.sum(x.flat.sum())
 
 
-def _extreme(act, end, x):
-    """Return the least or the largest entry; NaN when one is NaN."""
-    return x.layout.agreement.reduced(act.reduce(x.flat, initial=_ends(x)[end]), act)
+def _mean(x):
+    total_in_dtype = _sum(x)[None]  # a number would have no dtype in a division
+    return (total_in_dtype / x.size)[0]
 
 
-_max, _min = partial(_extreme, np.maximum, 0), partial(_extreme, np.minimum, 1)
+def _max(x):
+    """Return the largest entry; NaN if one is NaN."""
+    smallest, _ = _range_of_dtype(x)
+    return x.layout.max(np.maximum.reduce(x.flat, initial=smallest))
+
+
+def _min(x):
+    """Return the least entry; NaN if one is NaN."""
+    _, largest = _range_of_dtype(x)
+    return x.layout.min(np.minimum.reduce(x.flat, initial=largest))
+
+
+def _any(x):
+    return bool(_max(x.astype(bool)))
+
+
+def _all(x):
+    return bool(_min(x.astype(bool)))
 
 
 def _max_from(x, *axis, initial=None, **options):
-    top = _over_all(np.max, _max, x, *axis, **options)
-    return top if initial is None else np.maximum(top, initial)
+    largest = _over_all(np.max, _max, x, *axis, **options)
+    if initial is None:
+        return largest
+    return np.maximum(largest, initial)
 
 
-def _ends(x):
+def _range_of_dtype(x):
     """Return the least and the largest number of the dtype of a field."""
-    if x.dtype.kind == "i":
+    kind = x.dtype.kind
+    if kind == "i":
         return np.iinfo(x.dtype).min, np.iinfo(x.dtype).max
-    return {"f": (-np.inf, np.inf), "b": (False, True)}.get(x.dtype.kind) or x.refuse("an order of complex numbers")
+    if kind == "f":
+        return -np.inf, np.inf
+    if kind == "b":
+        return False, True
+    return x.refuse("an order of complex numbers")
 
 
 def _vdot(x, y):
     first = _first(x, y)
-    here = np.vdot(*(block(value, first.space).flat for value in (x, y)))
-    return here.dtype.type(first.layout.sum(here))
+    local = np.vdot(block(x, first.space).flat, block(y, first.space).flat)
+    return local.dtype.type(first.layout.sum(local))
 
 
 def _norm(x):
-    """Root of the sum of the squares."""
-    x = 1.0 * x  # of whole numbers, too
+    """Return the root of the sum of the squares."""
+    x = 1.0 * x  # integers become float64
     return np.sqrt(_vdot(x, x).real)
+
+
+def _count_nonzero(x):
+    return int(x.layout.sum(np.count_nonzero(x.flat)))
 
 
 def _by_entry(act, *values):
@@ -190,59 +233,87 @@ def _equal(x, y, **options):
 
 
 def _place(extreme, x):
-    """Flat number in the whole field of the first entry that is the least or the largest, or NaN."""
-    here = (x.flat == extreme(x)) | np.isnan(x.flat)
-    at = x.layout.take(np.arange(x.size), x.space.parts)[here]
-    return int(x.layout.min(np.min(at, initial=x.size)))
+    """Return the flat index in the whole field of the first entry that is the least or the largest, or NaN."""
+    is_extreme = (x.flat == extreme(x)) | np.isnan(x.flat)
+    indices = x.layout.take(np.arange(x.size), x.space.parts)[is_extreme]
+    return int(x.layout.min(np.min(indices, initial=x.size)))
 
 
-def _shaped(x, shape, **options):
-    return x if np.broadcast_to(0, x.shape).reshape(shape).shape == x.shape else x.refuse("reshape")
+def _reshape(x, shape, **options):
+    if np.broadcast_to(0, x.shape).reshape(shape).shape != x.shape:
+        x.refuse("reshape")
+    return x
 
 
-def _filled(number):
-    return lambda x, dtype=None: x.like(np.full(x.flat.shape, number, dtype or x.dtype))
+def _full_like(x, number, dtype=None):
+    return x.like(np.full(x.flat.shape, number, dtype or x.dtype))
+
+
+def _zeros_like(x, dtype=None):
+    return _full_like(x, 0, dtype)
+
+
+def _ones_like(x, dtype=None):
+    return _full_like(x, 1, dtype)
 
 
 def _repeat(x, repeats, axis=None):
-    return x if repeats == 1 and axis is not None else x.refuse("repeat")
+    if repeats != 1 or axis is None:
+        x.refuse("repeat")
+    return x
+
+
+def _where(condition, x, y):
+    return _by_entry(np.where, condition, x, y)
+
+
+def _clip(x, low=None, high=None):
+    return _by_entry(np.clip, x, low, high)
+
+
+def _is_complex(x):
+    return x.dtype.kind == "c"
+
+
+def _is_real(x):
+    return x.dtype.kind != "c"
 
 
 def _result_type(*values):
     return np.result_type(*(value.dtype if isinstance(value, DistributedField) else value for value in values))
 
 
-FUNCTIONS = {
+FUNCTIONS: dict[Callable, Callable] = {
     **{getattr(np, name): attrgetter(name) for name in ("shape", "ndim", "size", "real", "imag")},
-    np.iscomplexobj: lambda x: x.dtype.kind == "c",
-    np.isrealobj: lambda x: x.dtype.kind != "c",
+    np.iscomplexobj: _is_complex,
+    np.isrealobj: _is_real,
     np.result_type: _result_type,
     np.max: _max_from,
     np.amax: _max_from,  # in new versions of NumPy the same, in old ones a function of its own
-    np.count_nonzero: lambda x: int(x.layout.sum(np.count_nonzero(x.flat))),
+    np.count_nonzero: _count_nonzero,
     np.argmin: partial(_place, _min),
     np.argmax: partial(_place, _max),
     np.vdot: _vdot,
     np.array_equal: _equal,
-    np.where: lambda condition, x, y: _by_entry(np.where, condition, x, y),
-    np.clip: lambda x, low=None, high=None: _by_entry(np.clip, x, low, high),
-    np.reshape: _shaped,
+    np.where: _where,
+    np.clip: _clip,
+    np.reshape: _reshape,
     np.repeat: _repeat,
     np.copy: DistributedField.copy,
-    np.zeros_like: _filled(0),
-    np.ones_like: _filled(1),
-    np.full_like: lambda x, number: x.like(np.full(x.flat.shape, number, x.dtype)),
+    np.zeros_like: _zeros_like,
+    np.ones_like: _ones_like,
+    np.full_like: _full_like,
 }
-OVER_ALL = {
+OVER_ALL: dict[Any, Callable] = {
     np.sum: _sum,
-    np.mean: lambda x: (_sum(x)[None] / x.size)[0],  # beside an array a number has no dtype
+    np.mean: _mean,
     np.min: _min,
     np.amin: _min,
-    np.any: lambda x: bool(_max(x.astype(bool))),
-    np.all: lambda x: bool(_min(x.astype(bool))),
+    np.any: _any,
+    np.all: _all,
     np.linalg.norm: _norm,
 }
-FUNCTIONS.update((function, partial(_over_all, function, act)) for function, act in OVER_ALL.items())
+FUNCTIONS |= {function: partial(_over_all, function, act) for function, act in OVER_ALL.items()}
 REDUCED: dict = {np.add: _sum, np.maximum: _max, np.minimum: _min}  # as ``np.add.reduce(u, axis=None)``
 
 
@@ -255,7 +326,7 @@ def _spread(shape, space):
     return linear("block", lambda x: block(x, space), back)
 
 
-def everywhere(x: Any, space: Any) -> Any:
+def everywhere(x: Any, space: Space) -> Any:
     """Return a field on ranks, from a number or an array that every rank holds, traced or not."""
     if not isbox(x):
         return block(x, space)
@@ -263,28 +334,32 @@ def everywhere(x: Any, space: Any) -> Any:
     if isinstance(value, DistributedField):
         return x
     if np.shape(value) not in ((), space.shape):
-        x = x * np.ones(space.shape)  # autograd adds up what is spread
+        x = x * np.ones(space.shape)  # the derivative of broadcasting is a sum; autograd computes it
     return _spread(np.shape(value), space)[0](x)
 
 
-def alike(back: Any, value: Any) -> Any:
-    """Return a cotangent or tangent in the form of what it belongs to: a number, a whole array, or a field on ranks."""
-    field, wanted = plain(back), plain(value)
-    if isinstance(wanted, DistributedField):
-        return everywhere(back, wanted.space)
-    return _spread(np.shape(wanted), field.space)[1](back) if isinstance(field, DistributedField) else back
+def alike(derivative: Any, value: Any) -> Any:
+    """Return a cotangent or tangent in the form of its value: a number, a whole array, or a field on ranks."""
+    plain_value = plain(value)
+    if isinstance(plain_value, DistributedField):
+        return everywhere(derivative, plain_value.space)
+    plain_derivative = plain(derivative)
+    if isinstance(plain_derivative, DistributedField):
+        _, collect = _spread(np.shape(plain_value), plain_derivative.space)
+        return collect(derivative)
+    return derivative
 
 
 def total(x: Any) -> Any:
-    """Sum of all entries, on the tape too."""
+    """Return the sum of all entries; differentiable."""
     return alike(x, 0.0)
 
 
-def formulas(fun: Any, value: Any, args: Any, nums: Any) -> Any:
+def formulas(fun: Callable, value: Any, args: Sequence[Any], nums: Sequence[int]) -> tuple | None:
     """Return the VJP and JVP of a call ``value = fun(*args)`` of autograd.numpy, as in FORMULAS; None if unknown.
 
-    Numbers and whole arrays are made fields first; then every function entry by entry has the derivatives that
-    autograd knows, to every order, and what spreads them adds up what comes back.
+    Numbers and whole arrays are converted to fields first, by rules whose transposes add up the cotangents. Then
+    autograd's derivatives of every function that acts entry by entry apply, to every order.
     """
     if fun not in KNOWN:
         return None
@@ -294,97 +369,141 @@ def formulas(fun: Any, value: Any, args: Any, nums: Any) -> Any:
             raise TypeError(
                 f"the derivative of {fun.__name__} of a field on ranks is not known; write sums of products"
             )
-        slope = REDUCTIONS[fun](args[0], value, space)
-        return lambda nums, args: (lambda g: (slope * g,), ()), lambda g, num, args, shape: total(slope * g)
-    spread = [everywhere(arg, space) if num in nums else arg for num, arg in enumerate(args)]
-    vjp, jvp = autograd_rules(fun)
+        return _formulas_of_reduction(REDUCTIONS[fun](args[0], value, space))
+    fields = [everywhere(arg, space) if num in nums else arg for num, arg in enumerate(args)]
+    autograd_vjp, autograd_jvp = autograd_rules(fun)
 
-    def back(nums, args):
-        pull = vjp(nums, value, spread, {})
-        return lambda g: [alike(one, args[num]) for num, one in zip(nums, pull(everywhere(g, space)))], ()
+    def vjp(nums, args):
+        pull_fields = autograd_vjp(nums, value, fields, {})
 
-    return back, lambda g, num, args, shape: jvp((num,), [everywhere(g, space)], value, spread, {})
+        def pull(g):
+            derivatives = pull_fields(everywhere(g, space))
+            return [alike(derivative, args[num]) for num, derivative in zip(nums, derivatives, strict=True)]
+
+        return pull, ()
+
+    def jvp(g, num, args, shape):
+        return autograd_jvp((num,), [everywhere(g, space)], value, fields, {})
+
+    return vjp, jvp
 
 
-def _ties(x, value, space):
-    least = block(plain(x) == plain(value), space).astype(float)
-    return least / _sum(least)
+def _formulas_of_reduction(slope):
+    """Return the VJP and JVP of a number computed from one field; `slope`: its gradient."""
+
+    def vjp(nums, args):
+        def pull(g):
+            return (slope * g,)
+
+        return pull, ()
+
+    def jvp(g, num, args, shape):
+        return total(slope * g)
+
+    return vjp, jvp
+
+
+# The gradients of reductions, ``slope(x, value, space)``.
+
+
+def _slope_of_sum(x, value, space):
+    return block(1.0, space)
+
+
+def _slope_of_mean(x, value, space):
+    return block(1.0 / space.size, space)
+
+
+def _slope_of_extreme(x, value, space):
+    """Return equal shares for all entries that have the extreme value."""
+    is_extreme = block(plain(x) == plain(value), space).astype(float)
+    return is_extreme / _sum(is_extreme)
+
+
+def _slope_of_norm(x, value, space):
+    return x / value
 
 
 REDUCTIONS = {
-    anp.sum: lambda x, value, space: block(1.0, space),
-    anp.max: _ties,
-    anp.min: _ties,
-    anp.linalg.norm: lambda x, value, space: x / value,
-    **dict.fromkeys(
-        [anp.mean, getattr(anp.numpy_wrapper, "_primitive_mean", anp.mean)],
-        lambda x, value, space: block(1.0 / space.size, space),
-    ),
+    anp.sum: _slope_of_sum,
+    anp.mean: _slope_of_mean,
+    getattr(anp.numpy_wrapper, "_primitive_mean", anp.mean): _slope_of_mean,
+    anp.max: _slope_of_extreme,
+    anp.amax: _slope_of_extreme,
+    anp.min: _slope_of_extreme,
+    anp.amin: _slope_of_extreme,
+    anp.linalg.norm: _slope_of_norm,
 }
-REDUCTIONS.update({anp.amax: _ties, anp.amin: _ties})
 KNOWN = {*REDUCTIONS, *filter(callable, vars(anp).values())}
 
 
-class Sums(VSpace):
-    """What autograd asks of a kind of values: to add them up."""
+class DistributedVSpace(VSpace):
+    """The vector space of fields on ranks, as autograd needs it to add up cotangents."""
 
-    def __init__(self, value: Any) -> None:
-        self.shape, self.dtype, self.value = value.shape, value.dtype, value
+    def __init__(self, value: DistributedField) -> None:
+        self.shape = value.shape
+        self.dtype = value.dtype
+        self.value = value
 
-    def zeros(self) -> Any:
+    def zeros(self) -> DistributedField:
         """Return a field of zeros."""
-        return np.zeros_like(self.value)
+        return _zeros_like(self.value)
 
     def _mut_add(self, x, y):
         return x + y
 
 
-# ---- calls that all ranks make alike ----
+# ---- calls that are the same on all ranks ----
 
 
-def together(what: str, given: Any, act: Any, *args: Any) -> Any:
-    """Return act(*args): an error of one rank is raised on all; `given` and the result must be equal on all ranks.
+def together(what: str, arguments: Any, act: Callable, *args: Any) -> Any:
+    """Return act(*args): an error of one rank is raised on all; arguments and result must be equal on all ranks.
 
-    Where no field on ranks was met, nothing is asked.
+    Ranks exchange no message if the call uses no field on ranks.
     """
-    outermost, untold = course.begun is None, (what, given)
-    if outermost:
-        course.begun = course.met
-    course.untold.append(untold)
+    is_outermost = state.messages_before_call is None
+    entry = (what, arguments)
+    if is_outermost:
+        state.messages_before_call = state.messages
+    state.unrecorded.append(entry)
     try:
         try:
             result = act(*args)
         except Exception as error:
-            if agreement := _agreement(given):
+            agreement = _agreement(arguments)
+            if agreement is not None:
                 agreement.fail(error)
             raise
-        if agreement := _agreement(given):
-            agreement.tell_all("the result", what, result)
-            agreement.meet(what)
+        agreement = _agreement(arguments)
+        if agreement is not None:
+            agreement.record_leaves("the result", what, result)
+            agreement.synchronize(what)
         return result
     finally:
-        course.untold[:] = [other for other in course.untold if other is not untold]
-        if outermost:
-            course.begun = None
+        state.unrecorded[:] = [other for other in state.unrecorded if other is not entry]
+        if is_outermost:
+            state.messages_before_call = None
 
 
-def _agreement(given):
+def _agreement(arguments: Any) -> Agreement | None:
     """Return the agreement of the fields among some values, or of the last message of this call; else None."""
-    for leaf in leaves(given):
+    for leaf in leaves(arguments):
         backend: Any = getattr(plain(leaf), "backend", NUMPY)
         if not backend.whole_fields:
             return backend.agreement
-    return course.last if course.met > course.begun else None
+    if state.messages_before_call is not None and state.messages > state.messages_before_call:
+        return state.last
+    return None
 
 
 BOX.register(DistributedField)
-VSpace.register(DistributedField, Sums)
+VSpace.register(DistributedField, DistributedVSpace)
 
 
 class DistributedKind(ArrayKind):
-    """What the tape and public calls ask of fields on ranks."""
+    """See `ArrayKind`."""
 
-    def formulas(self, fun: Any, value: Any, args: Any, nums: Any) -> Any:
+    def formulas(self, fun: Callable, value: Any, args: tuple, nums: tuple) -> tuple | None:
         """See `formulas`."""
         return formulas(fun, value, args, nums)
 
@@ -392,13 +511,15 @@ class DistributedKind(ArrayKind):
         """See `alike`."""
         return alike(derivative, value)
 
-    def collectively(self, what: str, arguments: Any, act: Any, *args: Any) -> Any:
+    def collectively(self, what: str, arguments: Any, act: Callable, *args: Any) -> Any:
         """See `together`."""
         return together(what, arguments, act, *args)
 
-    def process_count(self) -> Any:
+    def process_count(self) -> int:
         """Return the number of ranks of the last communicator."""
-        return course.last.comm.size if course.last else 1
+        if state.last is None:
+            return 1
+        return state.last.comm.size
 
 
 ARRAY_KINDS[DistributedField] = DistributedKind()

@@ -2,39 +2,48 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from functools import cache, cached_property, reduce
 from operator import add
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
 
+from sparsedp._utils.reconstruction import Frozen
 from sparsedp._utils.validation import field_array
 from sparsedp.advection.method import TransportMethod
+from sparsedp.advection.settings import TransportSettings
 from sparsedp.advection.transport import method_and_rule
 from sparsedp.autodiff.backend import Backend, is_distributed
-from sparsedp.autodiff.tape import linear
+from sparsedp.autodiff.tape import Rule, linear
 from sparsedp.errors import ShapeError
-from sparsedp.grid.grid import node_axes
+from sparsedp.flow.projection_setup import ProjectionSetup
+from sparsedp.grid.grid import Grid, node_axes
 from sparsedp.grid.space import Space
-from sparsedp.operators.given import from_matrix
+from sparsedp.operators.operator import Operator
+from sparsedp.operators.structure.base import Structure
 from sparsedp.optimize.minimize import minimize
-from sparsedp.parallel.cut import localized
-from sparsedp.parallel.exchange import hold
+from sparsedp.optimize.result import Minimum
+from sparsedp.parallel.cut import local_structure, storage
+from sparsedp.parallel.exchange import keep_petsc_communicator
 from sparsedp.parallel.fields import DistributedField, block, everywhere
+from sparsedp.parallel.jacobian import RanksJacobians
 from sparsedp.parallel.partition import Partition
+from sparsedp.parallel.projection import RanksProjectionSetup
 from sparsedp.parallel.solve import RanksSystem
-from sparsedp.parallel.stencil import stencil_of
-from sparsedp.parallel.transport import Carry
-from sparsedp.solvers.choose_method import Choice
+from sparsedp.parallel.transport import TransportOnBlocks
+from sparsedp.solvers.choose_method import Choice, SolveSettings
 from sparsedp.solvers.inverse import system_and_choice
-from sparsedp.solvers.jacobian import jacobian_on_unknowns
+from sparsedp.solvers.jacobian import Jacobians
 from sparsedp.solvers.newton import space_of_unknowns
 from sparsedp.solvers.system import System
 
 __all__ = ["Layout"]
 
 # The functions that call `check_grid` or `check_operator` and work on ranks; all others raise TypeError.
-RIGHT = {
+SUPPORTED = {
     "component",
     "curl",
     "distribute",
@@ -55,191 +64,191 @@ RIGHT = {
 }
 
 
-ENTRIES = 1000  # of an array beside a field that are compared between ranks, in 5 us
-
-
 class Layout(Partition, Backend):
     """The partition of a grid, and how operators and fields use it."""
 
     whole_fields = False
 
-    def __init__(self, shape: tuple, periodic: Any, comm: Any) -> None:
+    def __init__(self, shape: Sequence[int], periodic: Sequence[bool], comm: MPI.Comm) -> None:
         super().__init__(shape, periodic, comm)
-        hold(comm)
+        keep_petsc_communicator(comm)
         self._pieces = cache(_pieces)
 
-    def __str__(self):
+    def __str__(self) -> str:
         return f"on {self.comm.size} ranks"
 
     __repr__ = __str__
 
     def check(self, name: str) -> None:
         """Raise TypeError if a function does not work on ranks."""
-        if name not in RIGHT:
+        if name not in SUPPORTED:
             raise TypeError(f"{name} does not work on ranks yet; give it the grid from before dp.distribute")
 
-    def place(self, grid: Any) -> Any:
+    def place(self, grid: Grid) -> Grid:
         """Return a grid whose fields are on the same ranks."""
-        return laid(grid, self.comm)
+        return grid_on_ranks(grid, self.comm)
 
     # ------------------------------------------------------------ operators
 
-    def apply(self, op: Any, u: Any, out: Any = None) -> Any:
+    def apply(self, op: Operator, u: Any, out: NDArray | None = None) -> Any:
         """Return the result of an Operator for a field on ranks, or one that every rank holds."""
         if out is not None:
             raise TypeError(f"{op.name} takes no out on ranks; leave it out")
-        return self.agreement.agreed(op.name, self._applied, op, u)
+        return self.agreement.run(op.name, self._applied, op, u)
 
-    def cut(self, op: Any) -> Any:
-        """Return what an operator does to the blocks of this rank, as a Structure; it is kept with the operator."""
-        if "_cut" not in vars(op):
-            vars(op)["_cut"] = localized(op.structure, _side(op.domain), _side(op.codomain))
-        return vars(op)["_cut"]
+    def local_structure(self, op: Operator) -> Structure:
+        """Return what an operator does to the blocks of this rank."""
+        return local_structure(op.structure, storage(op.domain), storage(op.codomain))
 
     def _applied(self, op, u):
-        y = self.cut(op).product(self._given(op, u))
+        y = op.local_structure.product(self._flat_argument(op, u))
         if op.codomain.backend.whole_fields:
             return y.reshape(op.codomain.shape)
         return DistributedField(y, op.codomain)
 
-    def _given(self, op, u):
+    def _flat_argument(self, op, u):
+        """Return the entries of the argument of an operator that this rank holds."""
         if not isinstance(u, DistributedField):
             u = field_array(op, u)
-            return u.reshape(-1) if op.domain.backend.whole_fields else block(u, op.domain).flat
-        if _side(op.domain) != _side(u.space):
+            if op.domain.backend.whole_fields:
+                return u.reshape(-1)
+            return block(u, op.domain).flat
+        if storage(op.domain) != storage(u.space):
             raise ShapeError(f"{op.name} takes a field on {op.domain.described}, got one on {u.space.described}")
-        return u.flat if u.dtype.kind in "fc" else u.flat.astype(float)
+        if u.dtype.kind in "fc":
+            return u.flat
+        return u.flat.astype(float)
 
-    def system(self, op: Any, rtol: Any, maxiter: Any, method: str = "auto", options: Any = None) -> Any:
+    def system(
+        self,
+        op: Operator,
+        rtol: float,
+        maxiter: int | None,
+        method: str = "auto",
+        options: dict[str, Any] | None = None,
+    ) -> RanksSystem:
         """Return the system of an operator on ranks, for `inverse`."""
-        if _side(op.domain) != _side(op.codomain):
-            raise TypeError(f"inverse of {op.name} does not work on ranks; both sides must lie there in the same way")
+        if storage(op.domain) != storage(op.codomain):
+            raise TypeError(f"inverse of {op.name} does not work on ranks; both sides must be stored in the same way")
         if method != "auto" or options:
             raise TypeError(f"inverse takes no method and no options on ranks, got {method!r}; omit them")
         if op.dtype.kind == "c":
             raise TypeError(f"inverse takes real operators on ranks, {op.name} is complex; solve it on one process")
         return RanksSystem(op, rtol, maxiter)
 
-    stencil = staticmethod(stencil_of)  # what the rows of a Jacobian on each rank need
-
     def reference(self, u: Any) -> Any:
-        """Return the argument of an Operator, which tells on which space its gradient is."""
+        """Return the argument of an Operator: its gradient is on the same space."""
         return u
 
-    def implementation(self, default: Any) -> Any:
+    def implementation(self, default: Callable) -> Callable:
         """Return what is called on ranks instead of a class or function of one process."""
-        replacements = {
+        replacements: dict[Callable, Callable] = {
+            Jacobians: RanksJacobians,
+            ProjectionSetup: RanksProjectionSetup,
             System: self.system,
-            jacobian_on_unknowns: jacobian_on_ranks,
-            method_and_rule: method_and_carry,
+            method_and_rule: method_and_rule_on_ranks,
             minimize: self.minimize,
-            space_of_unknowns: self.joined,
+            space_of_unknowns: self.space_of_fields,
             system_and_choice: self.system_and_choice,
         }
         return replacements.get(default, default)
 
-    def system_and_choice(self, op: Any, settings: Any, solves: Any) -> Any:
+    def system_and_choice(self, op: Operator, settings: SolveSettings, solves: str) -> tuple[RanksSystem, Choice]:
         """Return the System of an operator on ranks, and that PETSc solves it."""
         system = self.system(op, settings.rtol, settings.maxiter, settings.method, settings.options)
         return system, Choice("petsc", str(self))
 
-    def minimize(self, *given: Any) -> Any:
-        """`minimize` of unknowns on ranks."""
+    def minimize(self, *arguments: Any) -> Minimum:
+        """Call `minimize_on_ranks`."""
         from sparsedp.parallel.minimize import minimize_on_ranks
 
-        return minimize_on_ranks(self.comm, *given)
+        return minimize_on_ranks(self.comm, *arguments)
 
-    def attempt(self, act: Any, *args: Any) -> Any:
+    def attempt(self, act: Callable, *args: Any) -> Any:
         """Return ``act(*args)``; if it fails on one rank it fails on all."""
-        return self.agreement.agreed("a trial", act, *args, at_once=True)
+        return self.agreement.run("a trial", act, *args, at_once=True)
 
     # ------------------------------------------------------------ fields
 
-    def tell(self, value: Any) -> None:
-        """Note a number or an array, or a part of its entries, that meets a field: it must be the same on all ranks."""
-        value, what = np.asarray(value), "a number"
-        if value.ndim:
-            most, what = round(ENTRIES ** (1 / value.ndim)), f"an array of shape {value.shape}"
-            value = value[tuple(slice(None, None, n // most + 1) for n in value.shape)]
-        self.agreement.tell(f"{what} beside a field on ranks", value.tobytes())
+    def volumes(self, space: Space) -> DistributedField:
+        """Return the control volumes as a field."""
+        blocks = []
+        for axis, part in enumerate(space.parts):
+            lines = self._own_parts(part, space.grid.control_lengths(space.kind, axis))
+            blocks.append(reduce(np.multiply.outer, lines).reshape(-1))
+        return DistributedField(np.concatenate(blocks), space)
 
-    def volumes(self, space: Any) -> Any:
-        """Control volumes, as a field."""
-        lines = [
-            self._beside(part, space.grid.control_lengths(space.kind, axis)) for axis, part in enumerate(space.parts)
-        ]
-        return DistributedField(np.concatenate([reduce(np.multiply.outer, some).reshape(-1) for some in lines]), space)
-
-    def mesh(self, grid: Any, lines: Any) -> Any:
+    def mesh(self, grid: Grid, lines: Sequence[NDArray]) -> tuple[DistributedField, ...]:
         """Return a field of coordinates for each axis, from the coordinates along the axes."""
         space = Space(tuple(line.size for line in lines), "places", grid)
-        lines = self._beside(space.shape, lines)
-        return tuple(DistributedField(np.array(full).reshape(-1), space) for full in np.meshgrid(*lines, indexing="ij"))
+        own_lines = self._own_parts(space.shape, lines)
+        fields = np.meshgrid(*own_lines, indexing="ij")
+        return tuple(DistributedField(np.array(values).reshape(-1), space) for values in fields)
 
-    def _beside(self, part, lines):
+    def _own_parts(self, part, lines):
         """Return the parts of arrays along the axes that belong to the block of this rank."""
-        return [line[start:stop] for line, (start, stop) in zip(lines, self.box(part))]
+        return [line[start:stop] for line, (start, stop) in zip(lines, self.box(part), strict=True)]
 
     def flat(self, field: Any) -> Any:
         """Return the field itself, whose operations act on the flat block."""
         return field
 
-    def field(self, space: Any, value: Any) -> Any:
-        """Return a field on ranks of values that every rank holds."""
-        return block(value, space)
+    def combinable(self, value: Any) -> Any:
+        """Return the value itself: fields on ranks take numbers and whole arrays as operands."""
+        return value
 
-    def joined(self, name: str, fields: Any) -> Any:
-        """Return the space of some fields side by side."""
+    def field(self, space: Space, values: Any) -> DistributedField:
+        """Return a field on ranks of values that every rank holds."""
+        return block(values, space)
+
+    def space_of_fields(self, name: str, fields: Sequence[Any]) -> JointSpace:
+        """Return the space of some fields one after the other."""
         for field in fields:
             if not isinstance(field, DistributedField) or field.layout != self:
                 raise TypeError(
-                    f"{name} takes fields that all lie on the same ranks, or none, got {type(field).__name__} among "
-                    "them; write dp.identity(grid.cells)(u) for the field of an array"
+                    f"{name} takes fields that are all distributed in the same way, or none, got "
+                    f"{type(field).__name__} among them; write dp.identity(grid.cells)(u) for the field of an array"
                 )
-        return Joint([field.space for field in fields])
+        return JointSpace([field.space for field in fields])
 
-    def split(self, space: Any, v: Any) -> Any:
-        """Return the components of a field, or the fields that a joint one holds; differentiable."""
+    def split(self, space: Space, v: Any) -> tuple:
+        """Return the components of a field, or the fields of a joint one; differentiable."""
         if type(space) is Space and not is_distributed(v):
             return space.split_array(v)
-        return tuple(take(v) for _, take, _ in self._pieces(space))
+        return tuple(piece.take(v) for piece in self._pieces(space))
 
-    def join(self, space: Any, parts: Any) -> Any:
+    def join(self, space: Space, parts: Any) -> Any:
         """Return one field of its components, or of fields; differentiable."""
         if type(space) is Space and not any(map(is_distributed, parts)):
             return space.join_arrays(parts)
-        pairs = zip(self._pieces(space), parts)
-        return reduce(add, (back(everywhere(part, inner)) for (inner, _, back), part in pairs))
+        pairs = zip(self._pieces(space), parts, strict=True)
+        return reduce(add, (piece.embed(everywhere(part, piece.space)) for piece, part in pairs))
 
 
-def jacobian_on_ranks(op: Any, space: Any) -> Any:
-    """Return a Jacobian that was given as an Operator, between the unknowns on ranks."""
-    if _side(op.domain) == _side(op.codomain) == _side(space):
-        return op
-    return from_matrix(op.matrix, space, space, op.name)
-
-
-def method_and_carry(settings: Any) -> Any:
+def method_and_rule_on_ranks(settings: TransportSettings) -> tuple[TransportMethod, TransportOnBlocks]:
     """Return a scheme of transport, and the differentiable rule of a step on ranks."""
-    return TransportMethod(settings), Carry(settings)
+    return TransportMethod(settings), TransportOnBlocks(settings)
 
 
-def laid(grid: Any, comm: Any) -> Any:
+def grid_on_ranks(grid: Grid, comm: MPI.Comm) -> Grid:
     """Return a grid whose fields are on the ranks of a communicator."""
-    made = object.__new__(type(grid))
-    vars(made).update(grid.__getstate__(), backend=Layout(grid.shape, grid.periodic, comm))
-    return made
+    return grid.stored_by(Layout(grid.shape, grid.periodic, comm))
 
 
-class Joint(Space):
-    """Where some fields lie side by side, as one flat field."""
+class JointSpace(Space):
+    """The space of some fields, one after the other, as one flat field.
 
-    spaces: list
+    Parameters
+    ----------
+    spaces : list of Space
+    """
 
-    def __init__(self, spaces: Any) -> None:
+    spaces: list[Space]
+
+    def __init__(self, spaces: list[Space]) -> None:
         parts = [part for space in spaces for part in space.parts]
         super().__init__(None, " and ".join(map(str, spaces)), spaces[0].grid, parts)
-        vars(self).update(spaces=spaces)
+        Frozen.__init__(self, spaces=spaces)
 
     @cached_property
     def volumes(self) -> Any:
@@ -249,30 +258,49 @@ class Joint(Space):
         return self.backend.join(self, [space.volumes for space in self.spaces])
 
 
+class Piece(NamedTuple):
+    """A component of a space, or a field of a joint space.
+
+    Attributes
+    ----------
+    space : Space
+    take : Rule
+        From a field on the whole space to its part on this one.
+    embed : Rule
+        The transpose: zeros elsewhere.
+    """
+
+    space: Space
+    take: Rule
+    embed: Rule
+
+
 def _pieces(space):
-    """Return the space of each component (or field) of a space, with the rules from the whole to it and back."""
-    layout, made, start = space.backend, [], 0
-    for inner in getattr(space, "spaces", None) or [
-        Space(part, f"components of {space.kind}", space.grid) for part in space.parts
-    ]:
+    """Return the pieces of a space."""
+    layout = space.backend
+    inner_spaces = getattr(space, "spaces", None)
+    if inner_spaces is None:
+        inner_spaces = [Space(part, f"components of {space.kind}", space.grid) for part in space.parts]
+    pieces = []
+    start = 0
+    for inner in inner_spaces:
         stop = start + layout.size(inner.parts)
-        made.append((inner, *_piece(space, inner, slice(start, stop))))
+        pieces.append(_piece(space, inner, slice(start, stop)))
         start = stop
-    return made
+    return pieces
 
 
-def _piece(space, inner, here):
+def _piece(space, inner, window):
+    """Return the piece of a space that is a window of the flat block."""
     size = space.backend.size(space.parts)
 
-    def back(g):
-        g = block(g, inner).flat
-        flat = np.zeros(size, g.dtype)
-        flat[here] = g
+    def take(x):
+        return DistributedField(block(x, space).flat[window], inner)
+
+    def embed(g):
+        values = block(g, inner).flat
+        flat = np.zeros(size, values.dtype)
+        flat[window] = values
         return DistributedField(flat, space)
 
-    return linear("piece", lambda x: DistributedField(block(x, space).flat[here], inner), back)
-
-
-def _side(space):
-    """Return where fields on a space are stored: (layout, components), or None if every rank has all of it."""
-    return None if space.backend.whole_fields else (space.backend, space.parts)
+    return Piece(inner, *linear("piece", take, embed))

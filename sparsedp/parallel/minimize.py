@@ -1,7 +1,7 @@
 """minimize for fields on ranks, by PETSc's optimizer TAO.
 
 The unknowns are a distributed vector of PETSc. Each rank holds its blocks of the fields; rank 0 holds the unknowns that
-every rank knows, such as numbers and NumPy arrays. Evaluations, the history and the stopping test are the same as
+every rank holds, such as numbers and NumPy arrays. Evaluations, the history and the stopping test are the same as
 on one process.
 """
 
@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from sparsedp._utils.pytree import labels, leaves, mapped
@@ -40,16 +41,16 @@ class LocalUnknowns:
 
     Parameters
     ----------
-    comm : mpi4py communicator
+    comm : mpi4py.MPI.Comm
     start : tree
     """
 
-    def __init__(self, comm: Any, start: Any) -> None:
+    def __init__(self, comm: MPI.Comm, start: Any) -> None:
         self.comm = comm
         self.start = start
 
     def blocks(self, tree: Any) -> Any:
-        """Return the tree of local blocks; unknowns that every rank knows are empty on all ranks but rank 0."""
+        """Return the tree of local blocks; unknowns that every rank holds are empty on all ranks but rank 0."""
 
         def block(leaf):
             if isinstance(leaf, DistributedField):
@@ -61,7 +62,7 @@ class LocalUnknowns:
         return mapped(block, tree)
 
     def tree(self, blocks: Any) -> Any:
-        """Return the tree of fields, and of unknowns that every rank knows, from the blocks. All ranks call it."""
+        """Return the tree of fields, and of unknowns that every rank holds, from the blocks. All ranks call it."""
 
         def unknown(leaf, block):
             if isinstance(leaf, DistributedField):
@@ -99,14 +100,14 @@ class DistributedObjective(Objective):
                 check_finite(f"the gradient of {name}", g, FINITE)
         return float(value), self._packing.pack_gradient(self.unknowns.blocks(gradient))
 
-    def projected_gradient(self, evaluation: Evaluation) -> Any:
+    def projected_gradient(self, evaluation: Evaluation) -> list[Any]:
         """Return the gradient as a list of fields and arrays, 0 in entries that bounds hold."""
         blocks = self._packing.unpack(super().projected_gradient(evaluation))
         return [leaf for leaf in leaves(self.unknowns.tree(blocks)) if is_variable(leaf)]
 
 
 def minimize_on_ranks(
-    comm: Any,
+    comm: MPI.Comm,
     loss: Callable[[Any], Any],
     start: Any,
     method: str,
@@ -120,7 +121,7 @@ def minimize_on_ranks(
 
     Parameters
     ----------
-    comm : mpi4py communicator
+    comm : mpi4py.MPI.Comm
     loss, start, method, maxiter, tolerance, callback, bounds
         As for `minimize`.
     other_arguments : dict
@@ -167,7 +168,9 @@ def _check_arguments(method, tolerance, bounds, other_arguments):
         )
 
 
-def _run(comm: Any, objective: DistributedObjective, monitor: Monitor, x: NDArray[np.float64], maxiter: int) -> None:
+def _run(
+    comm: MPI.Comm, objective: DistributedObjective, monitor: Monitor, x: NDArray[np.float64], maxiter: int
+) -> None:
     """Run TAO's quasi-Newton method with limited memory and bounds from x until the monitor stops it."""
     first = objective.evaluate_start(x)
     unused_evaluations = [first]  # TAO evaluates its start again

@@ -1,24 +1,32 @@
 """Which rank holds which block of a field, and the numbers that all ranks agree on.
 
 Along an axis, the ranks at place c hold the cells cuts[c] to cuts[c + 1] and their lower faces; those at the last place
-hold the upper wall too. So every number has one owner, and sums over blocks are sums. Blocks may be empty: any grid
-lies on any number of ranks. A box is one (start, stop) for each axis of a component; on a periodic axis it may reach
-beyond 0 and n.
+hold the upper wall too. So every number has one owner, and sums over blocks are sums. Blocks may be empty: any grid can
+be distributed over any number of ranks. A box is one (start, stop) for each axis of a component; on a periodic axis it
+may reach beyond 0 and n.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from itertools import product
 from math import prod
-from typing import Any
+from typing import Any, NoReturn, TypeAlias
 
 import numpy as np
+from mpi4py import MPI
+from numpy.typing import ArrayLike, NDArray
 
 from sparsedp.operators.structure.kronecker import components
 from sparsedp.parallel.agreement import Agreement
 
-__all__ = ["Partition"]
+__all__ = ["Box", "Partition", "Shapes", "lengths", "slices"]
+
+Box: TypeAlias = Sequence[tuple[int, int]]
+Shapes: TypeAlias = Sequence[tuple[int, ...]]
+
+MOST_COMPARED = 1000  # entries of an array that are compared between ranks, in 5 us
 
 
 class Partition:
@@ -30,12 +38,21 @@ class Partition:
         Cells along each axis.
     periodic : tuple of bool
     comm : mpi4py.MPI.Comm
+
+    Attributes
+    ----------
+    ranks : tuple of int
+        Number of ranks along each axis.
+    cuts : list of int arrays
+        For each axis the first cell at each place, and the number of cells.
     """
 
-    def __init__(self, shape: tuple, periodic: Any, comm: Any) -> None:
-        self.shape, self.periodic, self.comm = tuple(shape), tuple(periodic), comm
+    def __init__(self, shape: Sequence[int], periodic: Sequence[bool], comm: MPI.Comm) -> None:
+        self.shape = tuple(shape)
+        self.periodic = tuple(periodic)
+        self.comm = comm
         self.ranks = _arrangement(self.shape, comm.size)
-        self.cuts = [n * np.arange(p + 1) // p for n, p in zip(self.shape, self.ranks)]
+        self.cuts = [n * np.arange(p + 1) // p for n, p in zip(self.shape, self.ranks, strict=True)]
         start = tuple(a for a, _ in self.box(self.shape))
         self.agreement = Agreement(comm, f", whose block begins at cell {start}")
 
@@ -43,100 +60,124 @@ class Partition:
     def _key(self):
         return self.shape, self.periodic, self.comm.py2f()
 
-    def __eq__(self, other):
+    def __eq__(self, other: object) -> bool:
         return isinstance(other, Partition) and self._key == other._key
 
-    def __hash__(self):
+    def __hash__(self) -> int:
         return hash(self._key)
 
-    def __reduce__(self):
+    def __reduce__(self) -> NoReturn:
         raise TypeError("a grid on ranks cannot be pickled; pickle the grid that was given to dp.distribute")
 
     # ------------------------------------------------------------ blocks
 
-    def lines(self, axis: int, length: int) -> Any:
+    def lines(self, axis: int, length: int) -> NDArray[np.integer]:
         """Return the cuts along one axis of a component with `length` entries: cells, nodes, or any other number."""
         return np.append(self.cuts[axis][:-1] * length // max(self.shape[axis], 1), length)
 
     @cached_property
-    def places(self) -> Any:
-        """Along each axis, the place of every rank."""
+    def places(self) -> list[tuple]:
+        """For each rank, its place along each axis."""
         return [np.unravel_index(rank, self.ranks) for rank in range(self.comm.size)]
 
-    def box(self, part: Any, rank: Any = None) -> Any:
+    def box(self, part: Sequence[int], rank: int | None = None) -> Box:
         """Return the box of one component that a rank (default: this one) holds."""
-        place = self.places[self.comm.rank if rank is None else rank]
+        if rank is None:
+            rank = self.comm.rank
         lines = [self.lines(axis, length) for axis, length in enumerate(part)]
-        return tuple((int(line[p]), int(line[p + 1])) for line, p in zip(lines, place))
+        return tuple((int(line[p]), int(line[p + 1])) for line, p in zip(lines, self.places[rank]))
 
-    def shapes(self, parts: Any, rank: Any = None) -> Any:
-        """Shapes of the blocks of a rank, one for each component."""
+    def shapes(self, parts: Shapes, rank: int | None = None) -> Shapes:
+        """Return the shapes of the blocks of a rank, one for each component."""
         return [lengths(self.box(part, rank)) for part in parts]
 
-    def size(self, parts: Any, rank: Any = None) -> Any:
-        """Count of numbers in the blocks of a rank."""
+    def size(self, parts: Shapes, rank: int | None = None) -> int:
+        """Return the number of entries in the blocks of a rank."""
         return sum(map(prod, self.shapes(parts, rank)))
 
-    def blocks(self, whole: Any, parts: Any, rank: Any = None) -> Any:
-        """Return what a rank holds of a whole flat field, as views, one for each component."""
-        return [field[slices(self.box(part, rank))] for field, part in zip(components(whole, parts), parts)]
+    def blocks(self, whole: NDArray, parts: Shapes, rank: int | None = None) -> list[NDArray]:
+        """Return the blocks of a rank in a whole flat field, as views, one for each component."""
+        fields = components(whole, parts)
+        return [field[slices(self.box(part, rank))] for field, part in zip(fields, parts, strict=True)]
 
-    def take(self, values: Any, parts: Any) -> Any:
+    def take(self, values: NDArray, parts: Shapes) -> NDArray:
         """Return the flat block of this rank of a whole flat field, a copy."""
         return np.concatenate([values[:0], *(block.reshape(-1) for block in self.blocks(values, parts))])
 
-    def gather(self, flat: np.ndarray, parts: Any) -> Any:
+    def gather(self, flat: NDArray, parts: Shapes) -> NDArray:
         """Return the whole flat field on every rank, from the flat block of this rank."""
         whole = np.empty(sum(map(prod, parts)), flat.dtype)
-        for rank, given in enumerate(self.agreement.gathered(flat)):
-            for block, values in zip(self.blocks(whole, parts, rank), components(given, self.shapes(parts, rank))):
+        for rank, rank_flat in enumerate(self.agreement.gather(flat)):
+            rank_blocks = components(rank_flat, self.shapes(parts, rank))
+            for block, values in zip(self.blocks(whole, parts, rank), rank_blocks, strict=True):
                 block[...] = values
         return whole
 
-    def owners(self, parts: Any, entries: np.ndarray) -> Any:
+    def owners(self, parts: Shapes, entries: NDArray[np.integer]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the rank that holds each of some entries of a whole flat field, and the places in its flat block."""
-        ranks, places = np.zeros((2, entries.size), np.int64)
-        first, starts = 0, np.zeros(self.comm.size, np.int64)
+        ranks = np.zeros(entries.size, np.int64)
+        places = np.zeros(entries.size, np.int64)
+        first = 0  # entry of the component
+        starts = np.zeros(self.comm.size, np.int64)  # of the component in the flat block of each rank
         for part in parts:
-            here = np.flatnonzero((entries >= first) & (entries < first + prod(part)))
-            rank = place = np.zeros(here.size, np.int64)
-            for axis, i in enumerate(np.unravel_index(entries[here] - first, part)):
+            inside = np.flatnonzero((entries >= first) & (entries < first + prod(part)))
+            rank = np.zeros(inside.size, np.int64)
+            place = np.zeros(inside.size, np.int64)
+            for axis, index in enumerate(np.unravel_index(entries[inside] - first, part)):
                 cuts = self.lines(axis, part[axis])
-                owner = np.searchsorted(cuts, i, side="right") - 1
+                owner = np.searchsorted(cuts, index, side="right") - 1
                 rank = rank * self.ranks[axis] + owner
-                place = place * np.diff(cuts)[owner] + (i - cuts[owner])
-            ranks[here], places[here] = rank, place + starts[rank]
-            first, starts = first + prod(part), starts + [self.size([part], r) for r in range(self.comm.size)]
+                place = place * np.diff(cuts)[owner] + (index - cuts[owner])
+            ranks[inside] = rank
+            places[inside] = place + starts[rank]
+            first += prod(part)
+            starts = starts + [self.size([part], r) for r in range(self.comm.size)]
         return ranks, places
 
     # ------------------------------------------------------------ numbers that all ranks agree on
 
-    def sum(self, number: Any) -> Any:
-        """Sum over the ranks, in their order."""
-        return self.agreement.reduced(number, np.add)
+    def compare(self, value: ArrayLike) -> None:
+        """Record a number or array, or some of its entries, that must be the same on all ranks."""
+        value = np.asarray(value)
+        description = "a number"
+        if value.ndim:
+            most = round(MOST_COMPARED ** (1 / value.ndim))
+            description = f"an array of shape {value.shape}"
+            value = value[tuple(slice(None, None, n // most + 1) for n in value.shape)]
+        self.agreement.record(f"{description} combined with a field on ranks", value.tobytes())
 
-    def max(self, number: Any) -> Any:
-        """Return the largest of all ranks; NaN when one is NaN."""
-        return self.agreement.reduced(number, np.maximum)
+    def sum(self, number: ArrayLike) -> Any:
+        """Return the sum over the ranks, in their order."""
+        return self.agreement.reduce(number, np.add)
 
-    def min(self, number: Any) -> Any:
-        """Return the least of all ranks; NaN when one is NaN."""
-        return self.agreement.reduced(number, np.minimum)
+    def max(self, number: ArrayLike) -> Any:
+        """Return the largest number of all ranks; NaN if one is NaN."""
+        return self.agreement.reduce(number, np.maximum)
+
+    def min(self, number: ArrayLike) -> Any:
+        """Return the least number of all ranks; NaN if one is NaN."""
+        return self.agreement.reduce(number, np.minimum)
 
 
-def lengths(box: Any) -> Any:
-    """Shape of a box."""
+def lengths(box: Box) -> tuple[int, ...]:
+    """Return the shape of a box."""
     return tuple(stop - start for start, stop in box)
 
 
-def slices(box: Any, origin: Any = None) -> Any:
+def slices(box: Box, origin: Box | None = None) -> tuple[slice, ...]:
     """Return one slice for each axis of a box, relative to the start of another box."""
-    starts = [0] * len(box) if origin is None else [start for start, _ in origin]
+    starts = [0] * len(box)
+    if origin is not None:
+        starts = [start for start, _ in origin]
     return tuple(slice(a - start, b - start) for (a, b), start in zip(box, starts))
 
 
 def _arrangement(shape, count):
     """Return the number of ranks along each axis for which the fewest cells are cut; ties prefer the first axes."""
     divisors = [p for p in range(count, 0, -1) if count % p == 0]
-    found = [ranks for ranks in product(divisors, repeat=len(shape)) if prod(ranks) == count]
-    return min(found, key=lambda ranks: sum((p - 1) * prod(shape) / max(n, 1) for p, n in zip(ranks, shape)))
+    arrangements = [ranks for ranks in product(divisors, repeat=len(shape)) if prod(ranks) == count]
+
+    def cells_cut(ranks):
+        return sum((p - 1) * prod(shape) / max(n, 1) for p, n in zip(ranks, shape, strict=True))
+
+    return min(arrangements, key=cells_cut)

@@ -6,9 +6,9 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator, Sequence
 from shutil import which
 from sysconfig import get_path
-from typing import Any
 
 import autograd.numpy as anp
 import numpy as np
@@ -22,10 +22,10 @@ from sparsedp.solvers.inverse import inverse
 
 __all__ = ["report"]
 
-SECONDS = 300  # timeout of a test; the first one compiles loops
-WITHIN = 1e-10  # tolerance, relative to the result of one process
+TIMEOUT = 300  # seconds of a test; the first one compiles loops
+TOLERANCE = 1e-10  # relative to the result of one process
 DEBIAN = "apt-get install -y --no-install-recommends"
-# Debian keeps petsc4py in a folder of its own, which a virtual environment of its python has to be told.
+# Debian has petsc4py in a folder of its own, which must be added to the path of a virtual environment.
 PETSC4PY = f"ls -d /usr/lib/petscdir/*/*-real/lib/python3/dist-packages > {get_path('purelib')}/petsc.pth"
 COMMANDS = {  # for key words of an error, the command that repairs it
     "'mpirun'": f"{DEBIAN} openmpi-bin",
@@ -37,37 +37,40 @@ COMMANDS = {  # for key words of an error, the command that repairs it
 }
 
 
-def report() -> Any:
+def report() -> Iterator[str]:
     """Yield lines on the installed versions and the test of two processes; the last is empty if the test failed."""
-    script = [sys.executable, "-m", __name__]
-    for command in (script, ["mpirun", "-n", "2", sys.executable, "-m", "mpi4py", *script[1:], "compare"]):
-        lines, wrong = run(command)
+    show_versions = [sys.executable, "-m", __name__]
+    compare_results = ["mpirun", "-n", "2", sys.executable, "-m", "mpi4py", "-m", __name__, "compare"]
+    for command in (show_versions, compare_results):
+        lines, error = run(command)
         yield from lines
-        if wrong:
-            yield "; write ".join([wrong, *(told for word, told in COMMANDS.items() if word in wrong)])
+        if error:
+            repairs = [repair for word, repair in COMMANDS.items() if word in error]
+            yield "; write ".join([error, *repairs])
             yield ""
             return
     yield "ranks work; write mpirun -n 2 python -m mpi4py scene.py"
 
 
-def run(command: Any) -> Any:
-    """Run a command; return the lines that it prints, and a few words on its error (empty without one)."""
+def run(command: Sequence[str]) -> tuple[list[str], str]:
+    """Run a command; return the lines that it prints, and its error message, empty if it succeeds."""
     settings = {"OMPI_MCA_rmaps_base_oversubscribe": "1", "OMP_NUM_THREADS": "1", **os.environ}
     try:
-        done = subprocess.run(command, env=settings, capture_output=True, text=True, timeout=SECONDS, check=False)
+        process = subprocess.run(command, env=settings, capture_output=True, text=True, timeout=TIMEOUT, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:
         return [], str(error)
-    told = [line for line in done.stderr.splitlines() if line.strip(" -")] or [f"exit code {done.returncode}"]
-    errors = [line for line in told if re.match(r"[\w.]+Error: ", line)] or told
-    if done.returncode == 0:
-        return done.stdout.splitlines(), ""
-    return done.stdout.splitlines(), errors[0]
+    lines = process.stdout.splitlines()
+    if process.returncode == 0:
+        return lines, ""
+    messages = [line for line in process.stderr.splitlines() if line.strip(" -")]
+    errors = [line for line in messages if re.match(r"[\w.]+Error: ", line)]
+    return lines, [*errors, *messages, f"exit code {process.returncode}"][0]
 
 
 # ---- in processes of their own ---------------------------------------------------------------------------------------
 
 
-def versions() -> Any:
+def versions() -> Iterator[str]:
     """Yield lines with the versions of the packages that can be imported."""
     yield f"Python {sys.version.split()[0]}, NumPy {np.__version__}, {which('mpirun') or 'no mpirun'}"
     import mpi4py
@@ -77,27 +80,35 @@ def versions() -> Any:
     import petsc4py
     from petsc4py import PETSc
 
-    hypre = "with" if PETSc.Sys.hasExternalPackage("hypre") else "WITHOUT"
+    hypre = "WITHOUT"
+    if PETSc.Sys.hasExternalPackage("hypre"):
+        hypre = "with"
     yield f"petsc4py {petsc4py.__version__} for {np.dtype(PETSc.ScalarType)}, {hypre} hypre"
 
 
-def compare() -> Any:
+def compare() -> Iterator[str]:
     """Solve Poisson's equation with a gradient, on all processes and on one; yield one line with the difference."""
     from mpi4py import MPI
 
-    alone = Grid((24, 20), size=1.0)
+    grid_on_one = Grid((24, 20), size=1.0)
     results = []
-    for grid in (alone, distribute(alone)):
+    for grid in (grid_on_one, distribute(grid_on_one)):
         solution = inverse(-laplacian(grid, dirichlet), rtol=1e-12)
         loss = value_and_grad(lambda b, solution=solution: anp.sum(anp.sin(100.0 * solution(b)) ** 2))
         results.append(loss(np.sin(np.arange(480.0)).reshape(24, 20)))
-    off = np.max([np.max(np.abs(found - wanted)) / np.max(np.abs(wanted)) for wanted, found in zip(*results)])
-    if not off <= WITHIN:
-        raise ArithmeticError(f"a gradient is off by {off:.1e} from one process")
+    errors = []
+    for expected, value in zip(*results, strict=True):
+        errors.append(np.max(np.abs(value - expected)) / np.max(np.abs(expected)))
+    error = np.max(errors)
+    if not error <= TOLERANCE:
+        raise ArithmeticError(f"a gradient differs by {error:.1e} (relative) from that of one process")
     if MPI.COMM_WORLD.rank == 0:
-        yield f"Poisson's equation on {MPI.COMM_WORLD.size} processes: value and gradient within {off:.0e} of one"
+        yield f"Poisson's equation on {MPI.COMM_WORLD.size} processes: value and gradient within {error:.0e} of one"
 
 
 if __name__ == "__main__":
-    for line in compare() if sys.argv[1:] else versions():
+    lines_of = versions
+    if sys.argv[1:]:
+        lines_of = compare
+    for line in lines_of():
         sys.stdout.write(line + "\n")

@@ -1,23 +1,27 @@
-"""The Jacobian of a residual whose unknowns lie on ranks: each rank assembles the rows that make its block.
+"""Stencils of Jacobians whose unknowns are fields on ranks: which entries each rank assembles, and their colours.
 
-Residuals made of operators on a grid meet the same few neighbours everywhere. Which, a few probes tell: products with
-one entry, in the middle of each component and at its ends. From these steps every rank knows where the entries of its
-rows are, and a colour for each column, without looking at the rest of the grid (see solvers/sparsity.py); a product for
-each colour gives the entries. Before a derivative is taken, and where a Newton step does not do well, the matrix is
-compared with a product along a random direction (solvers/jacobian.py): what it lacks is looked for again, or refused.
+Residuals composed of operators on a grid couple each number to the same few neighbours everywhere. A few probes find
+them: products with one entry, in the middle of each component and at its ends. From these steps every rank knows where
+the entries of its rows are, and a colour for each column, without looking at the rest of the grid (see
+solvers/sparsity.py); a product for each colour gives the entries. Before a derivative is taken, and after a slow Newton
+step, the matrix is compared with a product along a random direction (solvers/jacobian.py): missing entries are searched
+for again, or an error is raised.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from itertools import permutations
 from itertools import product as combinations
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sparsedp.grid.space import Space
 from sparsedp.operators.operator import Operator
 from sparsedp.operators.structure.base import Matrix
-from sparsedp.parallel.cut import Columns, OwnRows, Rows, reads
+from sparsedp.parallel.cut import Columns, OwnRows, Rows, reading
 from sparsedp.parallel.fields import DistributedField
 from sparsedp.parallel.partition import lengths
 from sparsedp.solvers.sparsity import (
@@ -31,61 +35,93 @@ from sparsedp.solvers.sparsity import (
     stencil_steps,
 )
 
-__all__ = ["Stencil", "stencil_of"]
+__all__ = ["Stencil", "find_stencil"]
 
-COLOURS = 8  # times the entries of the fullest row: more are no stencil's
+MOST_COLOURS = 8  # in units of the entries of the fullest row: a stencil needs fewer
+
+Step: TypeAlias = tuple[int, ...]  # (component of the column, component of the row, cells to the row along each axis)
+Product: TypeAlias = Callable[[DistributedField], Any]
 
 
-def stencil_of(name: str, space: Any, products: Any, lacking: Any = None) -> Any:
-    """Return the Stencil of a Jacobian from products with it at several points; `lacking`: a Stencil to extend.
+def find_stencil(name: str, space: Space, products: Sequence[Product], incomplete: Stencil | None = None) -> Stencil:
+    """Return the Stencil of a Jacobian from products with it at several points.
+
+    Parameters
+    ----------
+    name : str
+        Of the root, for messages.
+    space : Space
+        Of the unknowns.
+    products : sequence of callables
+    incomplete : Stencil, optional
+        One to which entries are added.
 
     Raises
     ------
     TypeError
-        If a number meets too many others, or far ones.
+        If an unknown is coupled to too many others, or to distant ones.
     """
-    own, (ends, n, around) = _own(space), _sides(space)
-    steps = {(one, one, *[0] * len(n)) for one in range(len(ends))}
-    steps.update(lacking.steps if lacking else ())
-    for one, act, cell in probe_positions(ends, products):
-        here = np.all(own == [[one], *cell], axis=0)
-        row = np.flatnonzero(act(DistributedField(here.astype(float), space)).flat)[: LARGEST_STENCIL + 1]
-        found, _ = stencil_steps(one, cell, own[0, row], own[1:, row], n, around)
-        steps.update(*space.backend.agreement.gathered(found))
-    least, lattice = np.bincount([row for _, row, *_ in steps]).max(), None
-    if least <= LARGEST_STENCIL and not (lacking and steps == lacking.steps):
-        lattice = find_lattice(_differences(space, steps), least, COLOURS * least + 1)
+    layout: Any = space.backend
+    index = _own_indices(space)
+    shapes = _component_columns(space)
+    cell_counts = _grid_column(space.grid.shape)
+    is_periodic = _grid_column(space.grid.periodic)
+    to_itself = [0] * space.grid.dim
+    steps: set[Step] = {(component, component, *to_itself) for component in range(len(shapes))}
+    if incomplete is not None:
+        steps.update(incomplete.steps)
+    for component, product, cell in probe_positions(shapes, products):
+        is_probed = np.all(index == [[component], *cell], axis=0)
+        image = product(DistributedField(is_probed.astype(float), space))
+        row = np.flatnonzero(image.flat)[: LARGEST_STENCIL + 1]
+        new_steps, _ = stencil_steps(component, cell, index[0, row], index[1:, row], cell_counts, is_periodic)
+        steps.update(*layout.agreement.gather(new_steps))
+    fullest_row = np.bincount([row for _, row, *_ in steps]).max()
+    has_new_steps = incomplete is None or steps != incomplete.steps
+    lattice = None
+    if fullest_row <= LARGEST_STENCIL and has_new_steps:
+        lattice = find_lattice(_differences(space, steps), fullest_row, MOST_COLOURS * fullest_row + 1)
     if lattice is None:
         raise TypeError(
-            f"{name} takes, for fields on ranks, residuals in which a number meets few others, all of them near; "
-            "write dp.gather(u) for what every rank solves alone"
+            f"{name} takes, for fields on ranks, residuals in which each number is coupled to a few near ones; write "
+            "dp.gather(u) for unknowns that every rank solves for alone"
         )
     return Stencil(space, steps, *lattice)
 
 
-def _own(space):
-    """Of each number of the block of this rank its component, and its index there."""
-    boxes = [*map(space.backend.box, space.parts)]
-    return field_indices([*map(lengths, boxes)], [[start for start, _ in box] for box in boxes])
+def _own_indices(space):
+    """Return for each number of the block of this rank its component, and its index there."""
+    boxes = [space.backend.box(part) for part in space.parts]
+    return field_indices([lengths(box) for box in boxes], [[start for start, _ in box] for box in boxes])
 
 
-def _sides(space):
-    """Lengths of each component; of each axis the number of cells, and whether it is periodic."""
-    columns = [np.reshape(line, (-1, 1)) for line in (*space.parts, space.grid.shape, space.grid.periodic)]
-    return columns[:-2], *columns[-2:]
+def _component_columns(space):
+    """Return the lengths of the axes of each component, each as a column."""
+    return [np.reshape(part, (-1, 1)) for part in space.parts]
+
+
+def _grid_column(values):
+    """Return one value for each axis of the grid as a column."""
+    return np.reshape(values, (-1, 1))
 
 
 def _differences(space, steps):
-    """Of the places (component, index) of two columns in one row, an axis in each row."""
-    gaps = [
-        (one - other, *np.subtract(back, step))
-        for (one, row, *step), (other, same, *back) in permutations(steps, 2)
-        if row == same
-    ]
-    turns = combinations(*([0, n, -n] if around else [0] for n, around in zip(space.grid.shape, space.grid.periodic)))
-    shifts = np.concatenate([np.reshape(gaps, (-1, 1 + space.grid.dim)) + (0, *turn) for turn in turns]).astype(int)
-    near = np.all(np.abs(shifts[:, 1:]) < np.max(space.parts, axis=0), axis=1)
-    return np.unique(shifts[near & np.any(shifts, axis=1)], axis=0).T
+    """Return the differences of the places (component, index) of two columns in one row; an axis in each row."""
+    gaps = []
+    for (first, first_row, *first_step), (second, second_row, *second_step) in permutations(steps, 2):
+        if first_row == second_row:
+            gaps.append((first - second, *np.subtract(second_step, first_step)))
+    periods = []
+    for n, is_periodic in zip(space.grid.shape, space.grid.periodic, strict=True):
+        if is_periodic:
+            periods.append([0, n, -n])
+        else:
+            periods.append([0])
+    gap_array = np.reshape(gaps, (-1, 1 + space.grid.dim))
+    shifted = [gap_array + (0, *period) for period in combinations(*periods)]
+    differences = np.concatenate(shifted).astype(int)
+    is_inside = np.all(np.abs(differences[:, 1:]) < np.max(space.parts, axis=0), axis=1)
+    return np.unique(differences[is_inside & np.any(differences, axis=1)], axis=0).T
 
 
 class Stencil(ColouredPattern):
@@ -94,28 +130,45 @@ class Stencil(ColouredPattern):
     Parameters
     ----------
     space : Space
-    steps : set of tuples
-        (component of the column, component of the row, cells from the column to the row along each axis).
+    steps : set of Step
     vector : int array
     count : int
         Of colours.
     """
 
-    def __init__(self, space: Any, steps: Any, vector: Any, count: Any) -> None:
-        self.space, self.steps, self.count, self.by_rows = space, steps, count, False
-        own, (ends, _, around), found = _own(space), _sides(space), []
-        for row, one, there in stencil_entries(steps, own[0], own[1:], ends, around):
-            column = space.offsets[one] + np.ravel_multi_index(tuple(there), space.parts[one])
-            found.append((row, column, (vector[0] * one + vector[1:] @ there) % count))
-        row, column, colour = map(np.concatenate, zip(*found))
-        place, self.exchange = reads(column, space.backend, space.parts)
-        colours = np.zeros(self.exchange.read[0], int)
-        colours[place], self.seeds = colour, vector @ own % count
-        self._set_pattern(pattern_of(row, place, (len(own[0]), colours.size)), colours)
+    def __init__(self, space: Space, steps: set[Step], vector: NDArray[np.integer], count: int) -> None:
+        self.space = space
+        self.steps = steps
+        self.count = count
+        self.by_rows = False
+        index = _own_indices(space)
+        is_periodic = _grid_column(space.grid.periodic)
+        rows = []
+        columns = []
+        colours = []
+        entries = stencil_entries(steps, index[0], index[1:], _component_columns(space), is_periodic)
+        for row, component, position in entries:
+            part = space.parts[component]
+            rows.append(row)
+            columns.append(space.offsets[component] + np.ravel_multi_index(tuple(position), part))
+            colours.append((vector[0] * component + vector[1:] @ position) % count)
+        layout: Any = space.backend
+        self.exchange, place = reading(np.concatenate(columns), layout, space.parts)
+        colour_of_column = np.zeros(self.exchange.read.size, int)
+        colour_of_column[place] = np.concatenate(colours)
+        self.seeds = vector @ index % count
+        shape = (index.shape[1], colour_of_column.size)
+        self._set_pattern(pattern_of(np.concatenate(rows), place, shape), colour_of_column)
 
-    def operator(self, act: Any, name: str) -> Any:
-        """Return the matrix that acts as ``act(v)``, as an Operator."""
-        space, own = self.space, Matrix(self.matrix(lambda v: act(DistributedField(v, self.space)).flat))
-        shape, exchange = (self.seeds.size,) * 2, self.exchange
-        both = Rows(own, shape, exchange.forward), Columns(own.transpose(), shape, exchange.backward)
-        return Operator(OwnRows((*both, self), (space.size,) * 2), space, space, name, "matrix-free")
+    def operator(self, product: Product, name: str) -> Operator:
+        """Return the matrix with these products as an Operator."""
+
+        def product_of_blocks(v):
+            return product(DistributedField(v, self.space)).flat
+
+        space = self.space
+        own_rows = Matrix(self.matrix(product_of_blocks))
+        shape = (self.seeds.size, self.seeds.size)
+        rows = Rows(own_rows, shape, self.exchange.forward)
+        columns = Columns(own_rows.transpose(), shape, self.exchange.backward)
+        return Operator(OwnRows((rows, columns, self), (space.size, space.size)), space, space, name, "matrix-free")

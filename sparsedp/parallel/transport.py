@@ -1,25 +1,28 @@
-"""Transport on ranks: the step of one process, on blocks that are widened by what it reads.
+"""Transport on ranks: the step of one process, on blocks that are widened by the cells that it reads.
 
     u' = C s(H u, H v, dt, inflow),     H: widen the blocks,     s: the step, unchanged,     C: keep the own block.
 
-C^T puts zeros around a block. H^T sends what stands beyond it back to whom it belongs, where it is added. A number goes
-to all ranks as it is, and what comes back is the sum over them. These maps are rules, and so is s: derivatives of every
-order follow. A step is one node of the tape, which sees fields on ranks alone, the same on every rank. Where a block
-ends at another one the widened grid has a wall that is not there; what that changes C leaves out.
+C^T puts zeros around a block. H^T sends the entries beyond a block back to the ranks that hold them, and adds them
+there. A number goes to all ranks as it is; its cotangent is the sum over them. These maps are rules, and so is s:
+derivatives of every order follow. A step is one node of the tape, which sees fields on ranks alone, the same on every
+rank. Where a block ends at another one the widened grid has a wall that does not exist; C drops the cells that it
+influences.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from math import floor, isfinite, prod
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_cdt
 
 from sparsedp.advection.arguments import check_array, check_numbers, check_stability, check_step
-from sparsedp.advection.settings import wall_space
+from sparsedp.advection.settings import TransportSettings, wall_space
 from sparsedp.advection.transport import Transport
 from sparsedp.autodiff.tape import Rule, isbox, linear, plain
 from sparsedp.errors import NonFiniteError, UnstableStepError
@@ -27,199 +30,325 @@ from sparsedp.grid.boundary_conditions import neumann
 from sparsedp.grid.grid import Grid
 from sparsedp.grid.space import Space, components
 from sparsedp.kernels.fluxes import SCHEMES
-from sparsedp.parallel.exchange import of_boxes
+from sparsedp.parallel.agreement import Agreement
+from sparsedp.parallel.exchange import Exchange, exchange_of_boxes
 from sparsedp.parallel.fields import DistributedField, block
+from sparsedp.parallel.partition import Box
 
-__all__ = ["Carry"]
+__all__ = ["TransportOnBlocks"]
 
-ROUNDING = 1e-9  # relative, of a displacement: what it may be off the one that the step finds
+ROUNDING = 1e-9  # relative difference between the displacement here and the one that the step computes
 
 
-class Carry:
-    """``move(u, v, dt, inflow)`` on fields that lie on ranks, or that all of them know; made by `Layout`."""
+class TransportOnBlocks:
+    """``move(u, v, dt, inflow)`` on fields on ranks, or arrays that every rank holds; built by `Layout`."""
 
-    def __init__(self, setting: Any) -> None:
-        self.setting, self.layout, self.walls = setting, setting.grid.backend, wall_space(setting)
-        self.speed, self.block, self.depth = last(self._speed), cache(partial(Block, setting)), 0
-        if setting.solid is not None and setting.of == "cells":
-            self.depth = int(np.max(distance_transform_cdt(setting.solid, "taxicab"), initial=0))
+    def __init__(self, settings: TransportSettings) -> None:
+        self.settings = settings
+        self.layout: Any = settings.grid.backend
+        self.walls = wall_space(settings)
+        self.speed = remembering_last(self._speed)
+        self.block_step = cache(partial(BlockStep, settings))
+        self.solid_depth = 0  # cells from the fluid to the deepest solid cell
+        if settings.solid is not None and settings.of == "cells":
+            self.solid_depth = int(np.max(distance_transform_cdt(settings.solid, "taxicab"), initial=0))
 
     def __call__(self, u: Any, v: Any, dt: Any, inflow: Any) -> Any:
         """Return the field after a step."""
-        setting, given, name = self.setting, tuple(map(plain, (u, v, dt, inflow))), f"transport {self.setting.scheme}"
-        inflows = self.walls.shape if np.shape(given[3]) else ()
-        check_step(name, given[2])
-        check_array(name, "u", given[0], (setting.space.shape,))
-        check_array(name, "v", given[1], setting.velocity_shapes)
-        check_array(name, "inflow", given[3], (inflows,))
-        made = partial(self.block, self._width(*given[1:3]), np.shape(given[1]), inflows)
+        settings = self.settings
+        name = f"transport {settings.scheme}"
+        plain_arguments = tuple(map(plain, (u, v, dt, inflow)))
+        _, plain_v, plain_dt, plain_inflow = plain_arguments
+        inflow_shape: tuple[int, ...] = ()
+        if np.shape(plain_inflow):
+            inflow_shape = self.walls.shape
+        check_step(name, plain_dt)
+        check_array(name, "u", plain_arguments[0], (settings.space.shape,))
+        check_array(name, "v", plain_v, settings.velocity_shapes)
+        check_array(name, "inflow", plain_inflow, (inflow_shape,))
+        width = self._width(plain_v, plain_dt)
+        step = partial(self.block_step, width, np.shape(plain_v), inflow_shape)
         try:
-            return made(setting.unstable).rule(u, v, dt, inflow)
+            return step(settings.unstable).rule(u, v, dt, inflow)
         except (NonFiniteError, UnstableStepError):
-            self._check(made("allow"), *given)
-            return made("allow").rule(u, v, dt, inflow)  # what is wrong is beyond the blocks alone
+            self._check(step("allow"), *plain_arguments)
+            return step("allow").rule(u, v, dt, inflow)  # only cells beyond the blocks are concerned
 
     def _width(self, v, dt):
-        """Cells beyond a block that a step may read: the same on all ranks."""
-        setting = self.setting
-        if setting.scheme in SCHEMES:
-            scheme, of_faces = SCHEMES[setting.scheme], setting.of == "faces"
+        """Return the number of cells beyond a block that a step may read: the same on all ranks."""
+        settings = self.settings
+        if settings.scheme in SCHEMES:
+            scheme = SCHEMES[settings.scheme]
             cells = len(scheme.stages) * (1 + (scheme.limiter is not None))
-            return cells + (of_faces and setting.solid is not None)  # the cells that tell whether a face is closed
-        far = self.speed(v) * dt * (1 + ROUNDING)
-        cells = floor(far) if isfinite(far) else 0  # the step itself refuses what is not finite
-        cells += 1 + (setting.interpolation == "cubic") + (setting.backtrace == "midpoint")
-        cells += min(self.depth, cells * setting.grid.dim)  # solids are filled from the fluid, layer by layer
-        cells *= 1 + (setting.scheme == "maccormack")
-        most = 1 << (cells - 1).bit_length()  # few widths serve all velocities
-        return most - most // 4 if cells <= most - most // 4 else most
+            if settings.of == "faces" and settings.solid is not None:
+                cells += 1  # these cells determine whether a face is closed
+            return cells
+        displacement = self.speed(v) * dt * (1 + ROUNDING)
+        cells = 1 + (settings.interpolation == "cubic") + (settings.backtrace == "midpoint")
+        if isfinite(displacement):  # otherwise the step itself raises an error
+            cells += floor(displacement)
+        cells += min(self.solid_depth, cells * settings.grid.dim)  # solids are filled from the fluid, layer by layer
+        if settings.scheme == "maccormack":
+            cells *= 2
+        return _rounded_up(cells)
 
     def _speed(self, v):
         """Return the largest velocity, in widths of the narrowest cell."""
-        space = velocity_space(self.setting, np.shape(v))
+        space = velocity_space(self.settings, np.shape(v))
         parts = components(np.abs(block(v, space).flat), self.layout.shapes(space.parts))
-        narrowest = [np.min(h, initial=np.inf) for h in self.setting.grid.widths]
-        return float(self.layout.max([np.max(part, initial=0.0) / h for part, h in zip(parts, narrowest)]).max())
+        narrowest = [np.min(h, initial=np.inf) for h in self.settings.grid.widths]
+        speeds = [np.max(part, initial=0.0) / h for part, h in zip(parts, narrowest, strict=True)]
+        return float(self.layout.max(speeds).max())
 
-    def _check(self, wide, u, v, dt, inflow):
-        """Refuse, in the words of one process, a step that is not finite, or too large in some block."""
-        setting, method = self.setting, wide.move.method
-        check_numbers(setting, block(u, setting.space), block(v, wide.velocity), block(inflow, self.walls))
-        if setting.scheme in SCHEMES:
-            v = wide.ins[1][0].forward(v).reshape(-1)
-            rate = self.layout.agreement.agreed("transport", method.reference.rate, v)
-            check_stability(setting, dt, wide.crop[0].forward(rate), method.scheme.max_courant)
-
-
-def velocity_space(setting: Any, shape: tuple) -> Any:
-    """Where a velocity of this shape lives."""
-    grid = setting.grid
-    return grid.faces if setting.velocity == "faces" else Space(shape, "cells", grid, (grid.shape,) * grid.dim)
+    def _check(self, block_step, u, v, dt, inflow):
+        """Raise the error of one process for a step that is not finite, or too large in some block."""
+        settings = self.settings
+        method = block_step.move.method
+        values: Any = (block(u, settings.space), block(v, block_step.velocity), block(inflow, self.walls))
+        check_numbers(settings, *values)
+        if settings.scheme in SCHEMES:
+            widen_velocity = block_step.inputs[1].widen
+            wide_v = widen_velocity.forward(v).reshape(-1)
+            rate = self.layout.agreement.run("transport", method.reference.rate, wide_v)
+            check_stability(settings, dt, block_step.crop.forward(rate), method.scheme.max_courant)
 
 
-class Block:
-    """The step on blocks that are widened by some cells, for velocities and inflow values of given shapes."""
-
-    def __init__(self, setting: Any, width: Any, shape: tuple, inflows: Any, unstable: Any) -> None:
-        grid, layout = setting.grid, setting.grid.backend
-        spans, sides = [], []
-        for (a, b), n, pair in zip(layout.box(grid.shape), grid.shape, setting.sides, strict=True):
-            low, high = a - width, b + width
-            if pair is None:
-                whole = high - low >= n  # a period
-                spans.append((0, n) if whole else (low, high))
-                sides.append(None if whole else (neumann, neumann))
-            else:
-                spans.append((max(low, 0), min(high, n)))
-                sides.append((pair[0] if low <= 0 else neumann, pair[1] if high >= n else neumann))
-        index = [np.arange(*span) % max(n, 1) for span, n in zip(spans, grid.shape)]
-        widths, around = [h[i] for h, i in zip(grid.widths, index)], [side is None for side in sides]
-        local = Grid([i.size for i in index], spacing=widths, periodic=around)
-        solid = None if setting.solid is None else setting.solid[np.ix_(*index)]
-        here = replace(setting, grid=local, sides=tuple(sides), solid=solid, unstable=unstable)
-        self.move, self.velocity = layout.agreement.agreed("transport", Transport, here), velocity_space(setting, shape)
-
-        def wider(space, wide):
-            return widened(space, [[(a, a + n) for (a, _), n in zip(spans, part)] for part in wide.parts], wide.shape)
-
-        number = linear("number", lambda x: x, layout.sum)
-        field, exchange = wider(setting.space, here.space)
-        speed, _ = wider(self.velocity, velocity_space(here, shape[: -grid.dim] + local.shape))
-        self.ins = [field, speed, number, _inflow(setting, self.move, spans) if inflows else number]
-        self.crop = linear(
-            "block",
-            lambda x: DistributedField(exchange.taken(x.reshape(-1)), setting.space),
-            lambda g: exchange.placed(block(g, setting.space).flat).reshape(here.space.shape),
-        )
-        self.rule = on_blocks(layout.agreement, self.move._rule, self.ins, self.crop)
+def _rounded_up(cells):
+    """Return the next power of two, or three quarters of it: a few widths serve all velocities."""
+    power = 1 << (cells - 1).bit_length()
+    three_quarters = power - power // 4
+    if cells <= three_quarters:
+        return three_quarters
+    return power
 
 
-def _inflow(setting, move, spans):
-    """Return the rules of inflow values: walls of the widened grid get the given values, or zeros."""
-    boxes, places = [], [np.zeros(0, int)]
-    numbers = iter(components(np.arange(move.walls.size), move.walls.parts))
-    for part in move.space.parts:
-        for axis, (pair, local) in enumerate(zip(setting.sides, move.settings.sides)):
-            for end in (0, setting.grid.shape[axis]) if local else ():
-                place, there = next(numbers), pair is not None and end in spans[axis]
-                if pair:
-                    box = [(a, a + n) for (a, _), n in zip(spans, part)]
-                    boxes.append([*box[:axis], (0, int(there)), *box[axis + 1 :]])
-                    places.append(place.reshape(-1)[: place.size * there])
-    return widened(wall_space(setting), boxes, move.walls.shape, np.concatenate(places))[0]
+def velocity_space(settings: TransportSettings, shape: tuple[int, ...]) -> Space:
+    """Return the space of a velocity of this shape."""
+    grid = settings.grid
+    if settings.velocity == "faces":
+        return grid.faces
+    return Space(shape, "cells", grid, (grid.shape,) * grid.dim)
 
 
-# ---- between fields and what a rank works on ----
+class RulePair(NamedTuple):
+    """A linear map from values on ranks to their widened blocks, and its transpose, as rules."""
+
+    widen: Rule
+    collect: Rule
 
 
-def widened(space: Any, boxes: Any, shape: tuple, places: Any = None) -> Any:
-    """Return the rules from the blocks of a field to boxes around them, at some places of an array of this shape.
+class BlockStep:
+    """The step on blocks that are widened by some cells, for velocities and inflow values of given shapes.
 
-    Those that lead there and back.
+    Parameters
+    ----------
+    settings : TransportSettings
+    width : int
+    velocity_shape, inflow_shape : tuples of int
+    unstable : "raise" or "allow"
+
+    Attributes
+    ----------
+    move : Transport
+        The step on the widened block.
+    velocity : Space
+    inputs : list of RulePair
+        For u, v, dt and inflow.
+    crop, embed : Rule
+        From a widened block to the own one, and the transpose.
+    rule : Rule
+        The step of fields on ranks.
     """
-    exchange = of_boxes(space.backend, space.parts, boxes)
 
-    def wide(x):
+    def __init__(
+        self,
+        settings: TransportSettings,
+        width: int,
+        velocity_shape: tuple[int, ...],
+        inflow_shape: tuple[int, ...],
+        unstable: str,
+    ) -> None:
+        grid = settings.grid
+        layout: Any = grid.backend
+        spans, sides = _widened_box(settings, layout.box(grid.shape), width)
+        index = [np.arange(*span) % max(n, 1) for span, n in zip(spans, grid.shape, strict=True)]
+        widths = [h[i] for h, i in zip(grid.widths, index, strict=True)]
+        local_grid = Grid([i.size for i in index], spacing=widths, periodic=[side is None for side in sides])
+        solid = None
+        if settings.solid is not None:
+            solid = settings.solid[np.ix_(*index)]
+        local = replace(settings, grid=local_grid, sides=sides, solid=solid, unstable=unstable)
+        self.move = layout.agreement.run("transport", Transport, local)
+        self.velocity = velocity_space(settings, velocity_shape)
+
+        def boxes_of(wide_space):
+            return [[(a, a + n) for (a, _), n in zip(spans, part, strict=True)] for part in wide_space.parts]
+
+        field_exchange = exchange_of_boxes(layout, settings.space.parts, boxes_of(local.space))
+        wide_velocity = velocity_space(local, velocity_shape[: -grid.dim] + local_grid.shape)
+        number = RulePair(*linear("number", _unchanged, layout.sum))
+        field = _widening(settings.space, field_exchange, local.space.shape)
+        velocity_exchange = exchange_of_boxes(layout, self.velocity.parts, boxes_of(wide_velocity))
+        velocity = _widening(self.velocity, velocity_exchange, wide_velocity.shape)
+        inflow = number
+        if inflow_shape:
+            inflow = _inflow(settings, self.move, spans)
+        self.inputs = [field, velocity, number, inflow]
+
+        def crop(x):
+            return DistributedField(field_exchange.taken(x.reshape(-1)), settings.space)
+
+        def embed(g):
+            return field_exchange.placed(block(g, settings.space).flat).reshape(local.space.shape)
+
+        self.crop, self.embed = linear("block", crop, embed)
+        self.rule = rule_on_blocks(layout.agreement, self.move._rule, self.inputs, self.crop, self.embed)
+
+
+def _unchanged(x):
+    return x
+
+
+def _widened_box(settings, box, width):
+    """Return the spans of a box that is widened by some cells, and the conditions of its sides."""
+    spans = []
+    sides: list[tuple | None] = []
+    for (a, b), n, pair in zip(box, settings.grid.shape, settings.sides, strict=True):
+        low = a - width
+        high = b + width
+        if pair is not None:
+            spans.append((max(low, 0), min(high, n)))
+            lower = pair[0] if low <= 0 else neumann
+            upper = pair[1] if high >= n else neumann
+            sides.append((lower, upper))
+        elif high - low >= n:  # a whole period
+            spans.append((0, n))
+            sides.append(None)
+        else:
+            spans.append((low, high))
+            sides.append((neumann, neumann))
+    return spans, tuple(sides)
+
+
+def _inflow(settings, move, spans):
+    """Return the rules of inflow values: walls of the widened grid get the values given for them, or zeros."""
+    boxes: list[Box] = []
+    places = [np.zeros(0, int)]
+    wall_indices = iter(components(np.arange(move.walls.size), move.walls.parts))
+    for part in move.space.parts:
+        for axis, (pair, local_pair) in enumerate(zip(settings.sides, move.settings.sides, strict=True)):
+            if not local_pair:
+                continue
+            for end in (0, settings.grid.shape[axis]):
+                place = next(wall_indices)
+                if not pair:
+                    continue
+                is_wall = end in spans[axis]
+                box = [(a, a + n) for (a, _), n in zip(spans, part, strict=True)]
+                boxes.append([*box[:axis], (0, int(is_wall)), *box[axis + 1 :]])
+                if is_wall:
+                    places.append(place.reshape(-1))
+    walls = wall_space(settings)
+    layout: Any = settings.grid.backend
+    exchange = exchange_of_boxes(layout, walls.parts, boxes)
+    return _widening(walls, exchange, move.walls.shape, np.concatenate(places))
+
+
+# ---- between fields on ranks and widened blocks ----
+
+
+def _widening(space: Space, exchange: Exchange, shape: tuple[int, ...], places: NDArray | None = None) -> RulePair:
+    """Return the rules from the blocks of a field to arrays of a shape, and back.
+
+    Parameters
+    ----------
+    space : Space
+        Of the field.
+    exchange : Exchange
+    shape : tuple of int
+    places : int array, optional
+        Where the numbers that are read go in the flat array; zeros elsewhere. Default: they are the array.
+    """
+
+    def widen(x):
         flat = block(x, space).flat
-        read = exchange.forward(flat if flat.dtype.kind == "f" else flat.astype(float))
+        if flat.dtype.kind != "f":
+            flat = flat.astype(float)
+        wide = exchange.forward(flat)
         if places is not None:
-            read, inner = np.zeros(prod(shape), read.dtype), read
-            read[places] = inner
-        read.flags.writeable = False
-        return read.reshape(shape)
+            read = wide
+            wide = np.zeros(prod(shape), read.dtype)
+            wide[places] = read
+        wide.flags.writeable = False
+        return wide.reshape(shape)
 
-    def back(g):
-        read = np.ascontiguousarray(g, dtype=float).reshape(-1)
-        return DistributedField(exchange.backward(read if places is None else read[places]), space)
+    def collect(g):
+        wide = np.ascontiguousarray(g, dtype=float).reshape(-1)
+        if places is not None:
+            wide = wide[places]
+        return DistributedField(exchange.backward(wide), space)
 
-    return linear("widened", last(wide), back), exchange
+    return RulePair(*linear("widened", remembering_last(widen), collect))
 
 
-def last(act: Any) -> Any:
+def remembering_last(act: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """Return a function of a field that reuses its last result: many steps have the same velocity."""
-    held = [None, None]
+    last_argument: Any = None
+    last_result: Any = None
 
-    def known(x):
-        if held[0] is not x or not isinstance(x, DistributedField):  # others can be written to
-            held[:] = x, act(x)
-        return held[1]
+    def remembered(x):
+        nonlocal last_argument, last_result
+        if last_argument is not x or not isinstance(x, DistributedField):  # other values can be written to
+            last_result = act(x)
+            last_argument = x
+        return last_result
 
-    return known
+    return remembered
 
 
-def on_blocks(agreement: Any, local: Any, ins: Any, crop: Any) -> Any:
+def rule_on_blocks(agreement: Agreement, local: Rule, inputs: Sequence[RulePair], crop: Rule, embed: Rule) -> Rule:
     """Return the Rule of fields on ranks, from the Rule on blocks; its derivatives consist of rules, to any order.
 
     Parameters
     ----------
+    agreement : Agreement
     local : Rule
-    ins : list of pairs of Rules
-        What leads to each argument of it, and back; linear.
-    crop : pair of Rules
-        What leads from its result, and back.
+    inputs : sequence of RulePair
+        One for each argument.
+    crop, embed : Rule
+        From the result on a widened block to the field, and the transpose.
     """
+    local_rule: Any = local
 
     def run(rule, x):
-        return rule(x) if isbox(x) else rule.forward(x)
+        if isbox(x):
+            return rule(x)
+        return rule.forward(x)
 
-    def wide(numbers, values):
-        return [run(ins[num][0], value) for num, value in zip(numbers, values, strict=True)]
+    def widened(numbers, values):
+        return [run(inputs[number].widen, value) for number, value in zip(numbers, values, strict=True)]
 
     def forward(*args):
-        given = wide(range(len(ins)), args)
-        return crop[0].forward(agreement.agreed(local.name, local.forward, *given, at_once=True))
+        wide_args = widened(range(len(inputs)), args)
+        return crop.forward(agreement.run(local.name, local.forward, *wide_args, at_once=True))
 
     def vjp(nums, ans, *args):
         def pull(g):
-            given, g = wide(range(len(ins)), args), run(crop[1], g)
-            backs = agreement.agreed(local.name, lambda: local.vjp(nums, None, *given)(g))
-            return [run(ins[num][1], back) for num, back in zip(nums, backs, strict=True)]
+            wide_args = widened(range(len(inputs)), args)
+            wide_g = run(embed, g)
+
+            def pull_wide():
+                return local_rule.vjp(nums, None, *wide_args)(wide_g)
+
+            cotangents = agreement.run(local.name, pull_wide)
+            return [run(inputs[num].collect, cotangent) for num, cotangent in zip(nums, cotangents, strict=True)]
 
         return pull
 
     def jvp(nums, tangents, ans, *args):
-        given = wide(range(len(ins)), args)
-        tangent = agreement.agreed(local.name, local.jvp, nums, wide(nums, tangents), given[0], *given)
-        return run(crop[0], tangent)
+        wide_args = widened(range(len(inputs)), args)
+        wide_tangents = widened(nums, tangents)
+        tangent = agreement.run(local.name, local_rule.jvp, nums, wide_tangents, wide_args[0], *wide_args)
+        return run(crop, tangent)
 
     return Rule(local.name, forward, vjp, jvp)

@@ -88,8 +88,8 @@ def explain(loss: Callable[[Any], Any], x: Any, gradient: bool = True) -> Plan:
     loss ran is not counted: it is reused. Seconds are without those of the calls inside. What other threads do
     meanwhile is not counted either, those that the loss starts included.
     Bytes on the tape: all arrays that its nodes keep between the forward and the backward pass, each once.
-    On ranks: exchanges are those of fields and between neighbours, their bytes those of all ranks together, reductions
-    the numbers that all ranks agree on; what PETSc sends inside a solve is not counted. Every rank has the same counts.
+    Of distributed fields, exchanges between blocks and reductions to one number are counted, and the bytes of the
+    exchanges of all processes together; messages inside a linear solve are not. All processes have the same counts.
 
     Examples
     --------

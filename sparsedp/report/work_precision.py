@@ -126,7 +126,7 @@ def work_precision(
     ValueError
         If `repeats` is not a whole number >= 1, there is no method, or the file is not such a table.
     TypeError
-        If the problem does not give (loss, x); on several ranks.
+        If the problem does not give (loss, x), or several processes share the fields.
 
     See Also
     --------
@@ -152,7 +152,7 @@ def work_precision(
     """
     check_function("work_precision", problem, "lambda cells: (loss, x)")
     if process_count() > 1:
-        raise TypeError("work_precision repeats runs by the clock, which no two ranks share; run it on one process")
+        raise TypeError("work_precision measures times, which differ between processes; run it on one process")
     repeats = check_whole("repeats of work_precision", repeats, 1, "; the default is 3")
     if not methods or not isinstance(methods, dict):
         raise ValueError("work_precision needs at least one method; write {'name': {settings}}")

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from sparsedp.solvers.records import SolveInfo
     from sparsedp.solvers.solve import Solver
 
-__all__ = ["Jacobians", "Linearisation", "Point", "find_fields"]
+__all__ = ["Jacobians", "KnownPattern", "Linearisation", "Point", "find_fields", "probing_points"]
 
 FULL_UP_TO = 16  # unknowns: a full Jacobian takes fewer products than the search for its pattern
 FULL_AT_MOST = 2000  # unknowns: a larger Jacobian that is not sparse is applied by products
@@ -179,7 +179,11 @@ class Jacobians:
     ----------
     description : str
         How the Jacobians are obtained; empty before the first one.
+    can_relax : bool
+        Whether `relaxed_solver` is implemented.
     """
+
+    can_relax = True
 
     def __init__(self, name: str, jacobian: Callable[..., Any] | None, sparsity: Any, settings: SolveSettings) -> None:
         self.name = name
@@ -241,14 +245,14 @@ class Jacobians:
     ) -> Solver | None:
         """Return the Solver of J + D / time_step, D the rates of its rows; None where its entries are not known."""
         op, _ = self._operator(equation, x, leaves)
-        if op.form != "explicit" or not op.backend.whole_fields:
+        if op.form != "explicit":
             return None
         matrix = op.matrix + sp.diags_array(_rates(op.matrix, equation.unknowns) / time_step)
         return self._solver(from_matrix(matrix, op.domain, op.domain, op.name), near)
 
     def _solver(self, op, near):
         """Return the Solver of a Jacobian, from the cache of entries or new."""
-        if op.form != "explicit" or not op.backend.whole_fields or near:
+        if op.form != "explicit" or near:
             return self._build(op, near)
         key: tuple[Any, ...]
         if op is self._operators.last:
@@ -308,14 +312,8 @@ class Jacobians:
             raise DerivativeError(
                 f"the sparsity given for {self.name} lacks entries in row {row}; add them or leave it out"
             )
-        equation, x, leaves = linearisation.point
         with self._lock:
-            if not equation.unknowns.backend.whole_fields:
-                structure: Any = linearisation.solver.system.unscaled.structure
-                incomplete = structure.stencil
-                self._find_distributed_stencil(equation, [x], leaves, incomplete)
-            else:
-                self._enlarge_pattern(equation, x, leaves, row)
+            self._enlarge_pattern(linearisation, row)
         return True
 
     # ------------------------------------------------------------ three ways to a Jacobian
@@ -339,10 +337,13 @@ class Jacobians:
             backward = self._product(equation, x, leaves, transposed=True)
             return from_functions(forward, backward, size, size, name), True
         product = self._product(equation, x, leaves, coloured.by_rows)
-        if not unknowns.backend.whole_fields:
-            return coloured.operator(product, name), False
-        op = self._explicit_operator(coloured.matrix(product), unknowns, pattern.cells, name)
-        is_full = coloured.pattern.nnz == size**2
+        return self._assembled(pattern, product, unknowns)
+
+    def _assembled(self, pattern, product, unknowns):
+        """Return J as an Operator from its products, and whether it is certainly exact."""
+        coloured = pattern.coloured
+        op = self._explicit_operator(coloured.matrix(product), unknowns, pattern.cells, self.solver_name)
+        is_full = coloured.pattern.nnz == unknowns.size**2
         return op, coloured.by_rows and is_full
 
     def _explicit_operator(self, matrix, unknowns, cells, name):
@@ -368,9 +369,15 @@ class Jacobians:
                 jacobian = [[jacobian]]
             jacobian = from_matrix(jacobian, name=name)
         check_shape(f"the jacobian of {self.name}", jacobian, (unknowns.size, unknowns.size))
-        jacobian = unknowns.backend.implementation(jacobian_on_unknowns)(jacobian, unknowns.space)
+        jacobian = self._on_unknowns(jacobian, unknowns.space)
         check_kind(f"the jacobian of {self.name}", jacobian.dtype, "real numbers")
         return jacobian
+
+    def _on_unknowns(self, op, space):
+        """Return a Jacobian that the user supplied as an Operator between the unknowns."""
+        if op.backend is space.backend:
+            return op
+        return from_matrix(op.matrix, name=op.name)
 
     def _product(self, equation, x, leaves, transposed, purpose="jacobian"):
         """Return the function that maps v to J v or J^T v, and counts."""
@@ -394,8 +401,6 @@ class Jacobians:
         """Find and store the pattern for the space of these unknowns."""
         unknowns = equation.unknowns
         size = equation.size
-        if not unknowns.backend.whole_fields:
-            return self._find_distributed_stencil(equation, _probing_points(equation, x, leaves), leaves)
         if not self._orientations:
             self._orientations = _possible_orientations(equation, x, leaves)
         if self.sparsity is not None:
@@ -409,7 +414,7 @@ class Jacobians:
             self.description = "assembled, all entries"
             return self._store_coloured(dense_pattern(size, size), equation, x, leaves)
         self.description = "assembled on a pattern found by probing"
-        points = _probing_points(equation, x, leaves)
+        points = probing_points(equation, x, leaves)
         if self._is_stencil(equation, points, leaves):
             return self._patterns[unknowns.space]
         pattern = self._probed_pattern(equation, points, leaves)
@@ -432,16 +437,6 @@ class Jacobians:
     def _store(self, space, pattern):
         self._patterns[space] = pattern
         return pattern
-
-    def _find_distributed_stencil(self, equation, points, leaves, incomplete=None):
-        """Find and store the stencil of distributed unknowns; `incomplete`: a stencil to which entries are added."""
-        unknowns = equation.unknowns
-        self.description = f"the rows of each rank, {unknowns.backend}"
-        if self.sparsity is not None:
-            raise TypeError(f"{self.name} takes no sparsity for fields on ranks; leave it out")
-        products = self._pattern_products(equation, points, leaves, by_rows=False)
-        stencil = unknowns.backend.stencil(self.name, unknowns.space, products, incomplete)
-        return self._store(unknowns.space, KnownPattern(stencil, None))
 
     def _is_stencil(self, equation, points, leaves):
         """Guess a stencil, store it, and return whether J has no entries elsewhere."""
@@ -468,8 +463,9 @@ class Jacobians:
     def _pattern_products(self, equation, points, leaves, by_rows):
         return [self._product(equation, point, leaves, by_rows, "pattern") for point in points]
 
-    def _enlarge_pattern(self, equation, x, leaves, row):
-        """Add the entries that J has at x; if there are none, its products are not linear."""
+    def _enlarge_pattern(self, linearisation, row):
+        """Add the entries that J has at its point; if there are none, its products are not linear."""
+        equation, x, leaves = linearisation.point
         coloured = self._patterns[equation.unknowns.space].coloured
         pattern = self._probed_pattern(equation, [x], leaves)
         if pattern is None:
@@ -505,7 +501,7 @@ def _possible_orientations(equation, x, leaves):
     return orientations
 
 
-def _probing_points(equation, x, leaves):
+def probing_points(equation: Any, x: Any, leaves: Sequence[Any]) -> list[Any]:
     """Return points to probe at: near x, and two opposite random ones, so that each side of a switch occurs."""
     rng = np.random.default_rng(0)
     distribute = equation.unknowns.distribute
@@ -532,13 +528,6 @@ def _can_derive(derive, *args):
     except NO_JVP:
         return False
     return True
-
-
-def jacobian_on_unknowns(op: Operator, space: Space) -> Operator:
-    """Return a Jacobian that the user supplied as an Operator, between flat unknowns."""
-    if op.backend.whole_fields:
-        return op
-    return from_matrix(op.matrix, name=op.name)
 
 
 def _rates(matrix, unknowns):
@@ -599,7 +588,7 @@ def find_fields(equation: Any, x: NDArray[Any], leaves: Sequence[Any]) -> tuple[
     if len(spaces) == len(shapes) and len({space.grid for space in spaces}) == 1:
         parts = [part for space in spaces for part in space.parts]
         is_one_field_of_cells = len(spaces) == 1 and spaces[0].kind == "cells" and len(shapes[0]) > 1
-        if is_one_field_of_cells and spaces[0].backend.whole_fields:
+        if is_one_field_of_cells and spaces[0].backend is equation.unknowns.backend:
             return spaces[0], parts
         return None, parts
     if len({len(shape) for shape in shapes}) == 1:

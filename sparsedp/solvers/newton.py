@@ -366,8 +366,7 @@ class Newton:
         self.largest_residual: Any = 0.0  # of each field, so far
         self.stalls = 0  # consecutive Newton steps that left nearly all of the residual
         self.near: Any = None  # the engine of the last Jacobian, if its LU factors can precondition the next one
-        # Pseudo-time is tried once, and only where one process knows all rows of the Jacobian.
-        self.may_use_pseudo_time = equation.unknowns.backend.whole_fields and not is_time_step
+        self.may_use_pseudo_time = jacobians.can_relax and not is_time_step  # it is tried once
 
     def solve(self, guess: Any, jacobian: Any = None) -> Any:
         """Find a root.

@@ -50,7 +50,7 @@ class NullSpace:
         Number of singular components.
     """
 
-    # Sums, arrays and norms over all ranks: those of other processes are assigned by a subclass.
+    # Sums, arrays and norms over all processes that hold unknowns; a subclass replaces them.
     total: Callable[[Any], Any] = staticmethod(_unchanged)
     whole: Callable[[Any], Any] = staticmethod(_unchanged)
     size_of: Callable[[Any], float] = staticmethod(norm)

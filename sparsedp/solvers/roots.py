@@ -23,7 +23,7 @@ from sparsedp._utils.counters import note, thread
 from sparsedp._utils.pytree import mapped, power_of_two
 from sparsedp._utils.reconstruction import Reconstructible
 from sparsedp._utils.validation import check_function, check_takes, check_whole
-from sparsedp.autodiff.backend import collectively, replicated
+from sparsedp.autodiff.backend import NUMPY, collectively
 from sparsedp.autodiff.derivative import pullback, push
 from sparsedp.autodiff.tape import Rule, plain
 from sparsedp.errors import DerivativeError
@@ -251,12 +251,13 @@ class Root(Reconstructible):
         self._settings = settings
         # For each thread inside `series`: number of unknowns -> Jacobian of the last solve.
         self._series: dict[int, dict[int, Linearisation]] = {}
-        self._jacobians = Jacobians(self.name, jacobian, sparsity, settings)
+        self._default_jacobians = Jacobians(self.name, jacobian, sparsity, settings)
+        self._jacobians = {NUMPY: self._default_jacobians}
         self._solution = Rule(self.name, self._forward, self._vjp, self._jvp)
 
     def recipe(self) -> tuple[type[Root], tuple[Any, ...]]:
         """Return the call that reconstructs this object: see _utils/reconstruction.py."""
-        jacobians = self._jacobians
+        jacobians = self._default_jacobians
         return Root, (self.residual, jacobians.user_jacobian, jacobians.sparsity, self.maxiter, self._settings)
 
     @contextmanager
@@ -283,8 +284,7 @@ class Root(Reconstructible):
         """
         check_takes(self.name, self.residual, 1 + len(params), "lambda x, p: ..., and root(guess, p)")
         unknowns = Unknowns(guess, self.name)
-        if unknowns.backend.whole_fields:
-            params = mapped(replicated, params)
+        params = mapped(unknowns.backend.combinable, params)
         equation = Equation(self.residual, unknowns, params, self.name)
         arguments = (equation, unknowns.flat(guess), *equation.variables(params))
         return unknowns.rounded(collectively(self.name, (guess, *params), self._solution, *arguments))
@@ -296,8 +296,20 @@ class Root(Reconstructible):
             x = thread.solve_hooks[-1].root(self, equation, guess, leaves)
         else:
             x = self.newton_solve(equation, guess, leaves)
-        note(self.name, "method", f"Newton's method, Jacobian {self._jacobians.description or 'not needed'}")
+        description = self._jacobians_of(equation).description or "not needed"
+        note(self.name, "method", f"Newton's method, Jacobian {description}")
         return x
+
+    def _jacobians_of(self, equation: Equation) -> Jacobians:
+        """Return the source of the Jacobians for unknowns that are stored by the backend of these."""
+        backend = equation.unknowns.backend
+        jacobians = self._jacobians.get(backend)
+        if jacobians is None:
+            default = self._default_jacobians
+            build = backend.implementation(Jacobians)
+            jacobians = build(self.name, default.user_jacobian, default.sparsity, default.settings)
+            self._jacobians[backend] = jacobians
+        return jacobians
 
     def newton_correction(
         self, equation: Equation, x: Any, leaves: Sequence[Any], forcing: float, residual: Any = 0.0
@@ -306,14 +318,15 @@ class Root(Reconstructible):
         F = equation.value(x, leaves) - residual
         if not np.any(F):
             return x
-        return x + self._jacobians.evaluate(equation, x, leaves).step(F, forcing)
+        return x + self._jacobians_of(equation).evaluate(equation, x, leaves).step(F, forcing)
 
     def newton_solve(self, equation: Equation, guess: Any, leaves: Sequence[Any]) -> Any:
         """Solve by Newton's method on flat unknowns, and record the solve."""
         run = Run()
         series = self._series.get(get_ident())
         is_time_step = series is not None
-        newton = Newton(equation, leaves, self._jacobians, self.rtol, self.maxiter, run, is_time_step)
+        jacobians = self._jacobians_of(equation)
+        newton = Newton(equation, leaves, jacobians, self.rtol, self.maxiter, run, is_time_step)
         try:
             return newton.solve(guess, (series or {}).get(equation.size))
         finally:
@@ -394,7 +407,7 @@ class Root(Reconstructible):
         return solve_rule(self.name, self._solve, _negative_gradient, _product, transposed)
 
     def _solve(self, transposed, checked, b, equation, x, *leaves):
-        linearisation = self._jacobians.cached(equation, x, leaves)
+        linearisation = self._jacobians_of(equation).cached(equation, x, leaves)
         self._note_setup(linearisation)
         s, info = linearisation.solve(b, transposed)
         if transposed and info is not None:
@@ -404,10 +417,12 @@ class Root(Reconstructible):
     # ------------------------------------------------------------ words
 
     def __repr__(self) -> str:
-        return f"<{self.name}: Jacobian {self._jacobians.description or 'not needed yet'}>"
+        descriptions = [jacobians.description for jacobians in self._jacobians.values() if jacobians.description]
+        return f"<{self.name}: Jacobian {'; '.join(descriptions) or 'not needed yet'}>"
 
     def __str__(self) -> str:
-        return f"{self!r}\n{self._jacobians}"
+        used = [jacobians for jacobians in self._jacobians.values() if jacobians.description]
+        return "\n".join([repr(self), *map(str, used or [self._default_jacobians])])
 
 
 def _negative_gradient(point, places, y, s):

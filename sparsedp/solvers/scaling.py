@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from sparsedp._utils.validation import BLOCK
-from sparsedp.autodiff.backend import is_distributed
 
 __all__ = [
     "LARGE",
@@ -36,7 +35,7 @@ LARGEST_POWER = 1000  # exponents below it have a power of two that is a normal 
 
 def dot(x: Any, y: Any) -> Any:
     """Return the sum of the products of the entries of two flat arrays, without conjugation."""
-    if x.size <= BLOCK or is_distributed(x):
+    if x.size <= BLOCK or not isinstance(x, np.ndarray):
         return x @ y
     total = 0.0
     for start in range(0, x.size, BLOCK):
@@ -49,7 +48,7 @@ def norm(x: Any) -> float:
 
     Squares may leave the range of floats, unlike those of `pytree.norm`: the caller tests with `in_range`, and scales.
     """
-    if x.size <= BLOCK or is_distributed(x):
+    if x.size <= BLOCK or not isinstance(x, np.ndarray):
         return sqrt(np.vdot(x, x).real)
     squares = 0.0
     for start in range(0, x.size, BLOCK):
@@ -59,7 +58,7 @@ def norm(x: Any) -> float:
 
 
 def length(x: Any) -> float:
-    """Return the 2-norm of a flat real array of any magnitude; a field on ranks counts as a whole."""
+    """Return the 2-norm of a flat real array of any magnitude; of a distributed field, the norm of all its entries."""
     size = norm(x)
     if in_range(size):
         return size

@@ -60,7 +60,6 @@ class System:
     size_of = staticmethod(norm)
     largest = staticmethod(largest)
     seed: Any = 0
-    side: Any = None  # (layout, parts) of fields on ranks
 
     def __init__(self, op: Operator, rtol: float = 1e-10, maxiter: int | None = None) -> None:
         self.unscaled = op
@@ -101,7 +100,7 @@ class System:
 
     def structure_of(self, op: Operator) -> Structure:
         """Return the Structure of an operator on the entries that this process holds."""
-        return op.structure
+        return op.local_structure
 
     def operator(self, transposed: bool) -> Operator:
         """Return the unscaled operator, or its transpose."""
@@ -145,7 +144,7 @@ class System:
     # ------------------------------------------------------------ sizes
 
     def total(self, numbers: Any) -> Any:
-        """Return sums over all ranks that hold unknowns."""
+        """Return sums over all processes that hold unknowns."""
         return numbers
 
     def extremes(self, x: np.ndarray) -> tuple[float, float]:

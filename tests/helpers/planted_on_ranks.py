@@ -22,9 +22,9 @@ BUGS_ON_RANKS = {
         "tests/parallel/test_ranks.py::test_as_on_one_process[fields-2]",
     ),
     "on ranks, a halo that was brought before": (
-        '            self.agreement.meet("exchange")',
-        "            given = vars(self).setdefault('sent', given.copy()).astype(given.dtype)\n"
-        '            self.agreement.meet("exchange")',
+        '            self.agreement.synchronize("exchange")',
+        "            values = vars(self).setdefault('sent', values.copy()).astype(values.dtype)\n"
+        '            self.agreement.synchronize("exchange")',
         "tests/parallel/test_ranks.py::test_as_on_one_process[fields-2]",
     ),
     "on ranks, what a halo gives back that is not added": (
@@ -48,7 +48,7 @@ BUGS_ON_RANKS = {
         "tests/parallel/test_ranks.py::test_as_on_one_process[newton-2]",
     ),
     "on ranks, a number that is not compared": (
-        "        self.layout.tell(value)\n        return value",
+        "        self.layout.compare(value)\n        return value",
         "        return value",
         "tests/parallel/test_errors_ranks.py::test_an_error_of_one_rank_is_that_of_all",
     ),

@@ -47,7 +47,7 @@ CASES = {
     ),
     "numbers": (
         TypeError,
-        "save takes arrays of numbers, u is of type str; write np.asarray(u), or dp.gather(u) on ranks",
+        "save takes arrays of numbers, u is of type str; write np.asarray(u), or dp.gather(u) for a distributed field",
         lambda: dp.save("u.npz", GRID, u="hot"),
     ),
     "series": (

@@ -86,7 +86,7 @@ REFUSED = {
     "strings": (
         lambda p: dp.save(p / "a.npz", GRID, u=np.full((4, 3), "a")),
         TypeError,
-        "save takes arrays of numbers, u is of type ndarray; write np.asarray.u., or dp.gather.u. on ranks",
+        "save takes arrays of numbers, u is of type ndarray; write np.asarray.u., or dp.gather.u. for a distributed fi",
     ),
     "masked": (
         lambda p: dp.save(p / "a.npz", GRID, u=np.ma.ones((4, 3))),

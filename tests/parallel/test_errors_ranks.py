@@ -30,7 +30,7 @@ class Scene:
 REFUSED = [
     (
         TypeError,
-        "u[...] does not work on a field that lies on ranks; write dp.gather(u) for the whole array",
+        "u[...] does not work on a field on ranks; write dp.gather(u) for the whole array",
         lambda s: s.u[0],
     ),
     (ShapeError, "a field on cells(5, 4) is needed, got one on cells(3, 2)", lambda s: s.u + s.other),
@@ -57,8 +57,8 @@ REFUSED = [
     (ShapeError, "gradient takes a field on cells(5, 4), got one on cells(3, 2)", lambda s: s.G(s.other)),
     (
         TypeError,
-        "an operator of two functions cannot be cut for ranks, for no rank knows its rows; make it of operators of the "
-        "grid or of a matrix",
+        "an operator of two functions cannot be applied to fields on ranks, because its rows are not known; build it "
+        "from operators of the grid or from a matrix",
         lambda s: s.double()(s.u),
     ),
     (
@@ -83,7 +83,7 @@ REFUSED = [
     ),
     (
         TypeError,
-        "inverse of sample does not work on ranks; both sides must lie there in the same way",
+        "inverse of sample does not work on ranks; both sides must be stored in the same way",
         lambda s: dp.inverse(dp.from_matrix(np.eye(20), s.grid.cells, 20, name="sample")),
     ),
     (
@@ -109,14 +109,14 @@ REFUSED = [
     ),
     (
         TypeError,
-        "implicit(<lambda>) takes, for fields on ranks, residuals in which a number meets few others, all of them "
-        "near; write dp.gather(u) for what every rank solves alone",
+        "implicit(<lambda>) takes, for fields on ranks, residuals in which each number is coupled to a few near ones; "
+        "write dp.gather(u) for unknowns that every rank solves for alone",
         lambda s: dp.implicit(lambda x, k: x - k + anp.sum(x) ** 2)(s.u, 1.0),
     ),
     (
         TypeError,
-        "implicit(<lambda>) takes fields that all lie on the same ranks, or none, got float among them; write "
-        "dp.identity(grid.cells)(u) for the field of an array",
+        "implicit(<lambda>) takes fields that are all distributed in the same way, or none, got float among them; "
+        "write dp.identity(grid.cells)(u) for the field of an array",
         lambda s: dp.implicit(lambda x: x)({"a": s.u, "b": 1.0}),
     ),
     (
@@ -154,7 +154,7 @@ def test_a_null_vector_that_nobody_tries():
 @on_ranks
 def test_another_mpi(monkeypatch):
     monkeypatch.setenv("PMI_SIZE", "4")
-    told = "4 processes were started, and mpi4py sees one: it belongs to another MPI; install it for this one"
+    told = "4 processes were started, but mpi4py belongs to another MPI and finds one; reinstall it for this MPI"
     with pytest.raises(RuntimeError) as caught:
         dp.distribute(dp.Grid(3))
     assert str(caught.value) == told
@@ -184,14 +184,14 @@ def test_what_gather_does_not_take():
 # ------------------------------------------------------------ errors of one rank among several
 
 PLANTED = {
-    "clock: TypeError": "work_precision repeats runs by the clock, which no two ranks share; run it on one process",
+    "clock: TypeError": "work_precision measures times, which differ between processes; run it on one process",
     "kernel in a gradient: MemoryError": "no room (on rank 1, whose block begins at cell (6, 0))",
     "argument: ValueError": (
         "argument 0['k'] of the loss is not the same on rank 1 as on rank 0; give all ranks the same numbers, random "
         "ones by the same seed"
     ),
     "another way: ValueError": (
-        "rank 1 came to maximum of shape (), float64 where rank 0 came to add of shape (), float64; let nothing depend "
+        "rank 1 has maximum of shape (), float64, rank 0 has add of shape (), float64; write no branches that depend "
         "on the number of the rank, on a clock or on numbers of one rank"
     ),
 }

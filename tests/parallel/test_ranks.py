@@ -12,7 +12,7 @@ import sparsedp as dp
 PARTS = 6  # of the table of transport
 pytestmark = pytest.mark.xdist_group("ranks")  # several processes at a time are enough
 run = cache(printed)  # a run serves several tests
-FUNCTIONS = "cannot be cut for ranks, for no rank knows its rows; make it of operators of the grid or of a matrix"
+FUNCTIONS = "cannot be applied to fields on ranks, because its rows are not known"
 
 
 def test_one_process_keeps_its_grid_and_imports_nothing(monkeypatch):

@@ -128,17 +128,25 @@ FAULTS = {
     "shape": (dp.errors.ShapeError, "on rank", lambda: laplacian()(here(U, np.zeros(3)))),
     "dtype": (TypeError, "on rank", lambda: laplacian()(here(U, U.astype(str)))),
     "cutting": (OverflowError, "on rank", within(cut, "_entries", OverflowError("too large"), lambda: laplacian()(U))),
-    "matrix": (MemoryError, "on rank", within(cut._Cut, "explicit", MemoryError(), lambda: dp.inverse(STEP))),
-    "kernel": (MemoryError, "on rank", within(cut._Cut, "product", MemoryError(), lambda: laplacian()(FIELD))),
+    "matrix": (
+        MemoryError,
+        "on rank",
+        within(cut.KroneckerOfBoxes, "explicit", MemoryError(), lambda: dp.inverse(STEP)),
+    ),
+    "kernel": (
+        MemoryError,
+        "on rank",
+        within(cut.KroneckerOfBoxes, "product", MemoryError(), lambda: laplacian()(FIELD)),
+    ),
     "kernel in a product": (
         FloatingPointError,
         "overflow",
-        within(cut._Cut, "product", FloatingPointError("overflow"), lambda: (laplacian() @ STEP)(FIELD)),
+        within(cut.KroneckerOfBoxes, "product", FloatingPointError("overflow"), lambda: (laplacian() @ STEP)(FIELD)),
     ),
     "kernel in a gradient": (
         MemoryError,
         "no room",
-        within(cut._Cut, "product", MemoryError("no room"), lambda: dp.grad(misfit)(FIELD)),
+        within(cut.KroneckerOfBoxes, "product", MemoryError("no room"), lambda: dp.grad(misfit)(FIELD)),
     ),
     "engine": (RuntimeError, "no", within(solve.PetscEngine, "solve", RuntimeError("no"), lambda: dp.inverse(STEP)(U))),
     "adjoint": (
@@ -176,12 +184,12 @@ FAULTS = {
     ),
     "random numbers": (
         ValueError,
-        "an array of shape (12, 10) beside a field on ranks is not the same",
+        "an array of shape (12, 10) combined with a field on ranks is not the same",
         lambda: dp.value_and_grad(lambda u: misfit(u + RUNS.standard_normal(PLAIN.shape)))(FIELD),
     ),
     "a random number": (
         ValueError,
-        "a number beside a field on ranks is not the same on rank",
+        "a number combined with a field on ranks is not the same on rank",
         lambda: np.sum(FIELD * RUNS.random()),
     ),
     "loss of one rank": (
@@ -196,11 +204,15 @@ FAULTS = {
     ),
     "kernel, caught by its rank": (
         ValueError,
-        "came to an error in laplacian where",
-        within(cut._Cut, "product", MemoryError(), lambda: dp.grad(caught)(FIELD)),
+        "has an error in laplacian, rank",
+        within(cut.KroneckerOfBoxes, "product", MemoryError(), lambda: dp.grad(caught)(FIELD)),
     ),
-    "clock": (TypeError, "by the clock", lambda: dp.work_precision(lambda: (misfit, U), [{}])),
-    "another way": (ValueError, "let nothing depend on the number of the rank", lambda: here(np.sum, np.max)(FIELD)),
+    "clock": (TypeError, "measures times", lambda: dp.work_precision(lambda: (misfit, U), [{}])),
+    "another way": (
+        ValueError,
+        "write no branches that depend on the number of the rank",
+        lambda: here(np.sum, np.max)(FIELD),
+    ),
 }
 
 

@@ -15,8 +15,8 @@ from flow_on_ranks import COMM, close, derivatives, lying, on_both, refused
 
 import sparsedp as dp
 from sparsedp.autodiff.tape import plain
+from sparsedp.parallel.jacobian import RanksJacobians
 from sparsedp.solvers.choose_method import check_settings
-from sparsedp.solvers.jacobian import Jacobians
 from sparsedp.solvers.newton import Equation, Unknowns
 
 PLAIN = dp.Grid((9, 8), size=(1.0, 2.0))
@@ -176,7 +176,7 @@ def bits():
             equation = Equation(make(grid), unknowns, params, "f")
             settings = check_settings("auto", 1e-10, None, "raise", {})
             x = unknowns.distribute(np.sin(np.arange(float(unknowns.size))))
-            J = Jacobians("f", None, None, settings).evaluate(equation, x, equation.variables(params))
+            J = RanksJacobians("f", None, None, settings).evaluate(equation, x, equation.variables(params))
             found.update(dp.gather(J.product(x)).tobytes())
     if COMM.rank == 0:
         print(found.hexdigest())

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from mpi4py import MPI
 
-from sparsedp.parallel.layout import RIGHT
+from sparsedp.parallel.layout import SUPPORTED
 
 COMM = MPI.COMM_WORLD
 README = Path(__file__).parents[2] / "README.md"
@@ -35,7 +35,7 @@ def main():
     """Run them; those that need transport as soon as that works on ranks."""
     names: dict = {}
     for code, told in blocks():
-        if "dp.transport" in code and "transport" not in RIGHT:
+        if "dp.transport" in code and "transport" not in SUPPORTED:
             continue
         assert ("dp.Grid(" in code) == ("dp.distribute(" in distributed(code))
         printed = io.StringIO()

@@ -130,10 +130,10 @@ def steps_of_what_all_know():
         on_both(name, PLAIN, partial(looked_at, name, make), fields=(whole,))
         grid = dp.distribute(PLAIN, COMM)
         u = lying(grid.cells, RNG_FIELDS[PLAIN.shape][0])
-        words = f"{name}) does not work on a field that lies on ranks; write dp.gather(u) for the whole array"
+        words = f"{name}) does not work on a field on ranks; write dp.gather(u) for the whole array"
         refused(TypeError, words, lambda make=make, u=u, grid=grid: make(grid)(u, 0.7))
     grid = dp.distribute(PLAIN, COMM)
-    words = "stepper(radau) does not work on a field that lies on ranks"
+    words = "stepper(radau) does not work on a field on ranks"
     refused(TypeError, words, lambda: rates("radau")(grid)(np.ones(PLAIN.shape), 0.7))
 
 

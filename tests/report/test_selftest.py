@@ -12,7 +12,7 @@ from sparsedp.parallel import selftest
 ROOT_USER = "mpirun has detected an attempt to run as root."
 NUMPY = "ValueError: numpy.dtype size changed, may indicate binary incompatibility. Expected 96, got 88 from PyObject"
 OTHER_MPI = (
-    "RuntimeError: 2 processes were started, and mpi4py sees one: it belongs to another MPI; install it for this one"
+    "RuntimeError: 2 processes were started, but mpi4py belongs to another MPI and finds one; reinstall it for this MPI"
 )
 
 
@@ -56,7 +56,7 @@ def test_failures_are_reported_in_one_line(said, told):
 
 
 def test_what_cannot_be_started_or_does_not_end(monkeypatch):
-    monkeypatch.setattr(selftest, "SECONDS", 0.1)
+    monkeypatch.setattr(selftest, "TIMEOUT", 0.1)
     assert selftest.run(["/nowhere/mpirun"]) == ([], "[Errno 2] No such file or directory: '/nowhere/mpirun'")
     assert selftest.run([sys.executable, "-c", "import time; time.sleep(9)"])[1].endswith("timed out after 0.1 seconds")
 
@@ -74,6 +74,8 @@ def test_two_processes(monkeypatch, capsys):
 
 @on_ranks
 def test_a_wrong_gradient_is_reported(monkeypatch):
-    monkeypatch.setattr(selftest, "WITHIN", -1.0)
-    with pytest.raises(ArithmeticError, match=r"^a gradient is off by 0.0e\+00 from one process$"):
+    monkeypatch.setattr(selftest, "TOLERANCE", -1.0)
+    with pytest.raises(
+        ArithmeticError, match=r"^a gradient differs by 0.0e\+00 \(relative\) from that of one process$"
+    ):
         next(selftest.compare())

@@ -187,7 +187,7 @@ def test_the_cache_holds_no_traced_values():
     loss = problem.loss(root)
     slope = lambda p: value_and_grad(loss)(p)[1]
     first = pushforward(slope, problem.params, directions(problem.params))[1]
-    for key, known in root._jacobians._points._entries:
+    for key, known in root._default_jacobians._points._entries:
         equation, x, values = known.point
         assert not any(map(isbox, (*key, x, *values, *equation.parameters.statics, *leaves(equation.params(values)))))
     second = pushforward(slope, problem.params, directions(problem.params))[1]
@@ -264,7 +264,7 @@ def test_probing_finds_both_sides_of_an_upwind_switch():
     loss = lambda f: anp.sum(root(np.zeros(50), f) ** 2)
     value, slope = value_and_grad(loss)(f)
     assert rate(lambda h: loss(f + h * d) - value - h * (slope @ d)) >= 1.95
-    ((coloured, _),) = root._jacobians._patterns.values()
+    ((coloured, _),) = root._default_jacobians._patterns.values()
     assert coloured.pattern.nnz == 150
 
 
