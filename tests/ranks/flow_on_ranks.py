@@ -177,6 +177,59 @@ def flows():
         on_both(f"flow_step {sorted(options)}", plain, look, 1e-9)  # its solves are good to 1e-10
 
 
+def moving_walls():
+    """Tangential velocities of walls and inflows: functions of the parameters, arrays and fields, and derivatives."""
+    box = dp.Grid((12, 10), size=1.0)
+    uneven = dp.Grid((12, 10), spacing=[np.linspace(1, 2, 12) / 18, np.linspace(2, 1, 10) / 15])
+    room = dp.Grid((6, 4, 5), size=1.0, periodic=(False, True, False))
+    oblique = {"x": (dp.inflow, dp.outflow), "y": (dp.no_slip, dp.free_slip)}
+    cases = [
+        (box, {"viscosity": 0.01}),
+        (box, {"viscosity": 0.1, "implicit": True, "solid": BLOCK[:12, :10]}),
+        (uneven, {"viscosity": 0.01, "boundary": oblique}),
+        (room, {"viscosity": 0.05, "implicit": True, "boundary": {"z": (dp.inflow, dp.outflow)}}),
+    ]
+    for plain, options in cases:
+        boundary = options.get("boundary", dp.no_slip)
+        rng = np.random.default_rng(0)
+        v, t = 0.05 * rng.standard_normal((2, plain.faces.size))
+        w, s = 0.1 * rng.standard_normal((2, dp.face_lift(plain, boundary).domain.size))
+
+        def look(grid, field, options=options, boundary=boundary, v=v, t=t, w=w, s=s):
+            space = dp.face_lift(grid, boundary).domain
+            step = dp.flow_step(grid, 0.02, walls=lambda p: p["walls"] * anp.cos(p["angle"]), **options)
+
+            def loss(x):
+                end = dp.rollout(step, step.start(x["v"], x), x, 2)
+                return anp.sum(anp.sin(1.0 + end["v"])) + anp.sum(end["p"] ** 2) + anp.sum(end["walls"] ** 3)
+
+            x = {"v": field(grid.faces, v), "walls": field(space, w), "angle": 0.3}
+            along = {"v": field(grid.faces, t), "walls": field(space, s), "angle": -0.2}
+            value, slope, tangent, bent = derivatives(loss, x, along)
+            return value, *slope.values(), tangent, *bent.values()
+
+        on_both(f"moving walls, {sorted(options)}", plain, look, 1e-9)
+
+    one_wall = {"x": (dp.inflow, dp.outflow), "y": dp.free_slip}
+    for plain, boundary in ((box, dp.no_slip), (uneven, one_wall)):
+        v = 0.05 * np.random.default_rng(0).standard_normal(plain.faces.size)
+
+        def look_at_constant_walls(grid, field, boundary=boundary, v=v):
+            lift = dp.face_lift(grid, boundary)
+            lifted = lift(field(lift.domain, np.linspace(0.1, 0.5, lift.domain.size)))
+            step = dp.flow_step(grid, 0.02, 0.01, boundary=boundary, walls=lifted)
+            end = dp.rollout(step, step.start(field(grid.faces, v)), None, 3)
+            return end["v"], end["p"]
+
+        on_both(f"constant walls, {boundary}", plain, look_at_constant_walls, 1e-9)
+    grid = dp.distribute(room, COMM)
+    meeting = {"z": (dp.inflow, dp.outflow)}
+    lift = dp.face_lift(grid, meeting)
+    lifted = lift(dp.identity(lift.domain)(np.ones(lift.domain.size)))
+    words = "the velocities of walls that meet at an inflow are summed"
+    refused(ValueError, words, lambda: dp.flow_step(grid, 0.02, 0.01, boundary=meeting, walls=lifted))
+
+
 def refused(kind, words, act):
     """An error with the same words on all ranks."""
     try:
@@ -208,6 +261,7 @@ if __name__ == "__main__":
     plume()
     cavity()
     flows()
+    moving_walls()
     errors_are_the_same_on_all_ranks()
     if COMM.rank == 0:
         print("all agree")
