@@ -50,7 +50,7 @@ class Result(Frozen):
 
     def omissions(self) -> list[str]:
         """Return what was skipped, with the reason: lines of its text."""
-        return [f"  left out: {sentence}" for sentence in self.skipped]
+        return [f"  skipped: {sentence}" for sentence in self.skipped]
 
     def __str__(self) -> str:
         return "\n".join(map(str, self.parts()))
@@ -77,7 +77,7 @@ class Result(Frozen):
                 blocks.append(part.html())
             elif part not in omissions:
                 blocks.append(paragraphs([part]))
-        return Markup("\n".join([*blocks, folded("What was left out", self.skipped)]))
+        return Markup("\n".join([*blocks, folded("What was skipped", self.skipped)]))
 
     def curves(self) -> tuple[dict[str, Any], str, str]:
         """Return what is drawn on logarithmic axes; nothing unless a kind of result says so.

@@ -25,22 +25,23 @@ from sparsedp.operators.given import from_matrix
 from sparsedp.solvers.cache import Cache
 from sparsedp.solvers.sparsity import ColouredPattern, dense_pattern, find_pattern, pattern_like, stencil_pattern
 
-__all__ = ["Adopted", "from_blackbox"]
+__all__ = ["BlackBox", "from_blackbox"]
 
-STEP = "complex step"
+COMPLEX_STEP = "complex step"
 DIFFERENCES = "central differences"
-WAYS = {"auto": "", "complex": STEP, "difference": DIFFERENCES}
-COMPLEX = 1e-30  # step of the complex step: no difference is taken, so nothing cancels
-CENTRAL = EPS ** (1 / 3)  # step of central differences, relative to x
-SHARES = 1.0, 1e-2  # of the step of central differences: Jacobians and probes
-MOST = {STEP: (1e-9, 1e-12), DIFFERENCES: (1e-4, 1e-4)}  # what a row may lack of a probe: of itself, of the largest row
-GROWS = 1e-5  # what it may lack of a difference if that grows with the step: rounding does not
-REFUSED = ValueError, ArithmeticError, RuntimeError  # what foreign code raises where it has no result
-SMALLER = 1.0, -1.0, 1e-2, -1e-2, 1e-4, -1e-4  # shares of a move, until the code takes the point
-TIMES = 2, 5, 11  # steps at which what a row lacks is looked at again
+METHODS = {"auto": "", "complex": COMPLEX_STEP, "difference": DIFFERENCES}
+COMPLEX_STEP_SIZE = 1e-30  # no difference is taken, so nothing cancels
+DIFFERENCE_STEP = EPS ** (1 / 3)  # step of central differences, relative to x
+DIFFERENCE_SHARES = 1.0, 1e-2  # of the step of central differences: Jacobians and probes
+# How far a row of the Jacobian may differ from a probe: as a share of the row, and of the largest row.
+TOLERANCES = {COMPLEX_STEP: (1e-9, 1e-12), DIFFERENCES: (1e-4, 1e-4)}
+LARGEST_ROUNDING = 1e-5  # share of a row; a larger difference from a probe that is proportional to the step is an error
+EVALUATION_ERRORS = ValueError, ArithmeticError, RuntimeError  # raised by foreign code at points without a result
+MOVE_SHARES = 1.0, -1.0, 1e-2, -1e-2, 1e-4, -1e-4  # tried in turn until the function has a result
+STEP_MULTIPLES = 2, 5, 11  # steps at which the difference between a row and a probe is computed again
 
 
-def from_blackbox(f: Callable, sparsity: Any = None, derivative: str = "auto", name: str | None = None) -> Adopted:
+def from_blackbox(f: Callable, sparsity: Any = None, derivative: str = "auto", name: str | None = None) -> BlackBox:
     """Return a NumPy function of an array as a differentiable function.
 
     Parameters
@@ -48,10 +49,10 @@ def from_blackbox(f: Callable, sparsity: Any = None, derivative: str = "auto", n
     f : callable
         ``f(x)``, real arrays of any shapes; it must return the same result for the same x.
     sparsity : sparse matrix or array, optional
-        (y.size, x.size), not 0 where y_i may depend on x_j. Default: what three cells touch, moved over the grid, if
-        each row of the Jacobian agrees with a derivative along a random direction; else found by changing random parts
-        of x, a little and by a tenth. Where a later point takes another branch it is found again, and grows. An entry
-        below 1e-9 (differences: 1e-5) of its row may be missed.
+        (y.size, x.size), not 0 where y_i may depend on x_j. Default: the stencil found at three cells, repeated over
+        the grid, if each row of the Jacobian agrees with a derivative along a random direction; else found by changing
+        random parts of x, slightly and by a tenth. At a later point that takes another branch it is searched again, and
+        entries are added. An entry below 1e-9 (differences: 1e-5) of its row may be missed.
     derivative : "auto", "complex" or "difference"
         complex: f(x + i h v), to rounding, for code that is analytic and takes complex numbers. difference: central
         differences, about ten digits. auto: complex where it is found to agree with differences.
@@ -60,9 +61,9 @@ def from_blackbox(f: Callable, sparsity: Any = None, derivative: str = "auto", n
 
     Returns
     -------
-    Adopted
-        ``adopted(x)``; `.jacobian(x)` is the csr_array dy/dx, `.runs` the number of runs so far; str() tells how many
-        runs one Jacobian takes.
+    BlackBox
+        ``box(x)``; `.jacobian(x)` is the csr_array dy/dx, `.runs` the number of runs so far; str() says how many runs
+        one Jacobian takes.
 
     Raises
     ------
@@ -104,19 +105,19 @@ def from_blackbox(f: Callable, sparsity: Any = None, derivative: str = "auto", n
     (14.0, array([2., 4., 6.]))
     """
     check_function("from_blackbox", f, "dp.from_blackbox(lambda x: ...)")
-    check_choice("derivative", derivative, WAYS)
-    return Adopted(f, sparsity, derivative, str(name or getattr(f, "__name__", "simulator")))
+    check_choice("derivative", derivative, METHODS)
+    return BlackBox(f, sparsity, derivative, str(name or getattr(f, "__name__", "simulator")))
 
 
-class Adopted(Reconstructible):
-    """A foreign function with a sparse Jacobian, kept for the last two points: see `from_blackbox`.
+class BlackBox(Reconstructible):
+    """A foreign function with a sparse Jacobian, cached for the last two points: see `from_blackbox`.
 
     Attributes
     ----------
     runs : int
         Runs of the function so far.
     way : str
-        STEP or DIFFERENCES; empty until the first derivative decides.
+        COMPLEX_STEP or DIFFERENCES; empty until the first derivative decides.
     """
 
     _shapes: Any
@@ -132,21 +133,17 @@ class Adopted(Reconstructible):
         if sparsity is not None:
             self._sparsity = pattern_like(sparsity)
         self._shapes, self.way, self._coloured = jacobian
-        self.way = self.way or WAYS[derivative]
+        self.way = self.way or METHODS[derivative]
         self.runs = 0
-        self._points, self._alone = Cache(), RLock()  # foreign code may work in arrays of its own: one thread at a time
-        self._rule = Rule(
-            name,
-            self._run,
-            self._vjp,
-            self._jvp,
-        )
+        self._points = Cache()
+        self._lock = RLock()  # foreign code may work in arrays of its own: one thread at a time
+        self._rule = Rule(name, self._run, self._vjp, self._jvp)
 
     def recipe(self) -> tuple:
         """Return the call that builds an equal object, for pickling and copying."""
-        # The pattern found so far travels too: it took many runs.
+        # The pattern found so far is included: it took many runs.
         jacobian = self._shapes, self.way, self._coloured
-        return Adopted, (self._f, self._sparsity, self._derivative, self.name, jacobian)
+        return BlackBox, (self._f, self._sparsity, self._derivative, self.name, jacobian)
 
     @public("dp.from_blackbox(f)")
     def __call__(self, x: Any) -> Any:
@@ -157,7 +154,7 @@ class Adopted(Reconstructible):
         if self._coloured is None:
             return f"{self.name}: no derivative asked for yet, {self.runs} runs"
         runs = self._coloured.count
-        if self.way != STEP:
+        if self.way != COMPLEX_STEP:
             runs *= 2  # a central difference takes two
         rows, columns = self._coloured.pattern.shape
         return (
@@ -171,7 +168,7 @@ class Adopted(Reconstructible):
         """Run the function on plain values and return a copy: it may write into the returned array at the next run."""
         check_precision(f"the argument of {self.name}", x)
         count(f"{self.name}.run", "forward")
-        with self._alone:
+        with self._lock:
             self.runs += 1
             y = np.array(self._f(np.array(x)))
         if y.dtype.kind not in "biuf" and np.asarray(x).dtype.kind != "c":
@@ -194,8 +191,8 @@ class Adopted(Reconstructible):
         """Return the Jacobian as an Operator, at the argument of a run with the result y."""
         if isbox(x):
             raise DerivativeError(
-                f"{self.name} is adopted: its Jacobian is known, its second derivative is not; use a method with "
-                "first derivatives, or write the function with autograd.numpy"
+                f"{self.name} is a black box without second derivatives; use a method with first derivatives, or "
+                "write the function with autograd.numpy"
             )
         matrix, result = self._at(x)
         first_result = plain(y)
@@ -204,7 +201,7 @@ class Adopted(Reconstructible):
         if not np.array_equal(result, first_result):
             raise DerivativeError(
                 f"{self.name} gives another result for the same argument than before; it must depend on its argument "
-                "only, so what changes from call to call must be a part of it"
+                "only, so make everything that changes between calls a part of it"
             )
         inputs, outputs = self._shapes
         return from_matrix(matrix, inputs, outputs, f"{self.name}.J")
@@ -225,7 +222,7 @@ class Adopted(Reconstructible):
     def _at(self, x):
         """Return the Jacobian at a point and the result there, cached for the last two points."""
         x = np.asarray(x, dtype=float)
-        with self._alone:
+        with self._lock:
             return self._points.find((x,)) or self._points.put((x,), self._computed(x))
 
     def _computed(self, x):
@@ -235,8 +232,8 @@ class Adopted(Reconstructible):
         check_finite(f"{self.name} near x", y, "must be finite to be differentiated")
         if self._shapes not in (None, (x.shape, y.shape)):
             raise ShapeError(
-                f"{self.name} was adopted from {self._shapes[0]} to {self._shapes[1]}, got {x.shape} to {y.shape}; "
-                "adopt it again"
+                f"{self.name} maps {self._shapes[0]} to {self._shapes[1]}, got {x.shape} to {y.shape}; call "
+                "from_blackbox again for other shapes"
             )
         self._shapes = x.shape, y.shape
         for coloured in self._patterns(x.reshape(-1), y.reshape(-1)):
@@ -245,9 +242,9 @@ class Adopted(Reconstructible):
             if not wrong.any():
                 return matrix, y
         raise DerivativeError(
-            f"the Jacobian of {self.name} by {self.way or STEP} misses in row {np.argmax(wrong)} what a difference "
-            "along a random direction sees; its sparsity lacks entries, or it has a kink at x: leave sparsity and "
-            "derivative out, or move x a little"
+            f"row {np.argmax(wrong)} of the Jacobian of {self.name} by {self.way or COMPLEX_STEP} does not agree with "
+            "a difference along a random direction; its sparsity lacks entries, or it has a kink at x: leave sparsity "
+            "and derivative out, or move x a little"
         )
 
     def _flat(self, x):
@@ -301,25 +298,25 @@ class Adopted(Reconstructible):
     # ------------------------------------------------------------ one Jacobian
 
     def _steps(self, x):
-        return CENTRAL * np.maximum(np.abs(x), typical(x))
+        return DIFFERENCE_STEP * np.maximum(np.abs(x), typical(x))
 
     def _product(self, x, way):
         """Return the product of the Jacobian at x with a vector, as a function of the vector."""
 
         def complex_step(v):
-            return self._flat(x + 1j * COMPLEX * v).imag / COMPLEX
+            return self._flat(x + 1j * COMPLEX_STEP_SIZE * v).imag / COMPLEX_STEP_SIZE
 
         def central_difference(v):
             return (self._flat(x + v) - self._flat(x - v)) / 2
 
-        if way == STEP:
+        if way == COMPLEX_STEP:
             return complex_step
         return central_difference
 
     def _by_colours(self, coloured, x, way, share):
         """Compute the Jacobian on a pattern by one product for each colour."""
         steps = np.ones_like(x)
-        if way != STEP:
+        if way != COMPLEX_STEP:
             steps = share * self._steps(x)
         product_along = self._product(x, way)
 
@@ -328,7 +325,7 @@ class Adopted(Reconstructible):
 
         matrix = coloured.matrix(scaled_product)
         matrix.data /= steps[matrix.indices]
-        check_finite(f"what differences of {self.name} close to x give", matrix.data, advice="; move x a little")
+        check_finite(f"the differences of {self.name} near x", matrix.data, advice="; move x a little")
         return matrix
 
     def _probed(self, coloured, x):
@@ -341,20 +338,20 @@ class Adopted(Reconstructible):
         """
         ways = []
         if self.way != DIFFERENCES:
-            ways.append((STEP, 1.0))
+            ways.append((COMPLEX_STEP, 1.0))
         if self._derivative != "complex":
-            ways.extend((DIFFERENCES, share) for share in SHARES)
+            ways.extend((DIFFERENCES, share) for share in DIFFERENCE_SHARES)
         jacobians: dict = {}
         matrix = coloured.pattern
         wrong = np.ones(coloured.pattern.shape[0], dtype=bool)
         probed = False
-        for share, way in product(reversed(SHARES), ways):
+        for share, way in product(reversed(DIFFERENCE_SHARES), ways):
             try:
                 with _strict():
                     if way not in jacobians:
                         jacobians[way] = self._by_colours(coloured, x, *way)
                     matrix = _with_rows(matrix, jacobians[way], wrong)
-                    wrong &= self._misses(matrix, x, way[0], share)
+                    wrong &= self._disagreeing_rows(matrix, x, way[0], share)
             except MemoryError:
                 raise
             except Exception as error:  # the code takes no complex numbers, or no point this far from x
@@ -368,11 +365,11 @@ class Adopted(Reconstructible):
             raise trouble
         return matrix, wrong
 
-    def _misses(self, matrix, x, way, share):
+    def _disagreeing_rows(self, matrix, x, way, share):
         """Return the rows in which a Jacobian disagrees with its own method or with a difference along a direction."""
         generator = np.random.default_rng(crc32(x.tobytes()))  # one direction for each point
         v = share * self._steps(x) * generator.standard_normal(x.shape)
-        wrong = [_lacks(matrix, v, self._product(x, method), method) for method in {way, DIFFERENCES}]
+        wrong = [_wrong_rows(matrix, v, self._product(x, method), method) for method in {way, DIFFERENCES}]
         return np.any(wrong, axis=0)
 
 
@@ -390,17 +387,17 @@ def _with_rows(matrix, other, rows):
     return sp.csr_array((np.where(entries, other.data, matrix.data), matrix.indices, matrix.indptr), matrix.shape)
 
 
-def _lacks(matrix, v, along, way):
+def _wrong_rows(matrix, v, along, way):
     """Return the rows in which the product of a matrix with v differs too much from the product along v."""
     lacks = along(v) - matrix @ v
     size = abs(matrix) @ np.abs(v)
-    share, floor = MOST[way]
+    share, floor = TOLERANCES[way]
     wrong = ~(np.abs(lacks) <= share * size + floor * np.max(size, initial=0.0))
-    doubtful = ~wrong & (np.abs(lacks) > GROWS * size)
+    doubtful = ~wrong & (np.abs(lacks) > LARGEST_ROUNDING * size)
     if way == DIFFERENCES and doubtful.any():
         # Entries, however small, lack something in proportion to the step, and what rounding makes does not. A row may
         # be far smaller than the largest, as one of other units is.
-        gaps = [along(times * v) - times * (matrix @ v + lacks) for times in TIMES]
+        gaps = [along(times * v) - times * (matrix @ v + lacks) for times in STEP_MULTIPLES]
         wrong |= doubtful & (lacks != 0) & ~np.any(np.abs(gaps) > 0.1 * np.abs(lacks), axis=0)
     return wrong
 
@@ -411,8 +408,8 @@ def change(run: Callable, x: NDArray, y: NDArray, v: NDArray) -> NDArray:
     The move is a tenth of the size of x; shorter moves are tried if the function raises an error or returns NaN or
     infinity. The change is 0 if it does so for all of them.
     """
-    for share in SMALLER:
-        with suppress(*REFUSED):
+    for share in MOVE_SHARES:
+        with suppress(*EVALUATION_ERRORS):
             moved = run(x + 0.1 * share * typical(x) * v)
             if np.all(np.isfinite(moved)):
                 return moved - y

@@ -74,24 +74,24 @@ def to_jax(f: Callable, like: Any = None) -> Callable:
     Array([-16.,  -2.,  -4.,  22.], dtype=float32)
     """
     check_function("to_jax", f, "dp.interop.to_jax(dp.laplacian(grid))")
-    nodes: dict = {}  # by structure, shapes and dtypes of the arguments: the form of the result may depend on all
+    functions: dict = {}  # by structure, shapes and dtypes of the arguments: the form of the result may depend on all
 
     def call(*args):
         entries, structure = jax.tree.flatten(args)
         arrays = [*map(jnp.asarray, entries)]
         key = structure, tuple((array.shape, array.dtype) for array in arrays)
-        if key not in nodes:
-            nodes[key] = _node_of(f, structure, like)
-        node, result = nodes[key]
-        entries = node.applied(*arrays)  # the first call sets the structure of the result
+        if key not in functions:
+            functions[key] = _jax_function(f, structure, like)
+        jax_function, result = functions[key]
+        entries = jax_function.applied(*arrays)  # the first call sets the structure of the result
         return jax.tree.unflatten(result.structure, entries)
 
     return ReconstructibleFunction(call, to_jax, f, like)
 
 
-def _node_of(f, structure, like):
-    """Return the node of f for arguments of one structure, and the form of its result."""
-    result = _Result("result of to_jax", like)
+def _jax_function(f, structure, like):
+    """Return f as a function of JAX arrays, for arguments of one structure, and the structure of its result."""
+    result = _ResultStructure("result of to_jax", like)
     forms_by_arguments: dict = {}
 
     def fun(arrays):
@@ -117,10 +117,10 @@ def _node_of(f, structure, like):
             forms_by_arguments[key] = [*map(np.zeros_like, results)]
         return forms_by_arguments[key]
 
-    return _Node(fun, forms), result
+    return _JaxFunction(fun, forms), result
 
 
-class _Result:
+class _ResultStructure:
     """The structure of the result of a function: that of `like`, or of its first run.
 
     Results of other runs are reordered to it.
@@ -173,7 +173,7 @@ def _joined(paths):
     return ", ".join(map(jax.tree_util.keystr, paths)) or "none"
 
 
-class _Node:
+class _JaxFunction:
     """A function of a list of arrays as one of JAX arrays, with derivatives of every order.
 
     Parameters
@@ -209,7 +209,7 @@ class _Node:
         if not any(isinstance(value, jax.core.Tracer) for value in values):
             return [*map(jnp.array, self.fun([np.asarray(value)[()] for value in values]))]
         forms = jax.eval_shape(lambda *results: [*results], *self.forms(values))  # as JAX converts dtypes
-        host = _Host(self.fun, tuple(form.dtype for form in forms))
+        host = _HostCallback(self.fun, tuple(form.dtype for form in forms))
         return jax.pure_callback(host, forms, *values, vmap_method="sequential")
 
     def _forward(self, *primals):
@@ -228,7 +228,7 @@ class _Node:
         return tuple(placed([None] * len(moving), variables, slopes))
 
     def _pull(self, moving, nonzero):
-        """Return the node from arguments and nonzero cotangents to the gradients of the variable arguments."""
+        """Return the function from arguments and nonzero cotangents to the gradients of the variable arguments."""
         count = len(moving)
         places = [*compress(range(len(nonzero)), nonzero)]
 
@@ -239,10 +239,10 @@ class _Node:
         def forms(values) -> Iterable:
             return compress(values, moving)
 
-        return _Node(slopes, forms)
+        return _JaxFunction(slopes, forms)
 
 
-class _Host(NamedTuple):
+class _HostCallback(NamedTuple):
     """The callback of JAX; JAX compiles equal callbacks once."""
 
     fun: Any
@@ -300,12 +300,12 @@ def from_jax(function: Callable) -> Callable:
             check_precision("an argument of from_jax", entry)
         key = structure, tuple((np.shape(plain(entry)), dtype_of(entry)) for entry in entries)
         if key not in rules:
-            form = _Result("result of from_jax")
+            form = _ResultStructure("result of from_jax")
 
             def of_entries(*entries):
                 return form.leaves(function(*jax.tree.unflatten(structure, entries)))
 
-            rules[key] = _Traced(of_entries), form
+            rules[key] = _JaxRule(of_entries), form
         traced, form = rules[key]
         results = traced.rule(*entries)
         return jax.tree.unflatten(form.structure, parts(results, form.structure.num_leaves))
@@ -313,7 +313,7 @@ def from_jax(function: Callable) -> Callable:
     return ReconstructibleFunction(call, from_jax, function)
 
 
-class _Traced:
+class _JaxRule:
     """A JAX function that returns a list, as a rule of the tape; its derivatives are JAX functions, too."""
 
     def __init__(self, function):
@@ -343,7 +343,7 @@ class _Traced:
         used = tuple(k for k, y in enumerate(plain(ans)) if dtype_of(y).kind in "fc")
         key = make, nums, used, len(entries)
         if key not in self._derivatives:
-            self._derivatives[key] = _Traced(partial(make, self.function, *key[1:]))
+            self._derivatives[key] = _JaxRule(partial(make, self.function, *key[1:]))
         return self._derivatives[key].rule, used
 
 

@@ -23,7 +23,7 @@ from sparsedp.autodiff.tape_constants import constant, frozen
 from sparsedp.errors import ShapeError
 from sparsedp.interop.recording import owned, parts, recorded
 
-__all__ = ["from_torch", "to_torch"]
+__all__ = ["TorchFunction", "from_torch", "to_torch"]
 
 SAME = "; return the same entries each time"
 
@@ -100,13 +100,13 @@ def _bridged(fun, tree):
     def of_arrays(arrays):
         return fun(rebuild(placed(constants, places, arrays)))
 
-    result: list = []  # filled by `_Call.forward`, which can return tensors only
-    outputs = _Call.apply(of_arrays, result, *tensors)
+    result: list = []  # filled by `_TorchNode.forward`, which can return tensors only
+    outputs = _TorchNode.apply(of_arrays, result, *tensors)
     values, output_places, rebuild_result = result
     return rebuild_result(placed(values, output_places, outputs))
 
 
-class _Call(torch.autograd.Function):
+class _TorchNode(torch.autograd.Function):
     """A function of arrays as a node of torch's graph."""
 
     @staticmethod
@@ -198,7 +198,7 @@ def _conjugated(g):
 # ---- functions of torch on our tape ----------------------------------------------------------------------------------
 
 
-def from_torch(function: Callable) -> Callable:
+def from_torch(function: Callable) -> TorchFunction:
     """Return a function of torch tensors, or a module, as a function of arrays, differentiable by this library.
 
     Parameters
@@ -208,10 +208,10 @@ def from_torch(function: Callable) -> Callable:
 
     Returns
     -------
-    callable
-        Takes and returns arrays instead of tensors. For a module the first argument is a dict of its parameters as
-        arrays: ``net(net.parameters, x)``; ``net.parameters`` are copies of the parameters of the module. Parameters
-        that are missing in a dict are taken from the module, as constants.
+    TorchFunction
+        A callable that takes and returns arrays instead of tensors. For a module the first argument is a dict of its
+        parameters as arrays: ``net(net.parameters, x)``; ``net.parameters`` are copies of the parameters of the module.
+        Parameters that are missing in a dict are taken from the module, as constants.
 
     Raises
     ------
@@ -282,8 +282,27 @@ def from_torch(function: Callable) -> Callable:
         results = _rule(graph, *entries)
         return rebuild_result(parts(results, len(graph.outputs)))
 
-    vars(call)["parameters"] = parameters
-    return ReconstructibleFunction(call, from_torch, function)
+    return TorchFunction(call, function, parameters)
+
+
+class TorchFunction(ReconstructibleFunction):
+    """A torch function of arrays, as `from_torch` returns it.
+
+    Parameters
+    ----------
+    call : callable
+        The function of arrays.
+    function : callable or torch.nn.Module
+
+    Attributes
+    ----------
+    parameters : dict
+        Copies of the parameters of a module by name; empty for other functions.
+    """
+
+    def __init__(self, call: Callable, function: Callable, parameters: dict[str, Any]) -> None:
+        super().__init__(call, from_torch, function)
+        self.parameters = parameters
 
 
 class _Graph:

@@ -81,7 +81,7 @@ def page(title: str, verdict: str, meaning: str, sections: Sequence[str], skippe
     sections : sequence of str
         From `section`.
     skipped : sequence of str
-        Sentences about what was left out.
+        Sentences about what was skipped.
     """
     return f"""<!doctype html>
 <html lang="en">
@@ -95,7 +95,7 @@ def page(title: str, verdict: str, meaning: str, sections: Sequence[str], skippe
 <h1>{cell(title)}</h1>
 <p class="verdict {verdict}"><strong>{verdict}</strong>. {cell(meaning)}</p>
 {"".join(sections)}
-{folded("What this report left out", skipped)}
+{folded("What this report skipped", skipped)}
 <script>{SORTING}</script>
 </body>
 </html>

@@ -111,7 +111,7 @@ def work_precision(
     scene : str, optional
         Default: the name of `problem`.
     skip : callable, optional
-        ``skip(method, settings)`` -> the reason why a run is left out, or None.
+        ``skip(method, settings)`` -> the reason why a run is skipped, or None.
     seed : int
         Noted in every row; passed to the problem by the caller.
 

@@ -171,7 +171,7 @@ def test_a_kink_without_a_derivative_is_refused():
     """Three equal numbers: no linear map is the derivative of the largest of three."""
     largest = dp.from_blackbox(lambda x: np.array([np.max(x.real)]), name="largest")
     assert np.allclose(largest.jacobian(np.array([1.0, 3.0, 2.0])).toarray(), [[0, 1, 0]])
-    with pytest.raises(DerivativeError, match=r"the Jacobian of largest .* in row 0"):
+    with pytest.raises(DerivativeError, match="row 0 of the Jacobian of largest .* does not agree"):
         largest.jacobian(np.ones(3))
 
 

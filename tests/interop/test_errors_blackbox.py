@@ -1,4 +1,4 @@
-"""What an adopted function refuses: each message, whole."""
+"""Errors of functions of `from_blackbox`: each message, whole."""
 
 import autograd.numpy as anp
 import numpy as np
@@ -43,7 +43,7 @@ WRONG = [
     (
         first(lambda x: x * x[::-1], sparsity=np.eye(2), name="swap"),
         DerivativeError,
-        "the Jacobian of swap by complex step misses in row 0 what a difference along a random direction sees; its "
+        "row 0 of the Jacobian of swap by complex step does not agree with a difference along a random direction; its "
         "sparsity lacks entries, or it has a kink at x: leave sparsity and derivative out, or move x a little",
     ),
     (first(np.sin, (np.nan, 1.0)), NonFiniteError, "the argument of sin must be finite, got 1 that are NaN"),
@@ -51,20 +51,23 @@ WRONG = [
     (
         first(np.sqrt, (0.0, 1.0), derivative="difference"),
         NonFiniteError,
-        "what differences of sqrt close to x give must be finite, got .*; move x a little",
+        "the differences of sqrt near x must be finite, got .*; move x a little",
     ),
     (
         first(lambda x: x * 1j, name="turn"),
         TypeError,
         "turn must return real numbers, got dtype complex128; take the real part",
     ),
-    (other_shape, ShapeError, r"sin was adopted from \(2,\) to \(2,\), got \(3,\) to \(3,\); adopt it again"),
+    (
+        other_shape,
+        ShapeError,
+        r"sin maps \(2,\) to \(2,\), got \(3,\) to \(3,\); call from_blackbox again for other shapes",
+    ),
     (
         second,
         DerivativeError,
-        "sin is adopted: its Jacobian is known, its second derivative is not; use a method with first "
-        "derivatives, or write "
-        "the function with autograd.numpy",
+        "sin is a black box without second derivatives; use a method with first derivatives, or write the function "
+        "with autograd.numpy",
     ),
 ]
 

@@ -115,12 +115,12 @@ def test_the_report(scene, tmp_path, capsys):
     page = (out / "report.md").read_text(encoding="utf-8")
     assert page.startswith("# poisson: agrees")
     assert "fastest at a gradient error of 1 %: direct" in page
-    assert "left out: multigrid hierarchy" in page and "left out: 10^4 steps" in page
+    assert "skipped: multigrid hierarchy" in page and "skipped: 10^4 steps" in page
     assert "may stop at" in page
     assert (
         "of 1 %: direct (cells=16, method=direct), " in page and "no method reaches a gradient error of 0.1 %" in page
     )
-    places = "## Which method for which error?", "fastest at", "## Work of one gradient", "left out: multigrid"
+    places = "## Which method for which error?", "fastest at", "## Work of one gradient", "skipped: multigrid"
     assert sorted(places, key=page.index) == list(places)  # each sentence stands under its question
     assert "[audit.md](audit.md)" in page and "[point_load.csv](point_load.csv)" in page
     table = (out / "point_load.md").read_text(encoding="utf-8")
@@ -140,7 +140,7 @@ def test_the_report(scene, tmp_path, capsys):
     assert whole.count('src="data:image/png;base64,') == len(drawn) and ("<polyline" in whole) == (not drawn)
     assert not re.search(r"https?:|@import|url\(|<link|src=\"(?!data:)", whole)  # one file, no network
     assert whole.count("<section>") == 5 and "<tbody>\n</tbody>" not in whole
-    assert "<li>multigrid hierarchy" in whole.partition("<summary>What was left out</summary>")[2]
+    assert "<li>multigrid hierarchy" in whole.partition("<summary>What was skipped</summary>")[2]
     assert main(["report", str(scene), "--out", str(out)]) == 2
     assert "is there already; name another folder with --out, or write --force" in capsys.readouterr().err
     assert main(["report", f"{scene}:wrong", "--out", str(out), "--force"]) == 1

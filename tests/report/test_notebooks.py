@@ -112,12 +112,12 @@ def test_audit_with_its_curves():
     assert len(list(tree.iter("tr"))) == len(audit.lines) + len({row["step"] for row in audit.rows}) + 2
 
 
-def test_plan_folds_what_was_left_out():
+def test_plan_folds_what_was_skipped():
     plan = dp.explain(lambda u: anp.sum(dp.laplacian(GRID)(u) ** 2), np.ones(GRID.shape))
     tree = shown(plan)
     [folded] = tree.iter("details")
     assert [line.text for line in folded.iter("li")] == list(plan.skipped)
-    assert "left out" not in "".join("".join(part.itertext()) for part in tree.iter("p"))
+    assert "skipped:" not in "".join("".join(part.itertext()) for part in tree.iter("p"))
 
 
 def test_work_precision_table():

@@ -243,7 +243,7 @@ def test_the_result_as_data_and_text(stable):
     assert data["counts"] == result.counts and len(data["rows"]) == len(result.rows)
     assert sum(result.counts.values()) == len(result.rows)
     assert len(result.csv().splitlines()) == len(result.rows) + 1
-    assert "| group |" in result.markdown() and "left out" in result.markdown()
+    assert "| group |" in result.markdown() and "skipped" in result.markdown()
     assert str(result).endswith(result.summary) and str(result.map) in str(result)
     assert np.shape(data["map"]["factors"]) == (9, 9)
 

@@ -209,8 +209,8 @@ def test_words_pictures_and_refusals(tmp_path):
     found = table(skip=lambda method, s: "too slow here" if (method, s["cells"]) == ("krylov", 16) else None)
     assert len(found.rows) == 3 and found.skipped == ["krylov with cells=16, method=krylov, rtol=1e-08: too slow here"]
     text = found.markdown()
-    assert text.startswith("### poisson") and "| * |" in text and "- left out: krylov with" in text
-    assert "left out: krylov" in str(found) and repr(found) == str(found)
+    assert text.startswith("### poisson") and "| * |" in text and "- skipped: krylov with" in text
+    assert "skipped: krylov" in str(found) and repr(found) == str(found)
     assert "| method | cells | unknowns |" in text and "| direct | 16 |" in text  # what tells two rows apart is shown
     assert re.search(r"^ *method +cells +unknowns", str(found), re.MULTILINE)
     paths = [path.name for path in found.save(tmp_path / "out")]
