@@ -34,6 +34,7 @@ html_math_renderer = "mathml"  # formulas.py: no script, no fonts to fetch
 
 # The API, from docstrings.
 default_role = "code"
+smartquotes_action = "D"  # dashes alone: quotes in tables of options are code
 # The bridges have pages without their libraries. One that is installed is imported: other libraries look at it.
 autodoc_mock_imports = [name for name in ("jax", "torch", "xarray") if find_spec(name) is None]
 autodoc_member_order = "bysource"
@@ -86,6 +87,7 @@ def setup(app):
     gallery_scripts.stage()
     gallery_scripts.let_processes_in()
     app.connect("autodoc-process-docstring", docstrings.rewrite, priority=400)  # before napoleon
+    app.connect("autodoc-process-docstring", docstrings.link, priority=600)  # after it
     app.connect("viewcode-follow-imported", docstrings.defined_in)
     app.connect("builder-inited", gallery_scripts.thumbnails, priority=900)  # after sphinx-gallery has run the examples
     app.connect("builder-inited", gallery_scripts.measured, priority=910)

@@ -7,7 +7,7 @@ from functools import reduce
 import sparsedp
 
 CODE = r"(``.*?``|`[^`]*`)"
-VALUES = ("attribute", "data", "property")  # napoleon takes the text before a colon in their first line for a type
+LABEL = re.compile(r"[A-Z][\w ,]{2,24}: ")  # of a paragraph in the notes
 
 
 def plain(line):
@@ -19,35 +19,47 @@ def plain(line):
 
 
 def rewrite(app, what, name, thing, options, lines):
-    """Text is not markup, names of See Also are links with a summary. Examples and literal blocks stay as they are."""
+    """Text is not markup, See Also gets summaries, and paragraphs with a label are apart.
+
+    Examples and literal blocks stay as they are. Napoleon takes the text before a colon in the first line of a property
+    for its type: an empty word in front makes it a part of the text.
+    """
     result = []
     example = literal = False
     for line in lines:
         example = line.lstrip().startswith(">>>") or (example and bool(line.strip()))
         literal = literal and (not line.strip() or line.startswith(" "))
+        if LABEL.match(line) and result and result[-1].endswith((".", ":")):
+            result.append("")
         result.append(line if example or literal else plain(line))
         literal = literal or (line.endswith("::") and not example)
-    if what in VALUES and ":" in lines[0]:
+    if what in ("attribute", "property") and lines and ":" in lines[0]:
         result.insert(0, "\\ ")
-    lines[:] = with_links(result)
+    lines[:] = with_summaries(result)
 
 
-def see_also(text):
-    """Names in the section See Also of a docstring."""
-    found = re.search(r"(?m)^See Also\n-{3,}\n((?:.+\n?)+)", text)
-    return [name.strip() for name in found[1].replace("\n", " ").split(",")] if found else []
-
-
-def with_links(lines):
-    """Replace the section See Also by links, each with the first line of the docstring that it leads to."""
+def see_also(lines):
+    """Return where the names in the section See Also begin and end, and the names."""
     if "See Also" not in lines:
-        return lines
-    start = lines.index("See Also")
+        return 0, 0, []
+    start = lines.index("See Also") + 2
     end = next((index for index in range(start, len(lines)) if not lines[index].strip()), len(lines))
-    links = [".. seealso::", ""]
-    for name in see_also("\n".join(lines[start:end])):
-        links += [f"   :obj:`{name} <sparsedp.{name}>`", f"      {plain(summary(name))}", ""]
-    return [*lines[:start], *links, *lines[end:]]
+    return start, end, [name.strip() for name in " ".join(lines[start:end]).split(",")]
+
+
+def with_summaries(lines):
+    """Give each name of the section See Also the first line of the docstring that it leads to."""
+    start, end, names = see_also(lines)
+    return [*lines[:start], *(f"{name} : {plain(summary(name))}" for name in names), *lines[end:]]
+
+
+def link(app, what, name, thing, options, lines):
+    """Let the names of See Also, which are public names, lead to their pages from every module; after napoleon."""
+    if ".. seealso::" not in lines:
+        return
+    start = lines.index(".. seealso::")
+    for index in range(start, len(lines)):
+        lines[index] = re.sub(r"^ +:(?:py:)?obj:`([\w.]+)`$", r"   :obj:`\1 <sparsedp.\1>`", lines[index])
 
 
 def summary(name):

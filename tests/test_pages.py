@@ -6,6 +6,7 @@ without an error, at the widths of a phone and of a desk, with its formulas and 
 
 import functools
 import importlib.util
+import inspect
 import os
 import re
 import shutil
@@ -17,6 +18,7 @@ from urllib.parse import unquote, urlsplit
 import pytest
 from pages import SHELL, blocks, check_install, commands, run_blocks
 from sources import ROOT
+from test_docstrings import names_with_a_page, see_also
 
 import sparsedp
 from sparsedp.__main__ import main
@@ -173,6 +175,39 @@ def test_every_example_and_name_has_a_page(site):
     assert len(thumbnails) >= len(examples)
 
 
+@pytest.mark.slow
+def test_related_names_are_links_with_summaries(site):
+    for name, value in names_with_a_page().items():
+        text = (site / "api" / f"sparsedp.{name}.html").read_text(encoding="utf-8")
+        box = text.partition('class="admonition seealso"')[2].partition("</div>")[0]
+        pages = re.findall(r'<dt><a class="reference internal" href="sparsedp\.([\w.]+)\.html#', box)
+        assert pages == see_also(inspect.getdoc(value)) and box.count("<dd><p>") == len(pages), name
+
+
+@pytest.mark.whole
+def test_a_card_is_one_panel_of_readable_size(tmp_path, monkeypatch):
+    """With its labels, without the panels beside it and their colour bars."""
+    for module in ("sphinx_gallery", "matplotlib"):
+        pytest.importorskip(module)
+    from matplotlib import pyplot
+    from PIL import Image
+
+    monkeypatch.syspath_prepend(DOCS)
+    gallery_scripts = importlib.import_module("gallery_scripts")
+    monkeypatch.setattr(gallery_scripts, "CARDS", tmp_path)
+    monkeypatch.setattr(gallery_scripts, "PANELS", {"second": 1})
+    for panel, name in enumerate(("first", "second")):
+        figure, places = pyplot.subplots(1, 2, figsize=(13, 3), layout="constrained")
+        places[0].loglog([1.0, 10.0], [1.0, 2.0])
+        figure.colorbar(places[1].imshow([[0.0, 1.0]]), ax=places[1])
+        gallery_scripts.draw_card(name)
+        assert figure.axes == [places[panel]] and tuple(figure.get_size_inches()) == gallery_scripts.CARD_SIZE
+        box = figure.axes[0].get_tightbbox()
+        assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= figure.bbox.x1 and box.y1 <= figure.bbox.y1
+        pyplot.close("all")
+        assert Image.open(tmp_path / f"{name}.png").size == (600, 420)
+
+
 @pytest.fixture(scope="session")
 def browser():
     if CHROMIUM is None or importlib.util.find_spec("playwright") is None:
@@ -196,25 +231,39 @@ def opened(browser, width):
     return tab, wrong
 
 
-LOOK = """() => ({
-    over: document.documentElement.scrollWidth - document.documentElement.clientWidth,
-    broken: [...document.images].filter(i => i.complete && !i.naturalWidth).map(i => i.src),
-    flat: [...document.querySelectorAll("article math")].filter(m => m.getBoundingClientRect().height < 5).length,
-    cut: [...document.querySelectorAll("article .highlight pre")].filter(e => e.scrollWidth > e.clientWidth + 1)
-        .map(e => e.textContent.slice(0, 60)),
-})"""
+LOOK = """() => {
+    const scrolls = element => ["auto", "scroll"].includes(getComputedStyle(element).overflowX);
+    const inner = element => element.parentElement.closest("article *");
+    const scrollable = element => element && (scrolls(element) || scrollable(inner(element)));
+    const text = element => element.tagName + " " + element.textContent.slice(0, 60);
+    const output = element => element.closest(".sphx-glr-script-out");
+    return {
+        over: document.documentElement.scrollWidth - document.documentElement.clientWidth,
+        broken: [...document.images].filter(i => i.complete && !i.naturalWidth).map(i => i.src),
+        flat: [...document.querySelectorAll("article math")].filter(m => m.getBoundingClientRect().height < 5).length,
+        cut: [...document.querySelectorAll("article .highlight pre")]
+            .filter(e => e.scrollWidth > e.clientWidth + 1 && !(output(e) && scrolls(e))).map(text),
+        beyond: [...document.querySelectorAll("article :is(p, li, dd, dt, pre, table, img, h1, h2, h3)")]
+            .filter(e => e.getBoundingClientRect().right > innerWidth + 1 && !scrollable(inner(e))).map(text),
+    };
+}"""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("width", WIDTHS)
 def test_in_a_browser(site, browser, width):
-    """No error, no picture missing, no formula without a height, no code cut, nothing wider than the window."""
+    """No error, no picture missing, no formula without a height, no code cut, nothing wider than the window.
+
+    Tables and what an example printed scroll in their own box.
+    """
     tab, wrong = opened(browser, width)
     found = []
     for path in pages(site):
         tab.goto(path.as_uri())
         seen = tab.evaluate(LOOK)
-        found += [f"{path.relative_to(site)}: {what}" for what in (*wrong, *seen["broken"], *seen["cut"])]
+        found += [
+            f"{path.relative_to(site)}: {what}" for what in (*wrong, *seen["broken"], *seen["cut"], *seen["beyond"])
+        ]
         found += [f"{path.relative_to(site)}: {key} {seen[key]}" for key in ("over", "flat") if seen[key] > 0]
         wrong.clear()
     tab.close()

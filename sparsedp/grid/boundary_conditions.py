@@ -254,7 +254,7 @@ no_slip = FlowCondition(
     True,
     dirichlet,
     neumann,
-    """Make a fluid stick to a wall: nothing passes, and at the wall the fluid has the velocity of the wall.
+    """Make a fluid stick to a wall, where it has the velocity of the wall.
 
     With v the component of the velocity across the wall, w one along it (w_c half a cell of width h away from the
     wall), p the pressure and n pointing outwards::
@@ -284,7 +284,7 @@ free_slip = FlowCondition(
     True,
     neumann,
     neumann,
-    """Let a fluid slip along a wall: nothing passes, and the wall exerts no friction.
+    """Let a fluid slip along a wall that nothing passes, without friction.
 
     With v the component of the velocity across the wall, w one along it, p the pressure and n pointing outwards::
 
@@ -313,7 +313,7 @@ inflow = FlowCondition(
     False,
     dirichlet,
     neumann,
-    """Prescribe the velocity of the fluid on a side: what the faces of the side hold is kept.
+    """Prescribe the velocity of a fluid on a side, as the faces of the side hold it.
 
     With v the component of the velocity across the side, w one along it (w_c half a cell of width h away from the
     side), p the pressure and n pointing outwards::
@@ -347,7 +347,7 @@ outflow = FlowCondition(
     False,
     neumann,
     dirichlet,
-    """Open a side to a fluid: the flow through it is computed, and the pressure there is 0.
+    """Open a side to a fluid, with the pressure 0 there and a flow that is computed.
 
     With w a component of the velocity along the side, p the pressure (p_c in the cell beside the side, h the width of
     this cell) and n pointing outwards::
