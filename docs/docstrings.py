@@ -14,7 +14,7 @@ def plain(line):
     """Bars, stars and an underscore at the end of a word are text, outside of code; a page in docs/ is a link."""
     parts = re.split(CODE, line, flags=re.DOTALL)
     parts[::2] = [re.sub(r"([|*]|(?<=\w)_(?!\w))", r"\\\1", part) for part in parts[::2]]
-    parts[::2] = [re.sub(r"\bdocs/(\w+)\.md\b", r":doc:`/\1`", part) for part in parts[::2]]
+    parts[::2] = [re.sub(r"\bdocs/([\w/]+)\.md\b", r":doc:`/\1`", part) for part in parts[::2]]
     return "".join(parts)
 
 

@@ -50,6 +50,13 @@ def test_every_public_name_is_on_the_page_of_the_api():
     assert sorted(listed) == sorted([*public, *(f"{room}.{name}" for room in rooms for name in rooms[room])])
 
 
+def test_pages_that_docstrings_name_exist():
+    sources = [path.read_text(encoding="utf-8") for path in (ROOT / "sparsedp").rglob("*.py")]
+    named = {page for text in sources for page in re.findall(r"\bdocs/[\w/]+\.md\b", text)}
+    assert "docs/guides/complex_numbers.md" in named
+    assert [page for page in sorted(named) if not (ROOT / page).is_file()] == []
+
+
 def test_fractions_have_braces():
     r"""Sphinx's MathML takes \frac12 x for twelve over x."""
     for path in [*DOCS.glob("*.md"), *DOCS.glob("*.rst"), *(ROOT / "examples").glob("*.py")]:

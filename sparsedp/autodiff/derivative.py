@@ -496,6 +496,7 @@ def jvp(fun: Callable, x: Any, tangent: Any) -> tuple:
     Notes
     -----
     Forward mode, or two reverse passes if a part of `fun` has no forward derivative.
+    Complex numbers: see docs/guides/complex_numbers.md.
 
     Examples
     --------
@@ -552,6 +553,10 @@ def hvp(loss: Callable, x: Any, tangent: Any) -> Any:
     See Also
     --------
     value_and_grad, jvp
+
+    Notes
+    -----
+    Complex numbers: see docs/guides/complex_numbers.md.
 
     Examples
     --------
@@ -644,7 +649,7 @@ def vjp(fun: Callable, *x: Any) -> tuple[Any, Callable]:
 
     Notes
     -----
-    Complex numbers: cotangents are dL/dRe - i dL/dIm, see "Complex numbers" in docs/ideas.md.
+    Complex numbers: cotangents are dL/dRe - i dL/dIm, see docs/guides/complex_numbers.md.
 
     Examples
     --------
@@ -701,6 +706,10 @@ def grad(loss: Callable, argnum: int = 0) -> Callable:
     --------
     value_and_grad
 
+    Notes
+    -----
+    Complex numbers: see docs/guides/complex_numbers.md.
+
     Examples
     --------
     >>> grad(lambda x: x**2)(3.0)
@@ -750,7 +759,7 @@ def value_and_grad(loss: Callable, argnum: int = 0) -> Callable:
 
     Notes
     -----
-    Complex numbers: the gradient in a complex leaf is dL/dRe - i dL/dIm, see "Complex numbers" in docs/ideas.md.
+    Complex numbers: the gradient in a complex leaf is dL/dRe - i dL/dIm, see docs/guides/complex_numbers.md.
     The caller, and the loss between two calls, may write into `x` and into constant arrays (``work[:] = c`` in a loop):
     what the backward pass needs is copied. An array that is read-only with all its memory is not copied;
     ``mask.flags.writeable = False`` saves the time of one product with the mask for each call. Other objects,

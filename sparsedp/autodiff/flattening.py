@@ -51,6 +51,10 @@ def flatten(tree: Any) -> tuple[np.ndarray, Callable]:
     --------
     minimize
 
+    Notes
+    -----
+    Complex numbers: see docs/guides/complex_numbers.md.
+
     Examples
     --------
     >>> vector, unflatten = flatten({"u": np.array([1.0, 2.0]), "k": 3.0})

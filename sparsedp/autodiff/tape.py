@@ -755,6 +755,7 @@ def differentiable(
     -----
     `vjp` gets read-only copies of the arrays in `args` that are not traced, also of those in tuples, lists and dicts:
     a caller may write into them before the backward pass. Other objects must stay as they are.
+    Complex numbers: see docs/guides/complex_numbers.md.
 
     Examples
     --------

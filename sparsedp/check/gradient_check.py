@@ -125,6 +125,8 @@ def gradient(
     point (unstable step, no convergence, not finite, a ValueError) makes that step unusable. At a kink
     central differences prove nothing, and the verdict is inconclusive.
 
+    Complex numbers: see docs/guides/complex_numbers.md.
+
     Examples
     --------
     >>> import autograd.numpy as anp

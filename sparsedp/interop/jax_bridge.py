@@ -65,6 +65,7 @@ def to_jax(f: Callable, like: Any = None) -> Callable:
     Only the arguments whose derivatives JAX asks for are differentiated, in reverse mode to every order. There is no
     forward mode, as in ``jax.hessian``, ``jacfwd`` and ``jvp``: the Hessian is ``jax.jacrev(jax.grad(f))``. JAX cannot
     keep the tape of f, so the backward pass runs f a second time.
+    Complex numbers: see docs/guides/complex_numbers.md.
 
     Examples
     --------
@@ -283,6 +284,7 @@ def from_jax(function: Callable) -> Callable:
     JAX compiles the function at the first call with each set of shapes. The VJP is ``jax.vjp``, which runs the function
     again, and the JVP is ``jax.jvp``; derivatives of every order are supported. Only traced arguments are
     differentiated.
+    Complex numbers: see docs/guides/complex_numbers.md.
 
     Examples
     --------

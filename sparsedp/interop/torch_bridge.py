@@ -62,9 +62,9 @@ def to_torch(f: Callable) -> Callable:
     -----
     Tensors and arrays share their memory; a result is copied where f may know its memory. f runs once for a value and
     its gradient, and a second time for a gradient of the gradient (``create_graph=True``). Derivatives of every order
-    are supported; f must return the same result for the same arguments. Gradients in complex numbers are torch's,
-    dL/dRe + i dL/dIm, see "Complex numbers" in docs/ideas.md. ``torch.func`` and forward mode are not supported; torch
-    raises an error.
+    are supported; f must return the same result for the same arguments. ``torch.func`` and forward mode are not
+    supported; torch raises an error.
+    Complex numbers: gradients are those of torch, dL/dRe + i dL/dIm, see docs/guides/complex_numbers.md.
 
     Examples
     --------
@@ -233,6 +233,8 @@ def from_torch(function: Callable) -> TorchFunction:
 
     The function runs once for its value and its derivatives of every order, also if it draws random numbers (dropout).
     Only traced arguments are differentiated. Derivatives are in reverse mode: `jvp` takes two passes.
+
+    Complex numbers: see docs/guides/complex_numbers.md.
 
     Examples
     --------

@@ -64,6 +64,10 @@ def from_matrix(matrix: ArrayLike, domain: Any = None, codomain: Any = None, nam
     --------
     from_functions, from_linear_operator, Operator
 
+    Notes
+    -----
+    Complex numbers: see docs/guides/complex_numbers.md.
+
     Examples
     --------
     >>> rows = from_matrix([[1.0, 2.0], [0.0, 3.0]])
@@ -197,6 +201,10 @@ def from_functions(
     See Also
     --------
     from_matrix, from_linear_operator, Operator
+
+    Notes
+    -----
+    Complex numbers: see docs/guides/complex_numbers.md.
 
     Examples
     --------

@@ -203,6 +203,10 @@ def diagonal(space: Space, values: ArrayLike) -> Operator:
     --------
     mask, identity
 
+    Notes
+    -----
+    Complex numbers: see docs/guides/complex_numbers.md.
+
     Examples
     --------
     >>> from sparsedp import Grid

@@ -58,6 +58,10 @@ class Operator(Frozen, Reconstructible):
     --------
     from_matrix, from_functions, from_linear_operator, inverse, check.operator
 
+    Notes
+    -----
+    Complex numbers: see docs/guides/complex_numbers.md.
+
     Examples
     --------
     >>> import numpy as np

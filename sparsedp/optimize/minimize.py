@@ -186,6 +186,10 @@ def minimize(
     value_and_grad, update_direction, physical_gradient, smoothness, total_variation, certified, convergence, flatten,
     ensemble
 
+    Notes
+    -----
+    Complex numbers: see docs/guides/complex_numbers.md.
+
     Examples
     --------
     >>> import autograd.numpy as anp

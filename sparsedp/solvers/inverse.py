@@ -120,6 +120,7 @@ def inverse(
     that is triangular in some order, such as a chain or upwind differences, takes one pass over its entries.
     Memory: the coarsest level of "multigrid" is a dense matrix of at most 2000 unknowns; a larger one is refused.
     Threads: several may solve at once, to the same bits; `inv.info` is of the solve that ended last.
+    Complex numbers: see docs/guides/complex_numbers.md.
 
     Examples
     --------

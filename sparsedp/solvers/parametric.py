@@ -217,6 +217,8 @@ def elliptic_solver(
     **Tensors.** The discretisation is of order 2. Where G has no slope (a closed wall, an obstacle) the flux is 0, not
     the slope; see operators/tensor.py.
 
+    Complex numbers: see docs/guides/complex_numbers.md.
+
     Examples
     --------
     >>> from sparsedp import Grid, dirichlet, divergence, gradient, value_and_grad
@@ -494,6 +496,8 @@ def matrix_solver(
 
     **Cost.** One set-up for each new content of data, one solve, and one adjoint solve for the derivatives in data and
     b. The memory is proportional to the number of entries: no outer product is formed.
+
+    Complex numbers: see docs/guides/complex_numbers.md.
 
     Examples
     --------
