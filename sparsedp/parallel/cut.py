@@ -27,7 +27,7 @@ from sparsedp.operators.structure.factor import Factor
 from sparsedp.operators.structure.kronecker import Kronecker, Term
 from sparsedp.operators.structure.lazy import Chain, Diagonal, Mask, Sum
 from sparsedp.parallel.exchange import Exchange, exchange_of_boxes
-from sparsedp.parallel.partition import Box, Partition, Shapes, lengths, slices
+from sparsedp.parallel.partition import Box, Partition, Shapes, lengths, partition_of, slices
 from sparsedp.solvers.inverse import Solution
 from sparsedp.solvers.nullspace import Projector
 
@@ -42,10 +42,9 @@ UNLIMITED = np.iinfo(int).max  # as an end of a side that nothing has limited ye
 
 def storage(space: Space) -> Storage:
     """Return where the fields on a space are stored."""
-    layout: Any = space.backend
-    if layout.whole_fields:
+    if space.backend.whole_fields:
         return None
-    return layout, space.parts
+    return partition_of(space), space.parts
 
 
 def local_structure(structure: Structure, source: Storage, target: Storage) -> Structure:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
+from sparsedp.grid.space import Space
 from sparsedp.operators.given import from_matrix
 from sparsedp.operators.operator import Operator
 from sparsedp.parallel.cut import storage
 from sparsedp.parallel.stencil import Stencil, find_stencil
 from sparsedp.solvers.jacobian import Jacobians, KnownPattern, probing_points
+from sparsedp.solvers.newton import Equation
 
 __all__ = ["RanksJacobians"]
 
@@ -24,7 +27,7 @@ class RanksJacobians(Jacobians):
     def _assembled(self, pattern, product, unknowns):
         return pattern.coloured.operator(product, self.solver_name), False
 
-    def _on_unknowns(self, op: Operator, space: Any) -> Operator:
+    def _on_unknowns(self, op: Operator, space: Space) -> Operator:
         if storage(op.domain) == storage(op.codomain) == storage(space):
             return op
         return from_matrix(op.matrix, space, space, op.name)
@@ -37,7 +40,9 @@ class RanksJacobians(Jacobians):
         structure: Any = linearisation.solver.system.unscaled.structure
         self._find_stencil(equation, [x], leaves, structure.stencil)
 
-    def _find_stencil(self, equation: Any, points: Any, leaves: Any, incomplete: Stencil | None) -> KnownPattern:
+    def _find_stencil(
+        self, equation: Equation, points: Sequence[Any], leaves: Sequence[Any], incomplete: Stencil | None
+    ) -> KnownPattern:
         """Find and store the stencil of these unknowns; entries are added to an incomplete one."""
         unknowns = equation.unknowns
         self.description = f"the rows of each rank, {unknowns.backend}"

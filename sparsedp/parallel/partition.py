@@ -12,16 +12,16 @@ from collections.abc import Sequence
 from functools import cached_property
 from itertools import product
 from math import prod
-from typing import Any, NoReturn, TypeAlias
+from typing import Any, NoReturn, TypeAlias, cast
 
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import ArrayLike, NDArray
 
-from sparsedp.operators.structure.kronecker import components
+from sparsedp.grid.space import Space, components
 from sparsedp.parallel.agreement import Agreement
 
-__all__ = ["Box", "Partition", "Shapes", "lengths", "slices"]
+__all__ = ["Box", "Partition", "Shapes", "lengths", "partition_of", "slices"]
 
 Box: TypeAlias = Sequence[tuple[int, int]]
 Shapes: TypeAlias = Sequence[tuple[int, ...]]
@@ -157,6 +157,11 @@ class Partition:
     def min(self, number: ArrayLike) -> Any:
         """Return the least number of all ranks; NaN if one is NaN."""
         return self.agreement.reduce(number, np.minimum)
+
+
+def partition_of(space: Space) -> Partition:
+    """Return the partition of a space whose fields are distributed."""
+    return cast(Partition, space.backend)
 
 
 def lengths(box: Box) -> tuple[int, ...]:

@@ -173,29 +173,31 @@ class Ensemble(Reconstructible):
         check_leaves("x", x, containers=False)
         x = copied(x)  # the caller may write into arrays of x before a second derivative is computed
         entries = leaves(x)
-        moving = [place for place, leaf in enumerate(entries) if isbox(leaf)]
-        slopes: Any = []
+        variable_places = [place for place, leaf in enumerate(entries) if isbox(leaf)]
+        gradients: Any = []
 
         def total(task, values, tangents=None):
-            return self._sum(task, (_placed(x, moving, values), moving, tangents), numbers)
+            return self._sum(task, (_placed(x, variable_places, values), variable_places, tangents), numbers)
 
-        def value(*values):
-            nonlocal slopes
-            task = _slopes if values else _value
-            result, *slopes = total(task, values)
+        def forward(*values):
+            nonlocal gradients
+            task = _value
+            if values:
+                task = _value_and_gradients
+            result, *gradients = total(task, values)
             return result
 
-        def slopes_at(values):
+        def gradients_at(values):
             if any(map(isbox, values)):
                 return gradient(*values)
-            return slopes
+            return gradients
 
-        def along(nums, tangents, ans, *values):
-            at = slopes_at(values)
+        def jvp(nums, tangents, ans, *values):
+            at = gradients_at(values)
             return sum(anp.real(anp.sum(at[num] * tangent)) for num, tangent in zip(nums, tangents, strict=True))
 
-        def back(nums, ans, *values):
-            at = slopes_at(values)
+        def vjp(nums, ans, *values):
+            at = gradients_at(values)
 
             def pull(g):
                 return tuple(g * at[num] for num in nums)
@@ -203,18 +205,18 @@ class Ensemble(Reconstructible):
             return pull
 
         def gradient_at(*values):
-            return tuple(total(_slopes, values)[1:])
+            return tuple(total(_value_and_gradients, values)[1:])
 
         def hessian_product(*values_and_tangents):
-            values = values_and_tangents[: len(moving)]
-            tangents = values_and_tangents[len(moving) :]
-            return tuple(total(_curvature, values, tangents))
+            values = values_and_tangents[: len(variable_places)]
+            tangents = values_and_tangents[len(variable_places) :]
+            return tuple(total(_hessian_product, values, tangents))
 
-        def gradient_along(nums, tangents, ans, *values):
+        def gradient_jvp(nums, tangents, ans, *values):
             tangent_of = dict(zip(nums, tangents, strict=True))
             return hessian(*values, *(tangent_of.get(num, zero_like(leaf)) for num, leaf in enumerate(values)))
 
-        def gradient_back(nums, ans, *values):  # the Hessian is symmetric
+        def gradient_vjp(nums, ans, *values):  # the Hessian is symmetric
             def pull(g):
                 product = hessian(*values, *(g[num] for num in range(len(values))))
                 return tuple(product[num] for num in nums)
@@ -222,8 +224,8 @@ class Ensemble(Reconstructible):
             return pull
 
         hessian = Rule("ensemble", hessian_product)
-        gradient = Rule("ensemble", gradient_at, gradient_back, gradient_along)
-        return Rule("ensemble", value, back, along)(*(entries[place] for place in moving))
+        gradient = Rule("ensemble", gradient_at, gradient_vjp, gradient_jvp)
+        return Rule("ensemble", forward, vjp, jvp)(*(entries[place] for place in variable_places))
 
     def _sum(self, task, point, numbers):
         """Add up the results of a task over scenes, in their order."""
@@ -250,14 +252,14 @@ class Ensemble(Reconstructible):
     def _submitted(self, chunk):
         """Submit a task, with the pickled objects that some worker may not have."""
         task, loss, point, scenes, count = chunk
-        parcels = dict([loss, *(parcel for _, _, parcel in scenes)])
+        pickles = dict([loss, *(pickled for _, _, pickled in scenes)])
         held = [*self._held_keys.values()]
-        bodies = {}
-        for key, data in parcels.items():
+        data_of_key = {}
+        for key, data in pickles.items():
             if not held or any(key not in held_keys for held_keys in held):
-                bodies[key] = data
-        keys = [(n, weight, parcel[0]) for n, weight, parcel in scenes]
-        return self._executor.submit(_of_parcels, [*parcels], bodies, task, loss[0], point, keys, count)
+                data_of_key[key] = data
+        keys = [(n, weight, pickled[0]) for n, weight, pickled in scenes]
+        return self._executor.submit(_run_pickled, [*pickles], data_of_key, task, loss[0], point, keys, count)
 
     def _answer(self, chunk, future):
         """Return the result of a task; if its worker lacks an object, send the task again with all objects."""
@@ -274,19 +276,19 @@ class Ensemble(Reconstructible):
 
 # Read-only unpickled objects by key, with the solvers that they have set up; the last used is the last entry.
 _cache: OrderedDict = OrderedDict()
-_alone = RLock()  # a worker may have several threads
+_cache_lock = RLock()  # a worker may have several threads
 
 
-def _of_parcels(keys, bodies, task, loss, point, scenes, count):
+def _run_pickled(keys, data_of_key, task, loss, point, scenes, count):
     """Return the keys, the name of this worker, and the result of `_sum`, or None if the worker lacks an object."""
     worker = f"{node()} {os.getpid()}"
     unpickled = {}
-    with _alone:
+    with _cache_lock:
         for key in keys:
             if key not in _cache:
-                if key not in bodies:
+                if key not in data_of_key:
                     return keys, worker, None
-                _cache[key] = mapped(frozen, pickle.loads(bodies[key]))
+                _cache[key] = mapped(frozen, pickle.loads(data_of_key[key]))
             _cache.move_to_end(key)
             unpickled[key] = _cache[key]
         while len(_cache) > CACHED:
@@ -297,13 +299,13 @@ def _of_parcels(keys, bodies, task, loss, point, scenes, count):
 
 def _sum(task, loss, point, scenes, count):
     """Add up the results of a task over scenes (number, weight, scene), in their order."""
-    x, moving, tangents = point
+    x, variable_places, tangents = point
     total = None
     x = mapped(frozen, x)
-    values = [leaves(x)[place] for place in moving]
+    values = [leaves(x)[place] for place in variable_places]
     for number, weight, scene in scenes:
         try:
-            parts = task(partial(_loss_of_values, loss, scene, x, moving), values, tangents)
+            parts = task(partial(_loss_of_values, loss, scene, x, variable_places), values, tangents)
         except Exception as error:
             if error.args and not isinstance(error.args[0], str):
                 raise RuntimeError(f"scene {number} of {count} raised {type(error).__name__}: {error}") from error
@@ -314,9 +316,9 @@ def _sum(task, loss, point, scenes, count):
     return total
 
 
-def _loss_of_values(loss, scene, x, moving, values):
+def _loss_of_values(loss, scene, x, variable_places, values):
     """Return the loss of one scene, with other values at the variable leaves of x."""
-    return loss(_placed(x, moving, values), scene)
+    return loss(_placed(x, variable_places, values), scene)
 
 
 def _value(loss, values, tangents):
@@ -326,23 +328,23 @@ def _value(loss, values, tangents):
     return [float(value)]
 
 
-def _slopes(loss, values, tangents):
+def _value_and_gradients(loss, values, tangents):
     """Return the value and the gradient of a loss, as a task of `_sum`."""
     with unwarned():  # warnings are given for the gradient of the sum
-        value, slopes = value_and_grad(loss)(values)
-    return [value, *slopes]
+        value, gradients = value_and_grad(loss)(values)
+    return [value, *gradients]
 
 
-def _curvature(loss, values, tangents):
+def _hessian_product(loss, values, tangents):
     """Return the product of the Hessian of a loss with the tangents, as a task of `_sum`."""
     with unwarned():
         return jvp(grad(loss), values, list(tangents))[1]
 
 
-def _placed(x, moving, values):
+def _placed(x, variable_places, values):
     """Return a tree with other values at its variable leaves."""
     entries, rebuild = flatten(x)
-    return rebuild(placed(entries, moving, values))
+    return rebuild(placed(entries, variable_places, values))
 
 
 def _added(total, parts):
@@ -352,22 +354,22 @@ def _added(total, parts):
     return [a + b for a, b in zip(total, parts, strict=True)]
 
 
-def _packed(thing):
+def _packed(value):
     """Return a key for the pickled bytes of an object, and these bytes."""
-    data = _pickled(thing)
+    data = _pickled(value)
     return sha256(data).hexdigest(), data
 
 
-def _pickled(thing):
+def _pickled(value):
     """Pickle an object, by cloudpickle if pickle fails."""
     try:
-        return pickle.dumps(thing, 5)
+        return pickle.dumps(value, 5)
     except Exception as error:
         try:
             import cloudpickle
         except ImportError:
             raise TypeError(
-                f"ensemble cannot send {type(thing).__name__} to another process ({error}); write functions as a def "
+                f"ensemble cannot send {type(value).__name__} to another process ({error}); write functions as a def "
                 "at the top level of a module, or install cloudpickle"
             ) from error
-        return cloudpickle.dumps(thing, 5)
+        return cloudpickle.dumps(value, 5)

@@ -22,7 +22,7 @@ from sparsedp.operators.structure.base import Structure
 from sparsedp.operators.structure.lazy import Chain, Diagonal, Mask, Sum
 from sparsedp.parallel.cut import Rows
 from sparsedp.parallel.fields import DistributedField
-from sparsedp.parallel.partition import Partition
+from sparsedp.parallel.partition import Partition, partition_of
 from sparsedp.solvers.engine import Engine
 from sparsedp.solvers.nullspace import NullSpace
 from sparsedp.solvers.system import System
@@ -86,8 +86,7 @@ class RanksSystem(System):
     splitting = None
 
     def __init__(self, op: Operator, rtol: float = 1e-10, maxiter: int | None = None) -> None:
-        layout: Any = op.domain.backend
-        self.layout: Partition = layout
+        self.layout = partition_of(op.domain)
         self.parts = op.domain.parts
         self.seed = [7, self.layout.comm.rank]
         super().__init__(op, rtol, maxiter)

@@ -23,7 +23,7 @@ from sparsedp.operators.operator import Operator
 from sparsedp.operators.structure.base import Matrix
 from sparsedp.parallel.cut import Columns, OwnRows, Rows, reading
 from sparsedp.parallel.fields import DistributedField
-from sparsedp.parallel.partition import lengths
+from sparsedp.parallel.partition import lengths, partition_of
 from sparsedp.solvers.sparsity import (
     LARGEST_STENCIL,
     ColouredPattern,
@@ -61,7 +61,7 @@ def find_stencil(name: str, space: Space, products: Sequence[Product], incomplet
     TypeError
         If an unknown is coupled to too many others, or to distant ones.
     """
-    layout: Any = space.backend
+    layout = partition_of(space)
     index = _own_indices(space)
     shapes = _component_columns(space)
     cell_counts = _grid_column(space.grid.shape)
@@ -152,8 +152,7 @@ class Stencil(ColouredPattern):
             rows.append(row)
             columns.append(space.offsets[component] + np.ravel_multi_index(tuple(position), part))
             colours.append((vector[0] * component + vector[1:] @ position) % count)
-        layout: Any = space.backend
-        self.exchange, place = reading(np.concatenate(columns), layout, space.parts)
+        self.exchange, place = reading(np.concatenate(columns), partition_of(space), space.parts)
         colour_of_column = np.zeros(self.exchange.read.size, int)
         colour_of_column[place] = np.concatenate(colours)
         self.seeds = vector @ index % count

@@ -33,7 +33,7 @@ from sparsedp.kernels.fluxes import SCHEMES
 from sparsedp.parallel.agreement import Agreement
 from sparsedp.parallel.exchange import Exchange, exchange_of_boxes
 from sparsedp.parallel.fields import DistributedField, block
-from sparsedp.parallel.partition import Box
+from sparsedp.parallel.partition import Box, partition_of
 
 __all__ = ["TransportOnBlocks"]
 
@@ -45,7 +45,7 @@ class TransportOnBlocks:
 
     def __init__(self, settings: TransportSettings) -> None:
         self.settings = settings
-        self.layout: Any = settings.grid.backend
+        self.layout = partition_of(settings.space)
         self.walls = wall_space(settings)
         self.speed = remembering_last(self._speed)
         self.block_step = cache(partial(BlockStep, settings))
@@ -169,7 +169,7 @@ class BlockStep:
         unstable: str,
     ) -> None:
         grid = settings.grid
-        layout: Any = grid.backend
+        layout = partition_of(settings.space)
         spans, sides = _widened_box(settings, layout.box(grid.shape), width)
         index = [np.arange(*span) % max(n, 1) for span, n in zip(spans, grid.shape, strict=True)]
         widths = [h[i] for h, i in zip(grid.widths, index, strict=True)]
@@ -249,8 +249,7 @@ def _inflow(settings, move, spans):
                 if is_wall:
                     places.append(place.reshape(-1))
     walls = wall_space(settings)
-    layout: Any = settings.grid.backend
-    exchange = exchange_of_boxes(layout, walls.parts, boxes)
+    exchange = exchange_of_boxes(partition_of(walls), walls.parts, boxes)
     return _widening(walls, exchange, move.walls.shape, np.concatenate(places))
 
 
