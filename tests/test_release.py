@@ -13,9 +13,12 @@ import pytest
 from pages import tomllib
 from sources import ROOT
 
+import sparsedp
+
 yaml = pytest.importorskip("yaml", reason='pyyaml is not installed: python -m pip install -e ".[test]"')
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+SETTINGS = (".toml", ".cff", ".cfg", ".md", ".in")
 SMOKE = """
 from pathlib import Path
 import autograd.numpy as np
@@ -48,6 +51,47 @@ def test_the_version_is_the_same_everywhere():
     citation = read("CITATION.cff")
     assert (citation["version"], str(citation["date-released"])) == dated[0]
     assert {citation["version"], read("recipe/meta.yaml")["package"]["version"]} == {PROJECT["version"]}
+
+
+CHECKLIST = (ROOT / "docs" / "release.md").read_text(encoding="utf-8")
+
+
+def test_the_checklist_names_every_line_with_the_version():
+    """Filled in, its lines are those of the files of today; no other file of the root or the recipe has the version."""
+    lines = re.findall(r"^\| `([\w./]+)` \| `(.+)` \|$", CHECKLIST, re.M)
+    date = str(read("CITATION.cff")["date-released"])
+    for file, line in lines:
+        wanted = line.replace("X.Y.Z", PROJECT["version"]).replace("YYYY-MM-DD", date)
+        text = (ROOT / file).read_text(encoding="utf-8")
+        assert [known.strip() for known in text.splitlines()].count(wanted) == 1, (file, wanted)
+    places = [ROOT / "recipe" / "meta.yaml", *(path for path in ROOT.iterdir() if path.suffix in SETTINGS)]
+    version = re.compile(rf"\bversion\b.*{re.escape(PROJECT['version'])}|^## \[{re.escape(PROJECT['version'])}\]", re.M)
+    holders = {path.relative_to(ROOT).as_posix() for path in places if version.search(path.read_text(encoding="utf-8"))}
+    assert holders == {file for file, _ in lines}
+
+
+def test_the_checklist_says_what_the_next_version_is():
+    [following] = re.findall(r"the next release is (\d+\.\d+\.\d+)\.", CHECKLIST)
+    assert numbers(following) > numbers(PROJECT["version"])
+
+
+def numbers(version):
+    return tuple(map(int, version.split(".")))
+
+
+def removals():
+    """Yield versions that remove a deprecated name, with the place of the warning."""
+    call = re.compile(r'(?:warn_deprecated|deprecated_attribute)\(.*, "(\d+\.\d+)"\)')
+    for path in (ROOT / "sparsedp").rglob("*.py"):
+        yield from ((path.name, removal) for removal in call.findall(path.read_text(encoding="utf-8")))
+    for name, (_, removal) in sparsedp._DEPRECATED.items():
+        yield name, removal
+
+
+def test_no_deprecated_name_is_overdue():
+    found = list(removals())
+    assert len(found) > len(sparsedp._DEPRECATED)
+    assert not [place for place, removal in found if numbers(PROJECT["version"])[:2] >= numbers(removal)]
 
 
 def test_the_recipe_asks_for_what_the_project_asks_for():
@@ -93,6 +137,14 @@ def test_ci_run_goes_through_its_jobs():
     text = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
     run = set(re.findall(r"^ *run_job (\w+)$", text, re.M))
     assert {*run, "newest"} == set(ci("jobs"))  # the README's two commands are its first stages
+
+
+@pytest.mark.parametrize("selection", ["quick", "plain"])
+def test_every_name_of_a_selection_is_a_file_of_tests(selection):
+    """A name without a file would be left out in silence."""
+    text = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    names = re.search(rf"^{selection}=\(([^)]*)\)", text, re.M)[1].split()
+    assert sorted(Path(path).stem for path in ci("tests", selection)) == sorted(f"test_{name}" for name in names)
 
 
 def test_an_unknown_job_is_refused():
