@@ -90,13 +90,17 @@ def nearest(word: Any, words: Sequence[str]) -> str | None:
     similar = [other for other in words if word and other.startswith(word)]
     if not similar:
         similar = get_close_matches(word, words)
-    return similar[0] if similar else None
+    if similar:
+        return similar[0]
+    return None
 
 
 def advice_near(word: Any, words: Sequence[str]) -> str:
     """Return the end of a message that proposes the most similar of some words; empty if none is similar."""
     near = nearest(word, words)
-    return f"; write {near!r}" if near else ""
+    if near is None:
+        return ""
+    return f"; write {near!r}"
 
 
 def public(written: str, advice: Callable | None = None) -> Callable:
@@ -155,8 +159,12 @@ def _call_error(error, function, written, advice, args, options):
 def _misfit(form, written, advice, args, options):
     """Return the TypeError for arguments that do not fit a signature."""
     parameters = {name: parameter for name, parameter in form.parameters.items() if name != "self"}
-    given = args[1:] if "self" in form.parameters else args
-    example = advice(*given, **options) if advice else None
+    given = args
+    if "self" in form.parameters:
+        given = args[1:]
+    example = None
+    if advice is not None:
+        example = advice(*given, **options)
     example = example or EXAMPLES.get(written) or _example(written, parameters)
     takes_any_keyword = any(parameter.kind is Parameter.VAR_KEYWORD for parameter in parameters.values())
     for name in options:
@@ -195,7 +203,9 @@ def _instead(name, parameters):
     if advice:
         return advice
     near = nearest(name, list(parameters))
-    return f"{near}=..." if near else None
+    if near is None:
+        return None
+    return f"{near}=..."
 
 
 def _example(written, parameters):

@@ -42,7 +42,9 @@ def text_of(value: Any, digits: int) -> str:
         return ""
     if not isinstance(value, (float, np.floating)):
         return str(value)
-    return "" if isnan(value) else f"{value:.{digits}g}"
+    if isnan(value):
+        return ""
+    return f"{value:.{digits}g}"
 
 
 def cell(value: Any) -> str:

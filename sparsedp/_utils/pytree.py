@@ -202,7 +202,9 @@ def subscript(tree: Any, key: Any) -> str:
     if not isinstance(tree, BRANCHES):
         return f".{key}"
     fields = getattr(tree, "_fields", None)
-    return f".{fields[key]}" if fields else f"[{key!r}]"
+    if fields:
+        return f".{fields[key]}"
+    return f"[{key!r}]"
 
 
 # ---- leaves ----------------------------------------------------------------------------------------------------------
@@ -289,7 +291,9 @@ def copied(tree: Any) -> Any:
 
 
 def _copied_leaf(leaf):
-    return leaf.copy() if isinstance(leaf, np.ndarray) or sp.issparse(leaf) else leaf
+    if isinstance(leaf, np.ndarray) or sp.issparse(leaf):
+        return leaf.copy()
+    return leaf
 
 
 def mapped(function: Callable, tree: Any, *others: Any) -> Any:
@@ -438,7 +442,9 @@ def _kind(tree):
     """Return the type of container with which a container can be paired; `object` for dataclasses."""
     if isinstance(tree, dict):
         return dict
-    return tuple if isinstance(tree, (tuple, list)) else object
+    if isinstance(tree, (tuple, list)):
+        return tuple
+    return object
 
 
 def _places(tree, reference):
@@ -511,4 +517,6 @@ def power_of_two(value: float) -> float:
 
 def safe_unit(size: float) -> float:
     """Return a power of two near a size whose square may underflow or overflow; 1 where it does not."""
-    return 1.0 if SMALL < size < LARGE else power_of_two(size)
+    if SMALL < size < LARGE:
+        return 1.0
+    return power_of_two(size)

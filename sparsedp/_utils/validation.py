@@ -295,7 +295,9 @@ def surely_finite(value: Any) -> bool:
 def place(index: int, shape: tuple[int, ...]) -> Any:
     """Return the index of an entry from its number in C order: a number in 1-D, else a tuple."""
     indices = tuple(map(int, np.unravel_index(index, shape)))
-    return indices[0] if len(indices) == 1 else indices
+    if len(indices) == 1:
+        return indices[0]
+    return indices
 
 
 def check_function(name: str, thing: Any, example: str, count: int | None = None) -> None:

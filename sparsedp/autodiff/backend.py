@@ -236,7 +236,9 @@ def match_value(derivative: Any, value: Any) -> Any:
     if not ARRAY_KINDS:
         return derivative
     kind = ARRAY_KINDS.get(_type_of(derivative)) or ARRAY_KINDS.get(_type_of(value))
-    return kind.match(derivative, value) if kind else derivative
+    if kind is None:
+        return derivative
+    return kind.match(derivative, value)
 
 
 def collectively(what: str, arguments: Any, act: Callable, *args: Any) -> Any:

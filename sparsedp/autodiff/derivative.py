@@ -11,7 +11,7 @@ import numpy as np
 
 from sparsedp._utils.calls import frames_inside, public
 from sparsedp._utils.counters import thread
-from sparsedp._utils.pytree import copied, described, flatten, is_branch, labels, leaves, mapped, paired
+from sparsedp._utils.pytree import copied, described, flatten, keys, labels, leaves, mapped, paired
 from sparsedp._utils.reconstruction import ReconstructibleFunction
 from sparsedp._utils.validation import (
     advise,
@@ -56,7 +56,6 @@ __all__ = [
     "hvp",
     "is_finite",
     "jvp",
-    "linearised",
     "name_of",
     "of_argument",
     "pullback",
@@ -112,65 +111,34 @@ def pullback(fun: Callable, x: Any) -> tuple[Any, Callable]:
     (5.0, 2.0)
     """
     entries, rebuild = flatten(x)
-    moving = [is_variable(leaf) for leaf in entries]
     check_native("a gradient", *entries)
     check_leaves("x", x)
-    if not any(moving):
+    moving = []
+    for place, leaf in enumerate(entries):
+        moving.append(is_variable(leaf))
+        if moving[place]:
+            entries[place] = _apart_from_caller(leaf)
+    if True not in moving:
         kinds = sorted({str(getattr(leaf, "dtype", type(leaf).__name__)) for leaf in entries})
         raise DerivativeError(
             f"a gradient needs floating values, got {', '.join(kinds) or 'nothing'}; write np.asarray(x, float)"
         )
-    entries = [_apart_from_caller(leaf) if moves else leaf for leaf, moves in zip(entries, moving, strict=True)]
-
-    def one_array(x):
-        result = fun(x)
-        if not _is_array(result):
-            raise DerivativeError(
-                f"the function must return one array or number, got {type(result).__name__}; sum or join it"
-            )
-        return result
-
-    (value,), _, back = linearised(one_array, rebuild(entries), moving)
+    tape = taped(fun, rebuild(entries), moving)
+    value = tape.rebuild(tape.values)
+    if not _is_array(value):
+        raise DerivativeError(
+            f"the function must return one array or number, got {type(value).__name__}; sum or join it"
+        )
 
     def pull(g):
         check_shape("the cotangent", g, np.shape(value), "; give one like the value")
-        gradients = []
-        for leaf, moves, slope in zip(entries, moving, back([g]), strict=True):
-            gradients.append(gradient_of(leaf, slope) if moves else None)
+        gradients: list = [None] * len(entries)
+        for place, slope in enumerate(tape.pull([g])):
+            if moving[place]:
+                gradients[place] = gradient_of(entries[place], slope)
         return rebuild(_without_shared_memory(gradients, g))
 
     return _apart_from_caller(value), pull
-
-
-def linearised(fun: Callable, tree: Any, moving: Iterable) -> tuple[list, Callable, Callable]:
-    """Evaluate a function of a tree and record it.
-
-    Parameters
-    ----------
-    fun : callable
-        ``fun(tree) -> tree``.
-    tree : tree
-    moving : sequence of bool
-        For each leaf of the tree, whether it is a variable.
-
-    Returns
-    -------
-    values : list
-        Leaves of the result.
-    rebuild : callable
-        Builds the result from its leaves.
-    pull : callable
-        ``pull(cotangents)`` returns a cotangent for each leaf of the tree from those of the leaves of the result; None
-        where there is none.
-    """
-    tape = taped(fun, tree, moving)
-
-    def pull(cotangents):
-        sums: dict = {}
-        backward(tape.nodes, tape.ends, cotangents, sums)
-        return [sums.get(root, (None,))[0] for root in tape.roots]
-
-    return tape.values, tape.rebuild, pull
 
 
 class Tape(NamedTuple):
@@ -196,11 +164,37 @@ class Tape(NamedTuple):
     nodes: list
     roots: list
 
+    def pull(self, cotangents: Sequence) -> list:
+        """Return a cotangent for each leaf of the tree, or None, from those of the leaves of the result."""
+        sums: dict = {}
+        backward(self.nodes, self.ends, cotangents, sums)
+        cotangents = []
+        for root in self.roots:
+            cotangent, _ = sums.get(root, (None, False))
+            cotangents.append(cotangent)
+        return cotangents
+
 
 def taped(fun: Callable, tree: Any, moving: Iterable, *witnesses: Callable) -> Tape:
-    """Record a function of a tree, see `linearised`; the witnesses are called for every node, see `Recorder`."""
+    """Evaluate a function of a tree and record it.
+
+    Parameters
+    ----------
+    fun : callable
+        ``fun(tree) -> tree``.
+    tree : tree
+    moving : iterable of bool
+        For each leaf of the tree, whether it is a variable.
+    *witnesses : callables
+        Called for every node, see `Recorder`.
+    """
     recorder = Recorder(*witnesses)
-    roots = [recorder.root() if moves else None for moves in moving]
+    roots: list = []
+    for moves in moving:
+        if moves:
+            roots.append(recorder.root())
+        else:
+            roots.append(None)
     try:
         values, ends, rebuild = traced(fun, tree, roots)
     finally:
@@ -287,8 +281,13 @@ def _warn_unless_finite(name, derivative, again):
     """
     if thread.quiet:
         return
-    variables = [leaf for leaf in leaves(derivative) if is_variable(leaf)]
-    if any(map(isbox, variables)) or all(map(is_finite, variables)):
+    all_finite = True
+    for leaf in leaves(derivative):
+        if isbox(leaf):
+            return
+        if is_variable(leaf):
+            all_finite = all_finite and is_finite(leaf)
+    if all_finite:
         return
     reason = _cause_of_non_finite(again) or "dp.check.gradient(loss, x) shows where it comes from"
     warnings.warn(
@@ -371,25 +370,31 @@ def _without_shared_memory(gradients, g):
 
 def _apart_from_caller(value):
     """Return an array as it is now: pullbacks need it, and the caller may write into it before they run."""
-    return value if not isinstance(value, np.ndarray) or is_fixed(value) else value.copy("K")
+    if isinstance(value, np.ndarray) and not is_fixed(value):
+        return value.copy("K")
+    return value
 
 
 def _owner(value):
     """Return the array that owns the memory of an array."""
-    return _owner(value.base) if isinstance(value, np.ndarray) and value.base is not None else value
+    while isinstance(value, np.ndarray) and value.base is not None:
+        value = value.base
+    return value
 
 
 def gradient_of(leaf: Any, cotangent: Any) -> Any:
     """Return a cotangent as the gradient in a leaf, of its shape and dtype; zeros if there is no cotangent."""
     if cotangent is None:
-        return 0.0 if isinstance(leaf, float) else anp.zeros_like(plain(leaf))
+        return _as_leaf(anp.zeros_like(plain(leaf)), leaf)
     check_shape("the gradient", cotangent, np.shape(leaf), SPREAD)
     return _as_leaf(fit("the gradient", leaf, cotangent, cotangent), leaf)
 
 
 def _as_leaf(derivative, leaf):
     """Return a derivative of a number of Python as such a number, unless it is traced."""
-    return float(derivative) if isinstance(leaf, float) and not isbox(derivative) else derivative
+    if isinstance(leaf, float) and not isbox(derivative):
+        return float(derivative)
+    return derivative
 
 
 def pushforward(fun: Callable, x: Any, tangent: Any) -> tuple:
@@ -411,7 +416,10 @@ def pushforward(fun: Callable, x: Any, tangent: Any) -> tuple:
 
 def forward(fun: Callable, x: Any, tangents: Sequence) -> tuple:
     """Return the value of a function and its tangent in forward mode, see `push`."""
-    roots = [None if tangent is None else forward_root(tangent) for tangent in tangents]
+    roots: list = [None] * len(tangents)
+    for place, tangent in enumerate(tangents):
+        if tangent is not None:
+            roots[place] = forward_root(tangent)
     values, nodes, rebuild = traced(fun, x, roots)
     slopes = [tangent_of(value, node and node.g) for value, node in zip(values, nodes, strict=True)]
     return rebuild(values), rebuild(slopes)
@@ -421,7 +429,9 @@ def tangent_of(value: Any, slope: Any) -> Any:
     """Return the tangent of a result in its dtype: zero for a constant result, None if it is not floating."""
     if not is_variable(value):
         return None
-    return zero_like(value) if slope is None else fit("a rule", value, slope, slope)
+    if slope is None:
+        return zero_like(value)
+    return fit("a rule", value, slope, slope)
 
 
 def is_finite(value: Any) -> bool:
@@ -517,8 +527,8 @@ def _jvp(name, fun, x, tangent):
     results = collectively("jvp", (x, tangent), push, fun, x, tangents)
 
     def again():
-        values, _, pull = linearised(fun, x, [direction is not None for direction in tangents])
-        pull([np.ones_like(value) if is_variable(value) else None for value in values])
+        tape = taped(fun, x, [direction is not None for direction in tangents])
+        tape.pull([np.ones_like(value) if is_variable(value) else None for value in tape.values])
 
     if all(is_finite(direction) for direction in tangents if direction is not None):
         _warn_unless_finite(name, results[1], again)
@@ -597,20 +607,19 @@ def _twice_reverse(fun, tree, tangents):
     The pullback of a cotangent z, J^T z, is linear, so the gradient in z of <J^T z, tangent> is J tangent. It is
     evaluated at random z: a rule may branch on a cotangent of zero, and then has no derivative there.
     """
-    values, rebuild, pull = linearised(fun, tree, [tangent is not None for tangent in tangents])
-    moving = [is_variable(value) for value in values]
+    tape = taped(fun, tree, [tangent is not None for tangent in tangents])
+    moving = [is_variable(value) for value in tape.values]
 
     def product(z):
         total = 0.0
-        for cotangent, tangent in zip(pull(z), tangents, strict=True):
+        for cotangent, tangent in zip(tape.pull(z), tangents, strict=True):
             if cotangent is not None:
                 total = total + anp.sum(cotangent * tangent)
         return total
 
-    z = [_random_like(value) if moves else None for value, moves in zip(values, moving, strict=True)]
-    _, _, pull_product = linearised(product, z, moving)
-    slopes = pull_product([1.0])
-    return rebuild(values), rebuild(map(tangent_of, values, slopes))
+    z = [_random_like(value) if moves else None for value, moves in zip(tape.values, moving, strict=True)]
+    slopes = taped(product, z, moving).pull([1.0])
+    return tape.rebuild(tape.values), tape.rebuild(map(tangent_of, tape.values, slopes))
 
 
 def vjp(fun: Callable, *x: Any) -> tuple[Any, Callable]:
@@ -669,7 +678,9 @@ def vjp(fun: Callable, *x: Any) -> tuple[Any, Callable]:
         slopes = collectively("the function of vjp", (g,), pull, g)
         if is_finite(g):
             _warn_unless_finite("vjp", slopes, lambda: pullback(of_tuple, x)[1](g))
-        return slopes[0] if len(x) == 1 else slopes
+        if len(x) == 1:
+            return slopes[0]
+        return slopes
 
     return value, public("pull")(back)
 
@@ -797,17 +808,20 @@ def _value_and_gradient(loss, argnum, args):
     try:
         gradient = pull(np.float64(1.0))  # a number of Python has no entries, which derivatives of it may ask for
     except NonFiniteError as error:  # a call refused a cotangent, as of a forward argument that the user looks for
-        cause = None if thread.quiet or isbox(value) else _cause_of_non_finite(again)
-        if cause is not None and cause != str(error):
-            error.args = (f"{error}, in the backward pass: {cause}",)
+        if not (thread.quiet or isbox(value)):
+            cause = _cause_of_non_finite(again)
+            if cause not in (None, str(error)):
+                error.args = (f"{error}, in the backward pass: {cause}",)
         raise
     _warn_unless_finite("value_and_grad", gradient, again)
-    return value if isbox(value) else float(value), gradient
+    if isbox(value):
+        return value, gradient
+    return float(value), gradient
 
 
 def check_loss(value: Any) -> None:
     """Refuse the value of a loss, traced or not, if it is not one real number."""
-    if is_branch(value):
+    if keys(value) is not None:
         raise ShapeError(f"the loss must be a scalar, got a {type(value).__name__}; return one number")
     if np.shape(plain(value)) != ():
         raise ShapeError(f"the loss must be a scalar, got an array of shape {np.shape(plain(value))}; sum it")

@@ -135,7 +135,9 @@ def in_dtype(value: Any, dtype: DTypeLike) -> Any:
 
 def operand(x: Any) -> Any:
     """Return a list or tuple as an array, which may hold traced values; all else as it is."""
-    return anp.array(x) if type(x) in SEQUENCES else x
+    if type(x) in SEQUENCES:
+        return anp.array(x)
+    return x
 
 
 # ---- functions entry by entry ----------------------------------------------------------------------------------------

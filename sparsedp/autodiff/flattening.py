@@ -89,7 +89,9 @@ def _unflatten(tree):
 
 def _traced_leaf(part, value):
     """Return a part of a traced vector as a leaf of the shape and dtype of a value."""
-    numbers = part[::2] + 1j * part[1::2] if np.iscomplexobj(value) else part
+    numbers = part
+    if np.iscomplexobj(value):
+        numbers = part[::2] + 1j * part[1::2]
     return cast(anp.reshape(numbers, value.shape), value.dtype)
 
 
@@ -172,7 +174,10 @@ class Packing(TreeStructure):
                 raise DerivativeError(f"{name}: expected shape {x.shape}, got {g.shape}{advice}")
             if g.dtype.kind not in "biufc":
                 raise DerivativeError(f"{name}: expected numbers, got dtype {g.dtype}{advice}")
-            slopes.append(np.conj(g).astype(complex) if np.iscomplexobj(x) else g.real)
+            if np.iscomplexobj(x):
+                slopes.append(np.conj(g).astype(complex))
+            else:
+                slopes.append(g.real)
         return slopes
 
     def pack_gradient(self, gradient: Any) -> np.ndarray:
@@ -222,4 +227,6 @@ def _like(leaf, value):
     """Return a value as a number of the type of a leaf, where the leaf is a number."""
     if isinstance(leaf, np.ndarray) or isbox(value):
         return value
-    return np.asarray(value)[()] if isinstance(leaf, np.generic) else type(leaf)(value)
+    if isinstance(leaf, np.generic):
+        return np.asarray(value)[()]
+    return type(leaf)(value)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import inspect
 from contextlib import contextmanager
-from functools import cached_property, partial, wraps
+from functools import cached_property, wraps
 from itertools import count as count_from
 from typing import TYPE_CHECKING, Any
 
@@ -205,7 +205,13 @@ class Recorder:
 
     def root(self) -> ReverseNode:
         """Return the node of a new variable of the trace."""
-        return ReverseNode.new_root(self)
+        root = ReverseNode.__new__(ReverseNode)
+        root._first = None
+        root._rest = None
+        root.vjp = None
+        root.held = ()
+        root.recorder = self
+        return root
 
     def weigh(self, value: Any, args: Sequence, nums: Sequence[int]) -> None:
         """Add the bytes of a call to `bytes`."""
@@ -252,21 +258,15 @@ class ReverseNode(VJPNode):
     @property
     def parents(self) -> tuple:
         """Nodes of the traced arguments."""
+        first = self._first
         rest = self._rest
+        if first is None:
+            return ()
         if rest is None:
-            return () if self._first is None else (self._first,)
-        return (self._first, *rest) if type(rest) is tuple else (self._first, rest)
-
-    @classmethod
-    def new_root(cls, recorder: Recorder) -> ReverseNode:
-        """Return the node of a variable."""
-        root = cls.__new__(cls)
-        root._first = None
-        root._rest = None
-        root.vjp = None
-        root.held = ()
-        root.recorder = recorder
-        return root
+            return (first,)
+        if type(rest) is tuple:
+            return (first, *rest)
+        return (first, rest)
 
     def __init__(self, value: Any, function: Callable, args: Any, options: dict, nums: Any, parents: Any):
         recorder = parents[0].recorder
@@ -275,8 +275,10 @@ class ReverseNode(VJPNode):
         self.recorder = recorder
         self._first = parents[0]
         self._rest = None
-        if len(parents) > 1:
-            self._rest = parents[1] if len(parents) == 2 else tuple(parents[1:])
+        if len(parents) == 2:
+            self._rest = parents[1]
+        elif len(parents) > 2:
+            self._rest = tuple(parents[1:])
         pullback = None
         if options:
             refuse_options(function, options)
@@ -306,7 +308,9 @@ class ReverseNode(VJPNode):
             args = constant_args(args, nums)
         known = underflow_safe.get(function, function)
         self.vjp = VJPNode(value, known, args, constant(options), nums, ()).vjp
-        self.held = SUMS if function is _primitive and args[0].adds else ()
+        self.held = ()
+        if function is _primitive and args[0].adds:
+            self.held = SUMS
         if _kind(function, value, args, nums) == "c":
             self._keep_real(args, nums)
 
@@ -367,7 +371,10 @@ class ForwardNode(JVPNode):
         total: Any = None
         for num, parent in zip(nums, parents, strict=True):
             g = formula.forward(parent.g, num, args, np.shape(value))
-            total = (g, False) if total is None and type(g) in NUMBERS else added(total, g)
+            if total is None and type(g) in NUMBERS:
+                total = (g, False)
+            else:
+                total = added(total, g)
         self.g = total[0]
 
 
@@ -398,12 +405,8 @@ forward_root = ForwardNode.new_root  # begins a forward-mode trace with its tang
 OWN_NODES = {ReverseNode, UntapedNode, ForwardNode}
 
 
-_numbers = count_from(trace_stack.top + 1)
-
-
-def new_trace() -> int:
-    """Return the number of a new trace: larger than those of the traces that it is nested in, and unique."""
-    return next(_numbers)
+# Returns the number of a new trace: larger than those of the traces that it is nested in, and unique.
+new_trace = count_from(trace_stack.top + 1).__next__
 
 
 @contextmanager
@@ -433,12 +436,20 @@ def innermost(values: Sequence) -> list[int]:
     """Return the positions of the values on the innermost trace, if that is a reverse-mode trace; else none."""
     trace = max((value._trace for value in values if isbox(value)), default=None)
     nums = [num for num, value in enumerate(values) if isbox(value) and value._trace == trace]
-    return nums if any(isinstance(values[num]._node, VJPNode) for num in nums) else []
+    if any(isinstance(values[num]._node, VJPNode) for num in nums):
+        return nums
+    return []
 
 
 def boxed(values: Iterable, roots: Iterable, number: int) -> list:
     """Return values as a list, those with a root as traced values of the trace with this number."""
-    return [x if root is None else new_box(x, number, root) for x, root in zip(values, roots, strict=True)]
+    traced = []
+    for value, root in zip(values, roots, strict=True):
+        if root is None:
+            traced.append(value)
+        else:
+            traced.append(new_box(value, number, root))
+    return traced
 
 
 def split_boxes(values: Iterable, number: int) -> tuple[list, list]:
@@ -484,7 +495,10 @@ def backward(nodes: Sequence[ReverseNode], ends: Sequence, cotangents: Sequence,
     """
     for end, g in zip(ends, cotangents, strict=True):
         if end is not None and g is not None:
-            sums[end] = added(sums[end], g) if end in sums else (g, False)
+            if end in sums:
+                sums[end] = added(sums[end], g)
+            else:
+                sums[end] = (g, False)
     for node in reversed(nodes):
         total = sums.pop(node, None)
         if total is None:
@@ -518,7 +532,9 @@ def _pull_into_sums(node, g, sums):
 
 def _open(total):
     """Return the array of a sum of cotangents if it may be written to, else None."""
-    return total[0] if total is not None and total[1] and type(total[0]) is np.ndarray else None
+    if total is not None and total[1] and type(total[0]) is np.ndarray:
+        return total[0]
+    return None
 
 
 def added(total: tuple | None, g: Any) -> tuple:
@@ -541,7 +557,9 @@ def added(total: tuple | None, g: Any) -> tuple:
         return add_outgrads(total, g)
     if kind is np.float64:
         return total[0] + g, False
-    return np.add(total[0], g, out=total[0] if total[1] else None), True
+    if total[1]:
+        return np.add(total[0], g, out=total[0]), True
+    return np.add(total[0], g), True
 
 
 def _add_part(total, part):
@@ -613,7 +631,9 @@ def _binary(function):
     """
     raw = function.fun
     quick = PYTHON_OPERATORS.get(function, raw)
-    plain_types = PLAIN if function is ITEM else PLAIN - {list, tuple}
+    plain_types = PLAIN
+    if function is not ITEM:
+        plain_types = PLAIN - {list, tuple}
 
     def ask_autograd(x, y):
         if function is ITEM:
@@ -668,7 +688,9 @@ def _reflected(act):
 
 def _shape(box):
     value = box._value
-    return value.shape if type(value) in NUMBERS else np.shape(value)
+    if type(value) in NUMBERS:
+        return value.shape
+    return np.shape(value)
 
 
 def _install():
@@ -988,7 +1010,9 @@ def fit(name: str, value: Any, cotangent: Any, g: Any) -> Any:
 def dtype_of(value: Any) -> np.dtype:
     """Return the dtype of a value, plain or traced."""
     value = plain(value)
-    return value.dtype if hasattr(value, "dtype") else np.asarray(value).dtype
+    if hasattr(value, "dtype"):
+        return value.dtype
+    return np.asarray(value).dtype
 
 
 def cast(g: Any, dtype: DTypeLike) -> Any:
@@ -1038,8 +1062,10 @@ def _operator_vjp(argnums, ans, args, options):
     del args, u
 
     def pull(g):
-        act = partial(apply_operator, op.T) if isbox(g) else op.T.apply
-        cotangent = timed(op.name, "vjp", act, g)
+        if isbox(g):
+            cotangent = timed(op.name, "vjp", apply_operator, op.T, g)
+        else:
+            cotangent = timed(op.name, "vjp", op.T.apply, g)
         return (cast(match_value(cotangent, reference), dtype),)
 
     return pull
@@ -1048,8 +1074,10 @@ def _operator_vjp(argnums, ans, args, options):
 def _operator_jvp(argnums, tangents, ans, args, options):
     op = args[0]
     count(op.name, "jvp")
-    tangent = tangents[0]
-    return apply_operator(op.tangent, tangent) if isbox(tangent) else op.tangent.apply(tangent)
+    (tangent,) = tangents
+    if isbox(tangent):
+        return apply_operator(op.tangent, tangent)
+    return op.tangent.apply(tangent)
 
 
 # Their pullbacks need only the shapes of constants, or call `constant_args` themselves.
@@ -1065,4 +1093,6 @@ def is_variable(leaf: Any) -> bool:
 
 def called(function: Callable, args: Sequence) -> Any:
     """Return the rule or Operator of a recorded call ``function(*args)``; for functions of autograd `function`."""
-    return args[0] if function in (_primitive, _operator, through) else function
+    if function in (_primitive, _operator, through):
+        return args[0]
+    return function

@@ -44,7 +44,9 @@ def constant_args(args: Sequence, nums: Sequence[int]) -> Any:
             if constants is None:
                 constants = list(args)
             constants[num] = value
-    return args if constants is None else tuple(constants)
+    if constants is None:
+        return args
+    return tuple(constants)
 
 
 def constant(value: Any) -> Any:
@@ -62,7 +64,9 @@ def constant(value: Any) -> Any:
     """
     kind: Any = type(value)
     if isinstance(value, np.ndarray):
-        return value if is_fixed(value) else _copied(value)
+        if is_fixed(value):
+            return value
+        return _copied(value)
     if kind is tuple and all(type(entry) in FIXED for entry in value):
         return value
     if kind is tuple or kind is list:

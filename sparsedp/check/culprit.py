@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sparsedp._utils.counters import recording
 from sparsedp._utils.pytree import leaves
-from sparsedp.autodiff.derivative import grad, linearised
+from sparsedp.autodiff.derivative import grad, taped
 from sparsedp.autodiff.tape import is_variable
 from sparsedp.check.direction_evidence import DirectionEvidence
 from sparsedp.check.directions import examine_directions
@@ -273,16 +273,16 @@ def _gap_of_results(
     behind = results_at(point.unpack(point.vector - step * direction))
     slopes = [(np.asarray(ahead[number]) - np.asarray(behind[number])) / (2 * step) for number in weights]
     moving = [True] * len(leaves(node.values))
-    values, _, pull = linearised(results_at, point.fresh(), moving)
+    tape = taped(results_at, point.fresh(), moving)
 
     def gap_along(parts: Sequence[Any]) -> float:
-        cotangents: list = [None] * len(values)
+        cotangents: list = [None] * len(tape.values)
         gap = 0.0
         for (number, weight), part, slope in zip(weights.items(), parts, slopes, strict=True):
-            cotangents[number] = np.asarray(weight * part, np.asarray(values[number]).dtype)[()]
+            cotangents[number] = np.asarray(weight * part, np.asarray(tape.values[number]).dtype)[()]
             gap += float(np.sum(cotangents[number] * slope))
         slopes_by_vjp = []
-        for slope, x in zip(pull(cotangents), point.values):
+        for slope, x in zip(tape.pull(cotangents), point.values):
             slopes_by_vjp.append(np.zeros(x.size) if slope is None else np.ravel(slope))
         return gap - float(np.concatenate(slopes_by_vjp) @ direction)
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from sparsedp._utils.validation import check_precision
-from sparsedp.autodiff.derivative import gradient_of, linearised
+from sparsedp.autodiff.derivative import gradient_of, taped
 
 __all__ = ["owned", "parts", "recorded"]
 
@@ -32,13 +32,13 @@ def recorded(fun: Callable, arrays: Sequence, moving: Sequence[bool]) -> tuple[l
     gradients : callable
         ``gradients(cotangents)`` are the gradients of the variables; a cotangent for each leaf, or None.
     """
-    values, rebuild, pull = linearised(fun, arrays, moving)
+    tape = taped(fun, arrays, moving)
 
     def gradients(cotangents):
-        slopes = zip(arrays, pull(cotangents), moving, strict=True)
+        slopes = zip(arrays, tape.pull(cotangents), moving, strict=True)
         return [gradient_of(array, slope) for array, slope, moves in slopes if moves]
 
-    return values, rebuild, gradients
+    return tape.values, tape.rebuild, gradients
 
 
 def owned(array: Any) -> Any:

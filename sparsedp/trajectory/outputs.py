@@ -14,7 +14,7 @@ import numpy as np
 from sparsedp._utils.pytree import flatten, leaves, mapped, paired
 from sparsedp._utils.validation import is_whole
 from sparsedp.autodiff.backend import as_field, is_distributed
-from sparsedp.autodiff.derivative import linearised
+from sparsedp.autodiff.derivative import taped
 from sparsedp.autodiff.tape import dtype_of, is_variable, isbox, plain, split_boxes, traces_of
 from sparsedp.autodiff.tape_constants import constant
 from sparsedp.errors import DerivativeError
@@ -328,15 +328,15 @@ class FunctionOfStates(LastState):
             def function(tree: Any) -> list:
                 return self._paired(self.function(state.i, tree), first, state.i)
 
-            results, _, pull = linearised(function, tree, map(is_variable, leaves(tree)))
-            self._compare(state.i, results)
+            tape = taped(function, tree, map(is_variable, leaves(tree)))
+            self._compare(state.i, tape.values)
             entering = []
             for leaf in leaves(first):
                 if isinstance(leaf, _StackedResult):
                     entering.append(leaf.of(cotangents))
                 else:
                     entering.append(None)
-            pulled = pull(entering)
+            pulled = tape.pull(entering)
             return [pulled[place] for place in self.form.places]
 
         return source

@@ -66,11 +66,16 @@ class ArgumentForm(TreeStructure):
 
     def __init__(self, tree: Any, root: str) -> None:
         super().__init__(tree, root, is_variable, constant)
-        values = [plain(leaf) for leaf in self.variables(tree)]
-        self.shapes: list[tuple] = [np.shape(value) for value in values]
-        self.dtypes: list[np.dtype] = [dtype_of(value) for value in values]
-        self.is_float: list[bool] = [type(value) is float for value in values]
-        self.nbytes: int = sum(as_field(value).nbytes for value in values)
+        self.shapes: list[tuple] = []
+        self.dtypes: list[np.dtype] = []
+        self.is_float: list[bool] = []
+        self.nbytes = 0
+        for leaf in self.variables(tree):
+            value = plain(leaf)
+            self.shapes.append(np.shape(value))
+            self.dtypes.append(dtype_of(value))
+            self.is_float.append(type(value) is float)
+            self.nbytes += as_field(value).nbytes
         self._check(tree)
         self.is_open = _is_open(tree)
 
