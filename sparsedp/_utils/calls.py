@@ -173,7 +173,10 @@ def _misfit(form, written, advice, args, options):
     by_position = Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD
     positional = [parameter for parameter in parameters.values() if parameter.kind in by_position]
     if len(given) > len(positional):
-        return TypeError(f"{written} takes {len(positional)} by position, got {len(given)}; write {example}")
+        arguments = "argument" if len(positional) == 1 else "arguments"
+        return TypeError(
+            f"{written} takes {len(positional)} {arguments} by position, got {len(given)}; write {example}"
+        )
     for name, parameter in parameters.items():
         filled = name in options or parameter in positional[: len(given)]
         if _is_required(parameter) and not filled:

@@ -33,8 +33,12 @@ NEEDS = "boundary on x needs dirichlet, neumann, robin(a, b) or a pair of them"
 PARAMS = "dp.rollout(step, start, params, n), with params=None if the step has none"
 TABLE = [
     # dp.Grid
-    (lambda: dp.Grid(64, 64), TypeError, "dp.Grid takes 1 by position, got 2; write dp.Grid((64, 64))"),
-    (lambda: dp.Grid((8, 8), 1.0), TypeError, "dp.Grid takes 1 by position, got 2; write dp.Grid((8, 8), size=1.0)"),
+    (lambda: dp.Grid(64, 64), TypeError, "dp.Grid takes 1 argument by position, got 2; write dp.Grid((64, 64))"),
+    (
+        lambda: dp.Grid((8, 8), 1.0),
+        TypeError,
+        "dp.Grid takes 1 argument by position, got 2; write dp.Grid((8, 8), size=1.0)",
+    ),
     (lambda: dp.Grid(8, dx=0.1), TypeError, "dp.Grid has no argument 'dx'; write spacing=0.1"),
     (lambda: dp.Grid(8, extent=2.0), TypeError, "dp.Grid has no argument 'extent'; write size=2.0"),
     (lambda: dp.Grid(nx=8), TypeError, "dp.Grid has no argument 'nx'; write dp.Grid((64, 64), size=1.0)"),
@@ -49,11 +53,11 @@ TABLE = [
         TypeError,
         "dp.laplacian was given an argument twice, by position and by name; write dp.laplacian(grid)",
     ),
-    (lambda: dp.curl(GRID, U), TypeError, "dp.curl takes 1 by position, got 2; write dp.curl(grid)"),
+    (lambda: dp.curl(GRID, U), TypeError, "dp.curl takes 1 argument by position, got 2; write dp.curl(grid)"),
     (
         lambda: dp.save("u.npz", GRID, U),
         TypeError,
-        "dp.save takes 2 by position, got 3; write dp.save('run.npz', grid, u=u)",
+        "dp.save takes 2 arguments by position, got 3; write dp.save('run.npz', grid, u=u)",
     ),
     (lambda: dp.save(U, GRID), TypeError, "save takes the path of a file first, got ndarray; write 'fields.npz'"),
     (lambda: dp.grad(square, argnums=0), TypeError, "dp.grad has no argument 'argnums'; write argnum=..."),
