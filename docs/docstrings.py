@@ -8,6 +8,10 @@ import sparsedp
 
 CODE = r"(``.*?``|`[^`]*`)"
 LABEL = re.compile(r"[A-Z][\w ,]{2,24}: ")  # of a paragraph in the notes
+BORDER = re.compile(r" *=+( +=+)+$")  # of a table
+PUBLIC = {name for name in dir(sparsedp) if not name.startswith("_")}
+PUBLIC |= {f"{room}.{name}" for room in sparsedp._PUBLIC_PACKAGES for name in getattr(sparsedp, room).__all__}
+PUBLIC -= {f"report.{name}" for name in sparsedp.report.__all__}  # these are public without the room
 
 
 def plain(line):
@@ -18,20 +22,46 @@ def plain(line):
     return "".join(parts)
 
 
-def rewrite(app, what, name, thing, options, lines):
-    """Text is not markup, See Also gets summaries, and paragraphs with a label are apart.
+def linked(line, own_names):
+    """Names of the package between backquotes are links, if they are not arguments of the function itself."""
 
-    Examples and literal blocks stay as they are. Napoleon takes the text before a colon in the first line of a property
-    for its type: an empty word in front makes it a part of the text.
+    def role(match):
+        name = match[1]
+        return f":obj:`{name} <sparsedp.{name}>`" if name in PUBLIC - own_names else match[0]
+
+    return re.sub(r"(?<![`:\w])`([\w.]+)`(?![`_])", role, line)
+
+
+def names_of_arguments(thing, lines):
+    """Names of the arguments of a function or class, and of those that its docstring shows as ``name=``."""
+    shown = set(re.findall(r"\b(\w+)=", "\n".join(lines)))
+    try:
+        return shown | set(inspect.signature(thing).parameters)
+    except (TypeError, ValueError):
+        return shown
+
+
+def rewrite(app, what, name, thing, options, lines):
+    """Text is not markup, public names are links, See Also gets summaries, and paragraphs with a label are apart.
+
+    Examples, literal blocks and tables stay as they are. Napoleon takes the text before a colon in the first line of a
+    property for its type: an empty word in front makes it a part of the text.
     """
+    own_names = names_of_arguments(thing, lines) | {name.removeprefix("sparsedp.")}
     result = []
-    example = literal = False
+    example = literal = table = False
     for line in lines:
         example = line.lstrip().startswith(">>>") or (example and bool(line.strip()))
         literal = literal and (not line.strip() or line.startswith(" "))
+        table = bool(line.strip()) and (table or BORDER.match(line) is not None)
         if LABEL.match(line) and result and result[-1].endswith((".", ":")):
             result.append("")
-        result.append(line if example or literal else plain(line))
+        if example or literal:
+            result.append(line)
+        elif table:
+            result.append(plain(line))
+        else:
+            result.append(plain(linked(line, own_names)))
         literal = literal or (line.endswith("::") and not example)
     if what in ("attribute", "property") and lines and ":" in lines[0]:
         result.insert(0, "\\ ")

@@ -89,6 +89,64 @@ def test_commands_of_the_pages():
             assert words[:4] in (["python", "-m", "sparsedp", "demo"], ["python", "-m", "sphinx", "-W"], [".ci/run"])
 
 
+def test_what_becomes_of_a_docstring(monkeypatch):
+    """Public names are links where they are no arguments; code, tables and examples stay."""
+    monkeypatch.syspath_prepend(DOCS)
+    docstrings = importlib.import_module("docstrings")
+
+    def inverse(lift):
+        pass
+
+    lines = """Solve with `inverse` and `laplacian`, |x|.
+
+    See Also
+    --------
+    check.order, lift
+
+    Notes
+    -----
+    Apply `lift` with ``transport(inflow=0.0)``; `inflow` is no `flow_step`.
+    Cost: two::
+
+        `laplacian` | 2
+
+    ======== ====
+    `upwind` 1
+    ======== ====
+
+    >>> `upwind` * 2
+    """
+    found = inspect.cleandoc(lines).splitlines()
+    docstrings.rewrite(None, "function", "sparsedp.inverse", inverse, None, found)
+    lift = inspect.getdoc(sparsedp.lift).splitlines()[0]
+    order = inspect.getdoc(sparsedp.check.order).splitlines()[0]
+    wanted = f"""Solve with `inverse` and :obj:`laplacian <sparsedp.laplacian>`, \\|x\\|.
+
+    See Also
+    --------
+    check.order : {order}
+    lift : {lift}
+
+    Notes
+    -----
+    Apply `lift` with ``transport(inflow=0.0)``; `inflow` is no :obj:`flow_step <sparsedp.flow_step>`.
+
+    Cost: two::
+
+        `laplacian` | 2
+
+    ======== ====
+    `upwind` 1
+    ======== ====
+
+    >>> `upwind` * 2
+    """
+    assert found == inspect.cleandoc(wanted).splitlines()
+    value = ["Mode: how it is solved."]
+    docstrings.rewrite(None, "property", "sparsedp.Operator.mode", None, None, value)
+    assert value == ["\\ ", "Mode: how it is solved."]
+
+
 # ---- what Sphinx makes of them ---------------------------------------------------------------------------------------
 
 
