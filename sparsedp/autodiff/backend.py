@@ -2,14 +2,14 @@
 
 Code outside of ``parallel/`` calls the methods of `Backend` and the functions below, and never asks where a field is
 stored. The class `Backend` itself is the default: fields are NumPy arrays of this process. ``parallel/`` derives the
-backend of fields whose blocks are stored by the processes of MPI.
+backend of fields whose blocks are stored by several processes.
 
 ======================  ============================================================================================
 asked of                by
 ======================  ============================================================================================
 a grid                  ``grid.backend``; `Backend.check`, `Backend.place`, `Backend.mesh`
-a field                 `Backend.split`, `Backend.join`, `Backend.volumes`; `as_field`, `is_distributed`, `gathered`,
-                        `replicated`
+a field                 `Backend.split`, `Backend.join`, `Backend.volumes`; `as_field`, `gathered`, `replicated`
+a state of a rollout    `Backend.stack`, `Backend.fingerprint`
 a reduction             NumPy's functions: a field of another backend implements ``np.sum``, ``np.max``, ...
 an application          `Backend.apply`, `Backend.reference`; `match_value` for its derivative
 a solve                 `Backend.local_structure`; `Backend.implementation`: the class or function that the backend uses
@@ -22,7 +22,7 @@ a public call           `collectively`: all processes run it, or all raise
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from numbers import Number
 from typing import Any
 
@@ -39,9 +39,9 @@ __all__ = [
     "as_field",
     "backend_of",
     "collectively",
+    "folded",
     "formulas_of_kind",
     "gathered",
-    "is_distributed",
     "is_field",
     "match_value",
     "process_count",
@@ -50,6 +50,9 @@ __all__ = [
 ]
 
 BOX = anp.numpy_boxes.ArrayBox
+FOLD = 509  # words in a line of a fingerprint: a prime, so that a field that was shifted has another one
+OTHER_FOLD = 521  # where an axis of the array is a multiple of the first
+WHOLE = 8192  # bytes up to which a fingerprint is that of all bytes
 
 
 class Backend:
@@ -108,6 +111,16 @@ class Backend:
         """Return a field as an array with one axis, without a copy."""
         return field.reshape(-1)
 
+    def stack(self, fields: Sequence) -> Any:
+        """Return fields, traced or not, along a new first axis; where that is not possible, the tuple of them."""
+        if any(type(field) is BOX for field in fields):
+            return anp.stack(fields)
+        return np.stack(fields)
+
+    def fingerprint(self, field: Any) -> int:
+        """Return 64 bits that depend on all bits of a plain field."""
+        return hash(folded(np.asarray(field, order="C")))
+
     # ------------------------------------------------------------ applications and solves
 
     def apply(self, op: Any, u: Any, out: np.ndarray | None = None) -> Any:
@@ -132,6 +145,19 @@ class Backend:
 
 
 NUMPY = Backend()
+
+
+def folded(value: Any) -> bytes:
+    """Return bytes that depend on all bits of an array; a large one is cut into lines, added as whole numbers."""
+    if value.nbytes < WHOLE:
+        return value.tobytes()
+    if any(size % FOLD == 0 for size in value.shape):
+        fold = OTHER_FOLD
+    else:
+        fold = FOLD
+    flat = value.reshape(-1).view(np.uint8)
+    end = flat.size - flat.size % (8 * fold)
+    return flat[:end].view(np.uint64).reshape(-1, fold).sum(axis=0).tobytes() + flat[end:].tobytes()
 
 
 class ArrayKind(ABC):
@@ -179,11 +205,6 @@ def array_types() -> tuple[type, ...]:
 def is_field(value: Any) -> bool:
     """Return whether a plain value is a number, an array, or a field of any backend."""
     return isinstance(value, (np.ndarray, Number)) or type(value) in ARRAY_KINDS
-
-
-def is_distributed(value: Any) -> bool:
-    """Return whether a value, traced or not, is a field of which this process holds a part only."""
-    return bool(ARRAY_KINDS) and _type_of(value) in ARRAY_KINDS
 
 
 def backend_of(values: Iterable) -> Backend:

@@ -297,7 +297,7 @@ def _warn_unless_finite(name, derivative, again):
 
 
 def _cause_of_non_finite(again):
-    """Name the first call whose own derivative is not finite; None if there is no such call, or on ranks.
+    """Name the first call whose own derivative is not finite; None if there is no such call, or with several processes.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.autodiff.backend import BOX, formulas_of_kind, is_distributed
+from sparsedp.autodiff.backend import BOX, as_field, formulas_of_kind
 from sparsedp.errors import DerivativeError
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ def refuse_options(function: Callable, options: dict) -> None:
 
 def in_dtype(value: Any, dtype: DTypeLike) -> Any:
     """Return a plain value in a dtype."""
-    return value.astype(dtype) if is_distributed(value) else np.asarray(value, dtype)
+    return as_field(value).astype(dtype, copy=False)
 
 
 def operand(x: Any) -> Any:

@@ -30,8 +30,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from sparsedp._utils.counters import count
 from sparsedp._utils.pytree import labels, leaves
+from sparsedp.autodiff.backend import folded
 from sparsedp.autodiff.tape import plain
-from sparsedp.trajectory.specification import folded
 
 __all__ = ["Agreement", "end_all", "end_all_after_error", "state"]
 

@@ -16,8 +16,8 @@ from sparsedp._utils.validation import field_array
 from sparsedp.advection.method import TransportMethod
 from sparsedp.advection.settings import TransportSettings
 from sparsedp.advection.transport import method_and_rule
-from sparsedp.autodiff.backend import Backend, is_distributed
-from sparsedp.autodiff.tape import Rule, linear
+from sparsedp.autodiff.backend import Backend
+from sparsedp.autodiff.tape import Rule, linear, plain
 from sparsedp.errors import ShapeError
 from sparsedp.flow.projection_setup import ProjectionSetup
 from sparsedp.grid.grid import Grid, node_axes
@@ -189,6 +189,14 @@ class Layout(Partition, Backend):
         """Return the parts of arrays along the axes that belong to the block of this rank."""
         return [line[start:stop] for line, (start, stop) in zip(lines, self.box(part), strict=True)]
 
+    def stack(self, fields: Sequence) -> tuple:
+        """Return the tuple of fields."""
+        return tuple(fields)
+
+    def fingerprint(self, field: DistributedField) -> int:
+        """Return a whole number that depends on all bits of a field, the same on all ranks."""
+        return field.fingerprint()
+
     def flat(self, field: Any) -> Any:
         """Return the field itself, whose operations act on the flat block."""
         return field
@@ -213,13 +221,13 @@ class Layout(Partition, Backend):
 
     def split(self, space: Space, v: Any) -> tuple:
         """Return the components of a field, or the fields of a joint one; differentiable."""
-        if type(space) is Space and not is_distributed(v):
+        if type(space) is Space and not _is_distributed(v):
             return space.split_array(v)
         return tuple(piece.take(v) for piece in self._pieces(space))
 
     def join(self, space: Space, parts: Any) -> Any:
         """Return one field of its components, or of fields; differentiable."""
-        if type(space) is Space and not any(map(is_distributed, parts)):
+        if type(space) is Space and not any(map(_is_distributed, parts)):
             return space.join_arrays(parts)
         pairs = zip(self._pieces(space), parts, strict=True)
         return reduce(add, (piece.embed(everywhere(part, piece.space)) for piece, part in pairs))
@@ -273,6 +281,10 @@ class Piece(NamedTuple):
     space: Space
     take: Rule
     embed: Rule
+
+
+def _is_distributed(value):
+    return isinstance(plain(value), DistributedField)
 
 
 def _pieces(space):

@@ -13,12 +13,12 @@ import numpy as np
 
 from sparsedp._utils.pytree import flatten, leaves, mapped, paired
 from sparsedp._utils.validation import is_whole
-from sparsedp.autodiff.backend import as_field, is_distributed
+from sparsedp.autodiff.backend import as_field
 from sparsedp.autodiff.derivative import taped
 from sparsedp.autodiff.tape import dtype_of, is_variable, isbox, plain, split_boxes, traces_of
 from sparsedp.autodiff.tape_constants import constant
 from sparsedp.errors import DerivativeError
-from sparsedp.trajectory.specification import fingerprint, owned, refuse_mask, stacked
+from sparsedp.trajectory.specification import fingerprint, is_array, owned, refuse_mask, stacked
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -106,7 +106,7 @@ def _is_zero(back: Any) -> bool:
 
 
 class SelectedStates(LastState):
-    """The states of given numbers, stacked along a new first axis; on ranks a tuple of them.
+    """The states of given numbers, stacked along a new first axis; a tuple of fields that cannot be stacked.
 
     Parameters
     ----------
@@ -129,10 +129,10 @@ class SelectedStates(LastState):
         self._statics = []
         self._is_stored = bool(runner.specification.differentiated)
         for shape, dtype, value in zip(self.form.shapes, self.form.dtypes, runner.first.values, strict=True):
-            if runner.outer or is_distributed(value):
-                self._blocks.append([None] * n)
-            else:
+            if is_array(value) and not runner.outer:
                 self._blocks.append(np.empty((n, *shape), dtype))
+            else:
+                self._blocks.append([None] * n)
 
     def see(self, state: State) -> State:
         """Store a state; where all are returned, the state moves to the memory of the result."""
@@ -142,8 +142,8 @@ class SelectedStates(LastState):
         self._statics.append(state.statics)
         values = list(state.values)
         for k, block in enumerate(self._blocks):
-            if is_distributed(values[k]) and not isinstance(block, list):
-                block = self._blocks[k] = [*block]  # the first state was a NumPy array, this one is in blocks
+            if not isinstance(block, list) and not is_array(values[k]):
+                block = self._blocks[k] = [*block]  # the first state was a NumPy array, this one is another field
             if isinstance(block, list):
                 block[row] = owned(values[k])
             else:
@@ -157,15 +157,14 @@ class SelectedStates(LastState):
         arrays: list = []
         self._places = []
         for block in self._blocks:
-            if isinstance(block, list) and is_distributed(block[-1]):
+            if isinstance(block, list):
+                block = stacked(block)
+            if isinstance(block, tuple):
                 self._places.append(slice(len(arrays), len(arrays) + len(block)))
                 arrays += block
             else:
                 self._places.append(len(arrays))
-                if isinstance(block, list):
-                    arrays.append(stacked(block))
-                else:
-                    arrays.append(block)
+                arrays.append(block)
         self._blocks = []
         for block in arrays:
             if type(block) is np.ndarray:
@@ -279,7 +278,7 @@ class FunctionOfStates(LastState):
                 "keep uses a traced value that is not part of the state, and its derivative would be lost; "
                 "return what it needs of the state, and combine the two outside of rollout"
             )
-        if is_distributed(leaf):  # a field on ranks has a stack of its own
+        if not is_array(plain(leaf)):  # a field that cannot be stacked has a stack of its own
             place = len(self._stacks)
             self._stacks[place] = [owned(leaf)]
             return _StackedResult(place, None)

@@ -7,14 +7,14 @@ An `ArgumentForm` is the structure of an argument, and says whether another tree
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from numbers import Number
 from typing import TYPE_CHECKING, Any
 
-import autograd.numpy as anp
 import numpy as np
 
 from sparsedp._utils.pytree import TreeStructure, child, described, is_branch, keys, leaves, paired
 from sparsedp._utils.validation import check_finite, check_leaves, check_native, hidden_leaves
-from sparsedp.autodiff.backend import array_types, as_field, is_distributed
+from sparsedp.autodiff.backend import array_types, as_field, backend_of, folded
 from sparsedp.autodiff.derivative import is_finite
 from sparsedp.autodiff.tape import cast, dtype_of, is_variable, isbox, plain, split_boxes, traces_of
 from sparsedp.autodiff.tape_constants import constant
@@ -28,16 +28,12 @@ __all__ = [
     "RolloutSpecification",
     "contiguous",
     "fingerprint",
-    "folded",
+    "is_array",
     "owned",
     "refuse_foreign_trace",
     "refuse_mask",
     "stacked",
 ]
-
-FOLD = 509  # words in a line of a fingerprint: a prime, so that a field that was shifted has another one
-OTHER_FOLD = 521  # where an axis of the array is a multiple of the first
-WHOLE = 8192  # bytes up to which a fingerprint is that of all bytes
 
 
 class ArgumentForm(TreeStructure):
@@ -268,9 +264,14 @@ class RolloutSpecification:
 # ---- arrays of a state -----------------------------------------------------------------------------------------------
 
 
+def is_array(value: Any) -> bool:
+    """Whether a plain value is a number or array of NumPy, not a field of another backend."""
+    return isinstance(value, (np.ndarray, Number))
+
+
 def contiguous(value: Any) -> Any:
-    """Return a contiguous array, or a NumPy scalar of a value without axes; traced values are returned as they are."""
-    if isbox(value) or is_distributed(value):
+    """Return a contiguous array, or a NumPy scalar of a value without axes; values that are no arrays as they are."""
+    if not is_array(value):
         return value
     if np.ndim(value):
         return np.ascontiguousarray(value)
@@ -278,15 +279,10 @@ def contiguous(value: Any) -> Any:
 
 
 def owned(value: Any) -> Any:
-    """Return a contiguous copy; traced values, into which nothing writes, are returned as they are."""
-    if isbox(value) or is_distributed(value):
+    """Return a contiguous copy; traced values and other fields, into which nothing writes, are returned as they are."""
+    if not is_array(value):
         return value
     return contiguous(np.array(value, order="C"))
-
-
-def stacked(parts: Sequence) -> Any:
-    """Stack arrays of one shape, traced or not, along a new first axis."""
-    return (anp if any(map(isbox, parts)) else np).stack(parts)
 
 
 def fingerprint(values: Sequence, statics: Sequence = ()) -> list:
@@ -294,10 +290,7 @@ def fingerprint(values: Sequence, statics: Sequence = ()) -> list:
     marks = []
     for value in values:
         value = plain(value)
-        if is_distributed(value):
-            marks.append(value.fingerprint())
-        else:
-            marks.append(hash(folded(contiguous(value))))
+        marks.append(backend_of([value]).fingerprint(value))
     for leaf in statics:
         if isinstance(leaf, (int, str)):
             marks.append(hash(leaf))
@@ -306,17 +299,9 @@ def fingerprint(values: Sequence, statics: Sequence = ()) -> list:
     return marks
 
 
-def folded(value: Any) -> bytes:
-    """Return bytes that depend on all bits of an array; a large one is cut into lines, added as whole numbers."""
-    if value.nbytes < WHOLE:
-        return value.tobytes()
-    if any(size % FOLD == 0 for size in value.shape):
-        fold = OTHER_FOLD
-    else:
-        fold = FOLD
-    flat = value.reshape(-1).view(np.uint8)
-    end = flat.size - flat.size % (8 * fold)
-    return flat[:end].view(np.uint64).reshape(-1, fold).sum(axis=0).tobytes() + flat[end:].tobytes()
+def stacked(parts: Sequence) -> Any:
+    """Return values, traced or not, along a new first axis; the tuple of them if their backend cannot stack them."""
+    return backend_of([plain(parts[-1])]).stack(parts)
 
 
 # ---- refusals --------------------------------------------------------------------------------------------------------
