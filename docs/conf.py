@@ -28,7 +28,7 @@ exclude_patterns = ["_build", "**/GALLERY_HEADER.rst"]
 templates_path = ["_templates"]
 
 # Pages are Markdown; code blocks in them are run by tests/test_pages.py.
-myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "tasklist"]
 myst_heading_anchors = 3
 html_math_renderer = "mathml"  # formulas.py: no script, no fonts to fetch
 

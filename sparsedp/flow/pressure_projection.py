@@ -19,7 +19,10 @@ from __future__ import annotations
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from sparsedp._utils.reconstruction import Frozen
+from sparsedp.errors import ShapeError
 from sparsedp.flow.projection_setup import ProjectionSetup
 from sparsedp.grid.boundary_conditions import no_slip
 from sparsedp.grid.grid import check_grid
@@ -98,6 +101,11 @@ def projection(
     array([2., 3., 2., 3., 0., 0., 0., 0.])
     """
     check_grid("projection", grid)
+    if solid is not None and np.shape(solid) == grid.faces.shape != grid.shape:
+        raise ShapeError(
+            f"the second argument of projection is solid, a boolean array on {grid.cells}, got an array on "
+            f"{grid.faces}; write dp.projection(grid)(v) for a velocity v"
+        )
     settings = check_settings(method, rtol, maxiter, "project", options)
     set_up = grid.backend.implementation(ProjectionSetup)
     return Projection(set_up(grid, solid, boundary, settings))

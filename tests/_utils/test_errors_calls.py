@@ -87,6 +87,12 @@ TABLE = [
         "method must be one of auto, separable, direct, structured, multigrid, krylov, got an array of shape (4, 3); "
         "write dp.inverse(op)(b) for a right-hand side b",
     ),
+    (
+        lambda: dp.projection(GRID, np.ones(GRID.faces.size)),
+        ShapeError,
+        "the second argument of projection is solid, a boolean array on cells(4, 3), got an array on faces(4, 3); "
+        "write dp.projection(grid)(v) for a velocity v",
+    ),
     # objects that are called
     (
         lambda: dp.transport(GRID)(U, np.zeros(31)),
