@@ -88,6 +88,7 @@ def test_public_docstring(name):
     assert not lacks, f"dp.{name} lacks: " + "; ".join(lacks)
 
 
+@pytest.mark.xdist_group("docstrings of bridges")  # torch and JAX are imported on one worker
 @pytest.mark.parametrize("room", sparsedp._PUBLIC_PACKAGES)
 def test_docstrings_of_a_room(room):
     module = getattr(sparsedp, room)
@@ -137,6 +138,7 @@ def see_also(doc):
     return [name.strip() for name in found[1].replace("\n", " ").split(",")] if found else []
 
 
+@pytest.mark.xdist_group("docstrings of bridges")
 def test_see_also_holds_in_both_directions():
     """Every public function names others by their public names, and those name it."""
     links = {name: see_also(inspect.getdoc(value)) for name, value in names_with_a_page().items()}

@@ -162,6 +162,7 @@ def test_curves_mark_the_best_so_far(ax):
     assert np.array_equal(x, [1.0, 2.0, 4.0]) and np.array_equal(y, [3.0, 2.0, 1.0])
 
 
+@pytest.mark.whole
 def test_labels_of_a_narrow_audit_do_not_overlap():
     """Beside two others, as in examples/audit.py."""
     picture = plots.figure()
