@@ -261,7 +261,10 @@ def leaves(tree: Any, depth: int = 0) -> list:
         raise ValueError(
             f"a tree has containers nested more than {DEEPEST} deep, or one that contains itself; flatten it"
         )
-    return [leaf for name in names for leaf in leaves(child(tree, name), depth + 1)]
+    entries = []
+    for name in names:
+        entries += leaves(child(tree, name), depth + 1)
+    return entries
 
 
 def _build(tree, values):

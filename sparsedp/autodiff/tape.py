@@ -218,7 +218,8 @@ class Recorder:
         size = self.bytes or 0
         for num, held in enumerate((*args, value)):
             if num not in nums and type(held) not in FIXED:
-                size += sum(getattr(leaf, "nbytes", 0) for leaf in leaves(held))
+                for leaf in leaves(held):
+                    size += getattr(leaf, "nbytes", 0)
         self.bytes = size
 
     def taken(self) -> list[ReverseNode]:
@@ -434,11 +435,17 @@ def traces_of(values: Iterable) -> set[int]:
 
 def innermost(values: Sequence) -> list[int]:
     """Return the positions of the values on the innermost trace, if that is a reverse-mode trace; else none."""
-    trace = max((value._trace for value in values if isbox(value)), default=None)
-    nums = [num for num, value in enumerate(values) if isbox(value) and value._trace == trace]
-    if any(isinstance(values[num]._node, VJPNode) for num in nums):
-        return nums
-    return []
+    trace = -1
+    nums: list[int] = []
+    for num, value in enumerate(values):
+        if not isbox(value) or value._trace < trace:
+            continue
+        if value._trace > trace:
+            trace = value._trace
+            nums = []
+        if isinstance(value._node, VJPNode):
+            nums.append(num)
+    return nums
 
 
 def boxed(values: Iterable, roots: Iterable, number: int) -> list:
@@ -901,8 +908,11 @@ def through(rule: Rule, nums: Sequence[int], *args: Any) -> Any:
     """
     if not nums:
         return _run(rule, *args)
-    values = [arg._value if num in nums else arg for num, arg in enumerate(args)]
-    parents = [args[num]._node for num in nums]
+    values = list(args)
+    parents = []
+    for num in nums:
+        values[num] = args[num]._value
+        parents.append(args[num]._node)
     answer = _run(rule, *values)
     node = type(parents[0])(answer, through, (rule, *values), {}, [num + 1 for num in nums], parents)
     return new_box(answer, args[nums[0]]._trace, node)
@@ -928,8 +938,10 @@ def _call_vjp(argnums, ans, args, options):
                 f"{rule.name} must return one derivative for each of the {len(nums)} values asked for, "
                 f"got {returned}; return a tuple"
             )
-        pairs = zip(nums, cotangents, strict=True)
-        return [fit(rule.name, values[num], cotangent, g) for num, cotangent in pairs]
+        fitted = []
+        for num, cotangent in zip(nums, cotangents, strict=True):
+            fitted.append(fit(rule.name, values[num], cotangent, g))
+        return fitted
 
     return checked_pull
 

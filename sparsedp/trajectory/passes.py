@@ -8,6 +8,7 @@ of higher order are those of the calls that the passes execute.
 from __future__ import annotations
 
 from copy import copy
+from functools import partial
 from operator import is_
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,7 @@ from sparsedp._utils.progress import shown_steps
 from sparsedp.autodiff.derivative import checking_derivatives, is_finite, zero_like
 from sparsedp.autodiff.tape import Rule, backward, fit, innermost, through
 from sparsedp.errors import DerivativeError, NonFiniteError
-from sparsedp.trajectory.record import Record, backward_record, largest, sampling_interval
+from sparsedp.trajectory.record import Record, backward_record, largest
 from sparsedp.trajectory.specification import RolloutSpecification, refuse_foreign_trace, stacked
 from sparsedp.trajectory.step_runner import State, StepRunner
 
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
 __all__ = ["RolloutRule"]
 
+SAMPLES = 32  # measurements of the cotangent in a long run
+APART = 16  # least number of steps between two of them: each one reads the whole cotangent
 NODE_BYTES = 800  # of a node, its closures and tuples: 350 to 1200 were measured
 
 
@@ -123,7 +126,7 @@ def run_backward(
     """
     specification = runner.specification
     n = plan.n
-    interval = sampling_interval(n)
+    interval = max(n // SAMPLES, APART)
     source = outputs.sources(n, cotangents)
     sums: dict = {}  # root of params: (sum so far, whether it may be written to)
     rows: list[list] = []  # cotangents of the rows of each block of inputs
@@ -343,12 +346,7 @@ class RolloutRule(Rule):
 
     def vjp(self, nums: Sequence[int], ans: Any, *args: Any) -> Callable:
         """Return the function from the cotangents of the result to those of the differentiated arguments."""
-        runs = self._take_runs()
-
-        def pull(g: Any) -> tuple:
-            return self._cotangents(args, self.parts(g), runs)
-
-        return pull
+        return partial(self._cotangents, args, self._take_runs())
 
     def _take_runs(self) -> list:
         """Return and clear the last run; the rule does not hold it, which would keep its states in memory."""
@@ -356,8 +354,9 @@ class RolloutRule(Rule):
         self._runs = []
         return runs
 
-    def _cotangents(self, args: tuple, g: list, runs: list) -> tuple:
+    def _cotangents(self, args: tuple, runs: list, cotangent: Any) -> tuple:
         """Return the cotangents of the differentiated arguments, which must be finite."""
+        g = self.parts(cotangent)
         backs = self._backward_pass(args, g, runs)
         for position, back in zip(self.specification.differentiated, backs, strict=True):
             if not is_finite(back) and all(map(is_finite, g)):

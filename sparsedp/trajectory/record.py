@@ -17,11 +17,9 @@ from sparsedp._utils.counters import thread
 from sparsedp.autodiff.tape import plain
 from sparsedp.errors import GrowthWarning
 
-__all__ = ["Record", "backward_record", "largest", "sampling_interval"]
+__all__ = ["Record", "backward_record", "largest"]
 
 LIMIT = 1e8  # amplification that costs half of the digits
-SAMPLES = 32  # measurements of the cotangent in a long run
-APART = 16  # least number of steps between two of them: each one reads the whole cotangent
 
 
 class Record(NamedTuple):
@@ -61,11 +59,6 @@ class Record(NamedTuple):
     def flagged(self) -> bool:
         """Return whether the cotangent grew beyond the limit at which a gradient is useful."""
         return self.amplification > LIMIT
-
-
-def sampling_interval(n: int) -> int:
-    """Return after how many steps of n the cotangent is measured again."""
-    return max(n // SAMPLES, APART)
 
 
 def backward_record(n: int, kept: int, recomputed: int, norms: list[tuple[int, float]], last_cut: int) -> Record:

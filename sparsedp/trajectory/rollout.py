@@ -145,7 +145,9 @@ def rollout(
     array([8., 2.])
     """
     check_function("rollout", step, "lambda state, params: ...")
-    n = _number_of_steps(n)
+    if isbox(n):
+        raise DerivativeError("rollout needs n as a plain whole number, got a traced value; it has no derivative")
+    n = check_whole("n of rollout", n, 0, "; give the number of steps")
     trees = {"state": state, "params": params}
     if inputs is not None:
         trees["inputs"] = inputs
@@ -180,12 +182,6 @@ def rollout(
     arguments = tuple(trees.values())
     result = collectively("rollout", arguments, through, rule, specification.differentiated, *args)
     return outputs.tree(rule.parts(result))
-
-
-def _number_of_steps(n: int) -> int:
-    if isbox(n):
-        raise DerivativeError("rollout needs n as a plain whole number, got a traced value; it has no derivative")
-    return check_whole("n of rollout", n, 0, "; give the number of steps")
 
 
 def _check_inputs(inputs: Any, n: int) -> None:

@@ -3,13 +3,12 @@
 import gc
 import pickle
 import re
-import sys
 import weakref
-from pathlib import Path
 
 import autograd.numpy as anp
 import numpy as np
 import pytest
+from journeys import check_journey
 from test_solvers import ALL, EVERY, GENERAL, PROBLEMS, stretched
 
 import sparsedp as dp
@@ -316,25 +315,11 @@ def test_a_coefficient_may_be_reused_before_the_pullback():
 # ---------------------------------------------------------------- structure
 
 
-def test_a_direct_solve_enters_few_functions():
+def test_a_direct_solve_and_its_gradient_enter_few_functions():
     """A reader who follows `inv(b)` sees the whole solve in at most 15 functions of 6 files."""
     grid = dp.Grid((20, 21), size=1.0)
     inv = dp.inverse(-dp.laplacian(grid, dp.dirichlet), "direct")
     b = np.ones(grid.shape)
-    package = str(Path(dp.__file__).parent)
-    entered = set()
-
-    def record(frame, event, argument):
-        code = frame.f_code
-        if event == "call" and code.co_filename.startswith(package):
-            entered.add((code.co_filename, code.co_qualname))
-
-    gc.disable()  # functions that it would call are not of the solve
-    sys.setprofile(record)
-    try:
-        inv(b)
-    finally:
-        sys.setprofile(None)
-        gc.enable()
-    assert len(entered) <= 15, sorted(entered)
-    assert len({file for file, _ in entered}) <= 6, sorted(entered)
+    gradient = dp.value_and_grad(lambda b: anp.sum(inv(b) ** 2))
+    check_journey(lambda: inv(b), functions=15, files=6)
+    check_journey(lambda: gradient(b), functions=76, files=16)

@@ -6,6 +6,7 @@ import autograd
 import autograd.numpy as anp
 import numpy as np
 import pytest
+from journeys import check_journey
 
 import sparsedp as dp
 from sparsedp._utils.pytree import flatten, leaves
@@ -296,3 +297,11 @@ def test_second_derivative_in_a_number_of_python(step):
 
     assert autograd.grad(slope)(0.1) == autograd.grad(slope)(np.float64(0.1))
     assert autograd.grad(slope)(0.1) == pytest.approx((slope(0.1 + 1e-5) - slope(0.1 - 1e-5)) / 2e-5, rel=1e-6)
+
+
+def test_the_gradient_of_a_rollout_enters_few_functions():
+    def decay(u, rate):
+        return u - 0.1 * rate * u
+
+    gradient = dp.value_and_grad(lambda u: anp.sum(dp.rollout(decay, u, 1.0, 3) ** 2))
+    check_journey(lambda: gradient(np.ones((20, 21))), functions=139, files=18)
