@@ -19,6 +19,7 @@ import docstrings
 from matplotlib import pyplot
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
+from PIL import Image
 from sphinx_gallery.scrapers import figure_rst
 
 import sparsedp as dp
@@ -29,6 +30,7 @@ DRAWN = Path(__file__).parent / "_build" / "drawn"  # what they write with --out
 CARDS = Path(__file__).parent / "_build" / "cards"  # one panel of each picture, at the size of a card of the gallery
 CARD_SIZE = (4.0, 2.8)  # in inches: text of 10 points is readable on a card
 CARD_DPI = 150
+WIDE = 1.6  # width over height
 PANELS = {"obstacle": 1, "plume": 1}  # the panel for the card, where it is not the first one
 HEADER = "GALLERY_HEADER.rst"
 INTRODUCTION = """Gallery
@@ -152,7 +154,16 @@ def pictures(block, block_vars, gallery_conf):
     if names:
         draw_card(Path(block_vars["src_file"]).stem)
         pyplot.close("all")  # what was saved is not shown twice
-    return figure_rst(names, gallery_conf["src_dir"])
+    shown = figure_rst(names, gallery_conf["src_dir"])
+    if len(names) == 1 and is_wide(names[0]):
+        shown = ".. container:: wide-picture\n" + textwrap.indent(shown, "   ")  # scrolls on a phone
+    return shown
+
+
+def is_wide(path):
+    """Whether panels of a picture lie side by side, too small to read at the width of a phone."""
+    width, height = Image.open(path).size
+    return width > WIDE * height
 
 
 def draw_card(name):
