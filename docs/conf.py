@@ -6,6 +6,7 @@ from pathlib import Path
 
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
 
+import course_notebooks
 import docstrings
 import gallery_scripts
 
@@ -59,6 +60,7 @@ sphinx_gallery_conf = {
     "show_signature": False,
     "write_computation_times": False,
     "download_all_examples": False,
+    "first_notebook_cell": "import sys\n\nsys.argv = sys.argv[:1]  # Jupyter has arguments, the script its defaults",
     "thumbnail_size": (400, 280),
 }
 
@@ -71,7 +73,8 @@ html_show_sphinx = False
 html_copy_source = False
 html_show_sourcelink = False
 html_show_search_summary = False  # a page that is opened from disk may not fetch others
-html_sidebars = {"index": [], "start": [], "ideas": [], "numbers": [], "compare": [], "building": [], "gallery/**": []}
+WITHOUT_SIDEBAR = "index", "start", "ideas", "numbers", "compare", "building", "course", "teaching", "gallery/**"
+html_sidebars = {page: [] for page in WITHOUT_SIDEBAR}
 html_theme_options = {
     "navbar_align": "left",
     "show_prev_next": False,
@@ -91,3 +94,4 @@ def setup(app):
     app.connect("viewcode-follow-imported", docstrings.defined_in)
     app.connect("builder-inited", gallery_scripts.thumbnails, priority=900)  # after sphinx-gallery has run the examples
     app.connect("builder-inited", gallery_scripts.measured, priority=910)
+    app.connect("builder-inited", course_notebooks.offer, priority=920)

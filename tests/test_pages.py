@@ -7,11 +7,13 @@ without an error, at the widths of a phone and of a desk, with its formulas and 
 import functools
 import importlib.util
 import inspect
+import json
 import os
 import re
 import shutil
 import subprocess
 import sys
+import zipfile
 from html.parser import HTMLParser
 from urllib.parse import unquote, urlsplit
 
@@ -277,6 +279,23 @@ def test_a_card_is_one_panel_of_readable_size(tmp_path, monkeypatch):
         assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= figure.bbox.x1 and box.y1 <= figure.bbox.y1
         pyplot.close("all")
         assert Image.open(tmp_path / f"{name}.png").size == (600, 420)
+
+
+@pytest.mark.slow
+def test_pages_of_the_course_offer_their_notebooks(site):
+    """Each page links to the notebook with the audit, also in the archive; that of an example that runs has outputs."""
+    course = [path for path in pages(site) if path.parent.name == "a_course" and path.name != "index.html"]
+    offered = {}
+    for path in course:
+        links = [path.parent / unquote(link) for link in Page(path).links if link.endswith((".ipynb", ".zip"))]
+        [file], [archive] = [[link for link in links if link.suffix == kind] for kind in (".ipynb", ".zip")]
+        text = file.read_text(encoding="utf-8")
+        assert "## Audit" in text and "parse_args" not in text
+        assert zipfile.ZipFile(archive).read(file.name).decode() == text
+        offered[path.stem] = json.loads(text)["cells"]
+    executed = [name for name, cells in offered.items() if any(cell.get("outputs") for cell in cells)]
+    assert len(offered) == 10 and executed == ["heat_rod"]
+    assert sum(link.endswith(".ipynb") for link in Page(site / "course.html").links) == 10
 
 
 @pytest.fixture(scope="session")
