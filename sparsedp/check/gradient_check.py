@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
 from math import inf, isinf, isnan
 from typing import Any
 
@@ -153,16 +154,18 @@ def gradient(
     lines = len(point.directions(point.vector, count, audit_generator(0), is_wanted))
     ticks = _announced(3 + POINTS * min(lines, 2) + 2 * len(evaluations.steps) * lines)
     evaluations.tick = lambda: next(ticks, None)
-    with unwarned():  # a gradient that is not finite is a verdict
+    with unwarned(), closing(ticks):  # a gradient that is not finite is a verdict
         return _Auditor(evaluations, gradient is None, count, audit_generator(rng), quick).audit()
 
 
-def _announced(total: int) -> Iterator[Any]:
-    """Tell those who watch a terminal how many evaluations are expected, and return as many ticks of a bar."""
-    if not sys.stderr.isatty():
-        return iter(())
-    sys.stderr.write(f"check.gradient: about {total} evaluations of the loss to come\n")
-    return iter(bar(range(total), needed=False, desc="check.gradient", unit="evaluation", leave=False))
+def _announced(total: int) -> Generator[Any, None, None]:
+    """Tell those who watch a terminal how many evaluations are expected, and yield as many ticks of a bar.
+
+    The bar disappears when the generator is closed; an open one would push later bars of the caller down a line.
+    """
+    if sys.stderr.isatty():
+        sys.stderr.write(f"check.gradient: about {total} evaluations of the loss to come\n")
+        yield from bar(range(total), needed=False, desc="check.gradient", unit="evaluation", leave=False)
 
 
 class _Auditor:

@@ -79,11 +79,22 @@ def test_a_terminal_without_tqdm_gets_the_first_line_only(monkeypatch):
 
 
 def test_with_tqdm_there_is_a_bar(monkeypatch):
-    pytest.importorskip("tqdm")
+    """It is closed at the end, also if the loss raises: a later bar is not pushed down a line."""
+    tqdm = pytest.importorskip("tqdm").tqdm
     screen = Terminal()
     monkeypatch.setattr(sys, "stderr", screen)
-    dp.check.gradient(lambda x: time.sleep(0.002) or np.sum(np.sin(x)), np.linspace(1.0, 2.0, 5))
+    result = dp.check.gradient(lambda x: time.sleep(0.002) or np.sum(np.sin(x)), np.linspace(1.0, 2.0, 5))
     assert "evaluation/s" in screen.getvalue()
+    with tqdm(total=1) as later:
+        assert result and later.pos == 0
+    with pytest.raises(LookupError, match="no such key"):
+        dp.check.gradient(lambda x: fails(), np.linspace(1.0, 2.0, 5))
+    with tqdm(total=1) as later:
+        assert later.pos == 0
+
+
+def fails():
+    raise LookupError("no such key")
 
 
 def test_nothing_is_shown_without_a_terminal(capsys):
