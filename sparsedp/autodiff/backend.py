@@ -8,7 +8,8 @@ backend of fields whose blocks are stored by several processes.
 asked of                by
 ======================  ============================================================================================
 a grid                  ``grid.backend``; `Backend.check`, `Backend.place`, `Backend.mesh`
-a field                 `Backend.split`, `Backend.join`, `Backend.volumes`; `as_field`, `gathered`, `replicated`
+a field                 `Backend.split`, `Backend.join`, `Backend.volumes`, `Backend.field`, `Backend.combinable`;
+                        `as_field`, `gathered`, `replicated`
 a state of a rollout    `Backend.stack`, `Backend.fingerprint`
 a reduction             NumPy's functions: a field of another backend implements ``np.sum``, ``np.max``, ...
 an application          `Backend.apply`, `Backend.reference`; `match_value` for its derivative

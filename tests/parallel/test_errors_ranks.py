@@ -166,6 +166,33 @@ def test_names():
     assert repr(scene.u) == "<field on cells(5, 4), on rank 0 of 1>" and repr(scene.grid).endswith("on 1 ranks)")
 
 
+@on_ranks
+def test_operators_are_pictured_as_on_one_process():
+    scene = Scene()
+    assert scene.G._repr_html_().replace(" on 1 ranks", "") == dp.gradient(dp.Grid((5, 4)))._repr_html_()
+
+
+@on_ranks
+def test_an_audit_names_places_as_on_one_process():
+    from mpi4py import MPI
+
+    plain = dp.Grid((5, 4), size=1.0)
+    factors = np.ones(plain.shape)
+    factors[2, 1] = 1.5
+
+    def wrong_vjp(nums, ans, u):
+        return lambda g: (2 * u * g * factors,)
+
+    wrong = dp.differentiable("wrong square", lambda u: u * u, wrong_vjp)
+    texts = []
+    for grid in (plain, dp.distribute(plain, MPI.COMM_SELF)):
+        L = dp.laplacian(grid)
+        u = dp.identity(grid.cells)(np.sin(np.arange(20.0)).reshape(5, 4))
+        audit = dp.check.gradient(lambda u, L=L: anp.sum(L(wrong(u)) ** 2), u)
+        texts.append([line for line in str(audit).splitlines() if "(2, 1)" in line or "x = " in line])
+    assert texts[0] and texts[0] == texts[1]
+
+
 def test_several_processes_without_mpi4py(monkeypatch):
     monkeypatch.setenv("OMPI_COMM_WORLD_SIZE", "2")
     monkeypatch.setitem(sys.modules, "mpi4py", None)
