@@ -19,7 +19,6 @@ SETTINGS = {
     "OMPI_ALLOW_RUN_AS_ROOT": "1",
     "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
     "OMPI_MCA_btl_vader_single_copy_mechanism": "none",  # containers forbid it
-    "OMPI_MCA_mpi_yield_when_idle": "1",  # other work on the machine does not stop the processes
     "OMP_NUM_THREADS": "1",
     "NUMBA_NUM_THREADS": "1",
     "PYTHONFAULTHANDLER": "1",

@@ -36,8 +36,8 @@ def by_hand(x):
     return sum(weight * loss(x, scene) for weight, scene in zip(WEIGHTS, SCENES, strict=True))
 
 
-def close(found, wanted, rtol=1e-12):
-    pairs = zip(leaves(found), leaves(wanted), strict=True)
+def close(actual, expected, rtol=1e-12):
+    pairs = zip(leaves(actual), leaves(expected), strict=True)
     return all(a is b is None or onp.allclose(a, b, rtol, 1e-6 * rtol * onp.max(onp.abs(b))) for a, b in pairs)
 
 
@@ -75,11 +75,11 @@ class Reversed:
 
 def test_derivatives_are_those_of_the_sum():
     total = dp.ensemble(loss, SCENES, weights=WEIGHTS)
-    wanted, gradient = dp.value_and_grad(by_hand)(X)
-    value, found = dp.value_and_grad(total)(X)
-    assert total(X) == value and abs(value / wanted - 1) <= 1e-13
-    assert close({**found, "few": 0}, {**gradient, "few": 0}) and close(found["few"], gradient["few"], 1e-6)
-    assert found["few"].dtype == onp.float32 and type(found["s"]) is float and found["n"] is None
+    expected, gradient = dp.value_and_grad(by_hand)(X)
+    value, actual = dp.value_and_grad(total)(X)
+    assert total(X) == value and abs(value / expected - 1) <= 1e-13
+    assert close({**actual, "few": 0}, {**gradient, "few": 0}) and close(actual["few"], gradient["few"], 1e-6)
+    assert actual["few"].dtype == onp.float32 and type(actual["s"]) is float and actual["n"] is None
     assert abs(dp.jvp(total, X, T)[1] / dp.jvp(by_hand, X, T)[1] - 1) <= 1e-6
     assert close(dp.hvp(total, X, T), dp.hvp(by_hand, X, T), 1e-6)
 
@@ -94,12 +94,12 @@ def test_complex_unknowns(rng):
     f = lambda z, b: np.real(np.sum(z**3 * b)) + np.sum(np.abs(z) ** 4)
     scenes, z, t = rng.standard_normal((3, 4)), *(rng.standard_normal((2, 4)) + 1j * rng.standard_normal((2, 4)))
     total = dp.ensemble(f, scenes)
-    wanted = lambda z: sum(f(z, b) for b in scenes)
-    assert close(dp.grad(total)(z), dp.grad(wanted)(z))
-    assert close(dp.jvp(total, z, t)[1], dp.jvp(wanted, z, t)[1])
-    assert close(dp.hvp(total, z, t), dp.hvp(wanted, z, t))
+    expected = lambda z: sum(f(z, b) for b in scenes)
+    assert close(dp.grad(total)(z), dp.grad(expected)(z))
+    assert close(dp.jvp(total, z, t)[1], dp.jvp(expected, z, t)[1])
+    assert close(dp.hvp(total, z, t), dp.hvp(expected, z, t))
     pair = lambda f: lambda z: np.real(np.sum(dp.grad(f)(z) ** 2 * t))
-    assert close(dp.grad(pair(total))(z), dp.grad(pair(wanted))(z))
+    assert close(dp.grad(pair(total))(z), dp.grad(pair(expected))(z))
 
 
 def test_the_check_agrees():
@@ -108,18 +108,18 @@ def test_the_check_agrees():
 
 @pytest.mark.parametrize("chunk", [None, 2, 9])
 def test_the_same_bits_in_any_order_of_work(chunk):
-    wanted = bits(dp.ensemble(loss, SCENES, weights=WEIGHTS, chunk=chunk))
-    assert bits(dp.ensemble(loss, SCENES, Reversed(), WEIGHTS, chunk)) == wanted
+    expected = bits(dp.ensemble(loss, SCENES, weights=WEIGHTS, chunk=chunk))
+    assert bits(dp.ensemble(loss, SCENES, Reversed(), WEIGHTS, chunk)) == expected
     with ThreadPoolExecutor(3) as pool:
-        assert bits(dp.ensemble(loss, SCENES, pool, WEIGHTS, chunk)) == wanted
+        assert bits(dp.ensemble(loss, SCENES, pool, WEIGHTS, chunk)) == expected
 
 
 @pytest.mark.whole
 @pytest.mark.parametrize("workers", [1, 2, 3])
 def test_the_same_bits_from_other_processes(workers):
-    wanted = bits(dp.ensemble(loss, SCENES, weights=WEIGHTS))
+    expected = bits(dp.ensemble(loss, SCENES, weights=WEIGHTS))
     with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-        assert bits(dp.ensemble(loss, SCENES, pool, WEIGHTS)) == wanted
+        assert bits(dp.ensemble(loss, SCENES, pool, WEIGHTS)) == expected
 
 
 @pytest.mark.whole
@@ -164,8 +164,8 @@ def test_a_worker_keeps_what_it_has_unpacked():
 
 
 def test_a_worker_that_forgets_unpacks_again():
-    wanted, total = (dp.ensemble(loss, SCENES, some, WEIGHTS, 2) for some in (None, Reversed(forgets=True)))
-    assert [bits(total) for _ in range(2)] == [bits(wanted)] * 2
+    expected, total = (dp.ensemble(loss, SCENES, some, WEIGHTS, 2) for some in (None, Reversed(forgets=True)))
+    assert [bits(total) for _ in range(2)] == [bits(expected)] * 2
 
 
 def summed(x, scene):
@@ -186,8 +186,8 @@ def test_batches_of_scenes():
     total = dp.ensemble(lambda x, scene: (x - scene) ** 2, [1.0, 2.0, 6.0, 7.0], weights=[1, 1, 2, 1], chunk=2)
     assert dp.value_and_grad(total)(3.0, [2, 0, 0]) == (26.0, -4.0)
     batches = [[0, 3], [1, 2]]
-    found = dp.minimize(total, 0.0, "adam", 200, batches=batches, rate=0.1)
-    assert 3.0 < found.x < 5.0
+    actual = dp.minimize(total, 0.0, "adam", 200, batches=batches, rate=0.1)
+    assert 3.0 < actual.x < 5.0
 
 
 @pytest.mark.parametrize("executor", [None, Reversed()], ids=["here", "elsewhere"])

@@ -135,10 +135,10 @@ REFUSED = [
 @on_ranks
 @pytest.mark.parametrize("case", range(len(REFUSED)))
 def test_refusals(case):
-    error, told, act = REFUSED[case]
+    error, message, act = REFUSED[case]
     with pytest.raises(error) as caught:
         act(Scene())
-    assert str(caught.value) == told
+    assert str(caught.value) == message
 
 
 @on_ranks
@@ -154,10 +154,10 @@ def test_a_null_vector_that_nobody_tries():
 @on_ranks
 def test_another_mpi(monkeypatch):
     monkeypatch.setenv("PMI_SIZE", "4")
-    told = "4 processes were started, but mpi4py belongs to another MPI and finds one; reinstall it for this MPI"
+    message = "4 processes were started, but mpi4py belongs to another MPI and finds one; reinstall it for this MPI"
     with pytest.raises(RuntimeError) as caught:
         dp.distribute(dp.Grid(3))
-    assert str(caught.value) == told
+    assert str(caught.value) == message
 
 
 @on_ranks
@@ -196,10 +196,10 @@ def test_an_audit_names_places_as_on_one_process():
 def test_several_processes_without_mpi4py(monkeypatch):
     monkeypatch.setenv("OMPI_COMM_WORLD_SIZE", "2")
     monkeypatch.setitem(sys.modules, "mpi4py", None)
-    told = "distribute on several processes needs mpi4py and petsc4py (*); install them, or start one process"
+    message = "distribute on several processes needs mpi4py and petsc4py (*); install them, or start one process"
     with pytest.raises(ImportError) as caught:
         dp.distribute(dp.Grid(3))
-    start, end = told.split("*")
+    start, end = message.split("*")
     assert str(caught.value).startswith(start) and str(caught.value).endswith(end)
 
 
@@ -230,16 +230,16 @@ def test_an_error_of_one_rank_is_that_of_all(count):
     """Type and words: 30 kinds, planted on the last rank or met by it alone."""
     lines = printed("faults.py", count).splitlines()
     assert lines[-1] == "all agree" and len(lines) >= 30
-    assert count != 2 or {f"{fault}: {told}" for fault, told in PLANTED.items()} <= set(lines)
+    assert count != 2 or {f"{fault}: {message}" for fault, message in PLANTED.items()} <= set(lines)
 
 
 @on_ranks
 @pytest.mark.whole
 @pytest.mark.parametrize(
-    "how, told",
+    "how, message",
     [("kill", "signal 9"), ("file", "No such file or directory: '/nowhere/rank.npy'"), ("waits", "of one rank")],
 )
-def test_a_rank_that_ends_ends_all(how, told):
+def test_a_rank_that_ends_ends_all(how, message):
     done = launched("faults.py", 2, how, seconds=30)
-    assert done.returncode != 0 and told in done.stderr + done.stdout
+    assert done.returncode != 0 and message in done.stderr + done.stdout
     assert how == "kill" or "rank 1 of 2: Traceback" in done.stderr

@@ -1,4 +1,4 @@
-"""Fields on ranks: what a user is told in one process, and, where PETSc is installed, the scripts of tests/ranks/."""
+"""Fields on ranks: one process without MPI, and the scripts of tests/ranks/ if MPI and PETSc are installed."""
 
 import sys
 from functools import cache

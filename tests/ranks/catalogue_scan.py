@@ -1,4 +1,4 @@
-"""Every line of the catalogue on ranks, and sums of them: beside one process, its transpose, the hash of what it gives.
+"""Every operator of the catalogue on ranks, and sums of them: errors, dot tests, and a hash of the results.
 
     mpirun -n 4 python -m mpi4py tests/ranks/catalogue_scan.py
 
@@ -24,7 +24,7 @@ GRIDS = [
 ]
 
 
-def beside_the_identity(direction):
+def sum_with_the_identity(direction):
     """One pass adds up the terms of a sum, in another order at the ends of a row: here one end needs no neighbour."""
     return lambda grid, sides: 0.4 * dp.identity(grid.cells) - 1.7 * dp.upwind(grid, grid.dim - 1, direction, sides)
 
@@ -35,8 +35,8 @@ def after_a_laplacian(grid, sides):
 
 
 SUMS = {
-    "sum-forward": Entry("sum", beside_the_identity(1)),
-    "sum-backward": Entry("sum", beside_the_identity(-1)),
+    "sum-forward": Entry("sum", sum_with_the_identity(1)),
+    "sum-backward": Entry("sum", sum_with_the_identity(-1)),
     "sum-laplacian": Entry("sum", after_a_laplacian),
 }
 
@@ -47,12 +47,12 @@ def boundary(grid):
     return {name: sides[a] for a, name in enumerate(grid.axes) if not grid.periodic[a]}
 
 
-def whole(u):
+def as_array(u):
     """A result as one array, on ranks or not."""
     return np.asarray(dp.gather(u))
 
 
-def looked_at(entry, plain, grid):
+def compared(entry, plain, grid):
     """(largest error, dot test, digest) of one operator on one grid; or the refusal."""
     one = entry.make(plain, boundary(plain))
     try:
@@ -60,23 +60,23 @@ def looked_at(entry, plain, grid):
         digest = sha256()
         worst = 0.0
         u, g = (np.random.default_rng(5).standard_normal(space.shape) for space in (one.domain, one.codomain))
-        found = []
-        for act, wanted, x in ((op, one, u), (op.T, one.T, g)):
-            y = whole(act(x))
-            right = wanted(x)
+        figures = []
+        for act, reference, x in ((op, one, u), (op.T, one.T, g)):
+            y = as_array(act(x))
+            right = reference(x)
             assert y.shape == right.shape
-            scale = max(np.max(wanted_magnitude(wanted, x), initial=0.0), 1e-300)
+            scale = max(np.max(magnitude_of(reference, x), initial=0.0), 1e-300)
             worst = max(worst, float(np.max(np.abs(y - right), initial=0.0) / scale))
             digest.update(y.tobytes())
-            found.append(act(x))
-        terms = np.vdot(g, found[0]), np.vdot(u, found[1])
-        dot = abs(terms[0] - terms[1]) / (np.vdot(np.abs(g), wanted_magnitude(one, u)) or 1.0)
+            figures.append(act(x))
+        terms = np.vdot(g, figures[0]), np.vdot(u, figures[1])
+        dot = abs(terms[0] - terms[1]) / (np.vdot(np.abs(g), magnitude_of(one, u)) or 1.0)
         return worst, float(dot), digest.hexdigest()[:16]
     except TypeError as error:
         return str(error)
 
 
-def wanted_magnitude(op, x):
+def magnitude_of(op, x):
     """|A| |x|, the scale of rounding errors."""
     return np.abs(op.matrix) @ np.abs(x).reshape(-1)
 
@@ -89,11 +89,11 @@ def main():
         for label, entry in [*zip(LABELS, CATALOGUE), *SUMS.items()]:
             if plain.dim < entry.least_dim:
                 continue
-            found = looked_at(entry, plain, grid)
-            assert len(set(comm.allgather(repr(found)))) == 1, (label, plain, comm.allgather(repr(found)))
+            figures = compared(entry, plain, grid)
+            assert len(set(comm.allgather(repr(figures)))) == 1, (label, plain, comm.allgather(repr(figures)))
             if comm.rank == 0:
-                told = f"refused {found}" if isinstance(found, str) else "{:.2e} {:.2e} {}".format(*found)
-                print(f"{number} {label} {told}")
+                text = f"refused {figures}" if isinstance(figures, str) else "{:.2e} {:.2e} {}".format(*figures)
+                print(f"{number} {label} {text}")
 
 
 if __name__ == "__main__":

@@ -20,8 +20,8 @@ def counted(loss, x):
     """The second plan of a loss, when all is set up: the same on every rank."""
     dp.explain(loss, x)
     plan = dp.explain(loss, x)
-    told = COMM.allgather((plan.totals, plan.skipped, plan.tape_nodes, plan.tape_bytes))
-    assert told == [told[0]] * COMM.size, told
+    counts_of_ranks = COMM.allgather((plan.totals, plan.skipped, plan.tape_nodes, plan.tape_bytes))
+    assert counts_of_ranks == [counts_of_ranks[0]] * COMM.size, counts_of_ranks
     assert f"{plan.totals['reductions']} reductions" in str(plan)
     assert plan.tape_bytes >= 8 * GRID.cells.size  # a field on ranks counts, all of it
     return [plan.totals[word] for word in ("exchanges between ranks", "bytes in them", "reductions")]

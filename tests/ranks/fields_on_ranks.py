@@ -1,4 +1,4 @@
-"""Fields on ranks: what NumPy does with them, and derivatives, beside one process.
+"""NumPy's functions of fields on ranks, and derivatives, compared with one process.
 
 mpirun -n 2 python -m mpi4py tests/ranks/fields_on_ranks.py
 """
@@ -23,14 +23,14 @@ def same_everywhere(value):
     return value
 
 
-def close(value, wanted, tol=1e-13):
-    """Compare, in the size of what is wanted."""
+def close(value, expected, tol=1e-13):
+    """Compare with the expected value, relative to its size."""
     value = np.asarray(dp.gather(value))
-    wanted = np.asarray(wanted)
-    assert value.shape == wanted.shape and value.dtype == wanted.dtype, (value, wanted)
+    expected = np.asarray(expected)
+    assert value.shape == expected.shape and value.dtype == expected.dtype, (value, expected)
     same_everywhere(value)
-    error = np.abs(np.subtract(value, wanted, dtype=complex))
-    assert np.max(error, initial=0.0) <= tol * np.max(np.abs(wanted), initial=1e-300), (value, wanted)
+    error = np.abs(np.subtract(value, expected, dtype=complex))
+    assert np.max(error, initial=0.0) <= tol * np.max(np.abs(expected), initial=1e-300), (value, expected)
 
 
 def fields():
@@ -122,26 +122,26 @@ REFUSED = [
 
 
 def numpy_is_whole_or_refused():
-    """Arithmetic and sums are those of the whole array; what looks further is refused, by name."""
+    """Arithmetic and sums are those of the whole array; other functions raise an error with their name."""
     for whole, u in fields():
         tol = 1e-6 if whole.dtype == np.float32 else 1e-13
         for act in ARITHMETIC + (ORDERED if whole.dtype.kind != "c" else []):
             try:
-                wanted = act(whole)
+                expected = act(whole)
             except TypeError:
                 continue  # NumPy takes no such numbers either
-            close(act(u), wanted, tol)
+            close(act(u), expected, tol)
         for act in REFUSED:
             try:
-                found = act(u)
+                actual = act(u)
             except TypeError as error:
                 assert "on ranks" in str(error), error
             else:
-                raise AssertionError(f"not refused: number {REFUSED.index(act)}, {found}")
+                raise AssertionError(f"not refused: number {REFUSED.index(act)}, {actual}")
 
 
 def no_function_of_numpy_sees_the_block():
-    """All there are, with a field alone and beside another: refused, or the same as of the whole array."""
+    """All functions of NumPy, of one field and of two: an error, or the result for the whole array."""
     whole, u = next(fields())
     taken = set()
     with warnings.catch_warnings():
@@ -151,12 +151,12 @@ def no_function_of_numpy_sees_the_block():
                 continue
             for count in (1, 2):
                 try:
-                    found = act(*[u] * count)
-                    wanted = act(*[whole] * count)
+                    actual = act(*[u] * count)
+                    expected = act(*[whole] * count)
                 except Exception:
                     continue
-                if isinstance(found, (type(u), float, bool, np.generic)) and np.asarray(wanted).dtype != object:
-                    np.testing.assert_allclose(dp.gather(found), wanted, rtol=1e-12, err_msg=name)
+                if isinstance(actual, (type(u), float, bool, np.generic)) and np.asarray(expected).dtype != object:
+                    np.testing.assert_allclose(dp.gather(actual), expected, rtol=1e-12, err_msg=name)
                     taken.add(name)
     assert len(taken) > 60, sorted(taken)
 
@@ -194,22 +194,22 @@ def derivatives_are_those_of_one_process():
         for field in (lambda w: w, dp.identity(GRID.cells)):
             given = [((field(u), 0.7), (field(t), -0.4)), ((u, 0.7), (t, -0.4))]
             acts = [lambda x, f=f: f(*x) for f in (loss, one)]
-            value, wanted = (dp.value_and_grad(act)(x) for act, (x, _) in zip(acts, given))
+            value, expected = (dp.value_and_grad(act)(x) for act, (x, _) in zip(acts, given))
             same_everywhere(value[0])
             assert type(value[1][0]) is type(given[0][0][0]), number
             slopes = [dp.jvp(act, *pair)[1] for act, pair in zip(acts, given)]
             curved = [dp.hvp(act, *pair) for act, pair in zip(acts, given)]
-            found = (value[0], *value[1], slopes[0], *curved[0])
-            right = (wanted[0], *wanted[1], slopes[1], *curved[1])
-            for pair in zip(found, right):
+            actual = (value[0], *value[1], slopes[0], *curved[0])
+            right = (expected[0], *expected[1], slopes[1], *curved[1])
+            for pair in zip(actual, right):
                 close(*pair, 1e-12)
 
 
 def rollouts_keep_what_one_process_keeps():
     """The last state and its gradient, for every memory, with a state on ranks or known to all; same bits."""
     u = np.random.default_rng(2).standard_normal(PLAIN.shape)
-    found = set()
-    wanted = flow = ()
+    actual = set()
+    expected = flow = ()
     for grid, field in ((PLAIN, None), (GRID, None), (GRID, dp.identity(GRID.cells))):
         L = dp.laplacian(grid, dp.dirichlet)
         convect = dp.convection(grid)
@@ -219,18 +219,18 @@ def rollouts_keep_what_one_process_keeps():
             end = lambda u, k, step=step, memory=memory: anp.sum(dp.rollout(step, u, k, 9, memory=memory) ** 2)
             value, slope = dp.value_and_grad(lambda x, end=end: end(*x))((start, 0.7))
             results = [value, *slope]
-            wanted = wanted or results
-            for pair in zip(results, wanted):
+            expected = expected or results
+            for pair in zip(results, expected):
                 close(*pair)
             if grid is GRID and field is not None:
-                found.add(b"".join(np.asarray(dp.gather(result)).tobytes() for result in results))
+                actual.add(b"".join(np.asarray(dp.gather(result)).tobytes() for result in results))
         v = np.sin(np.arange(grid.faces.size))
         loss = lambda v, convect=convect: anp.sum(anp.sin(convect(v, v)))
         carried = dp.value_and_grad(loss)(v)
         flow = flow or carried
         for pair in zip(carried, flow):
             close(*pair, 1e-12)
-    assert len(found) == 1
+    assert len(actual) == 1
 
 
 def geometry_and_batches():
@@ -238,8 +238,8 @@ def geometry_and_batches():
     for space, plain in ((GRID.cells, PLAIN.cells), (GRID.faces, PLAIN.faces), (GRID.nodes, PLAIN.nodes)):
         close(space.volumes, plain.volumes, 0.0)
     for axis in range(2):
-        for found, wanted in zip(GRID.face_centres(axis), PLAIN.face_centres(axis)):
-            close(found, wanted, 0.0)
+        for actual, expected in zip(GRID.face_centres(axis), PLAIN.face_centres(axis)):
+            close(actual, expected, 0.0)
     G = dp.gradient(GRID)
     for wrong in (np.zeros((5, *GRID.shape)), np.zeros(3), GRID.faces.volumes):
         try:

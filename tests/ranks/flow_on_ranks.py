@@ -1,4 +1,4 @@
-"""Flow on ranks, beside one process: projections, a plume and a cavity that they keep incompressible, and gradients.
+"""Flow on ranks compared with one process: projections, a plume, a cavity, moving walls, and their gradients.
 
 mpirun -n 2 python -m mpi4py tests/ranks/flow_on_ranks.py
 """
@@ -13,18 +13,18 @@ import sparsedp as dp
 
 COMM = MPI.COMM_WORLD
 SOLID = np.zeros((12, 10), dtype=bool)
-SOLID[4:7, 3:5] = SOLID[9] = True  # a block, and a wall that parts the room
+SOLID[4:7, 3:5] = SOLID[9] = True  # a block, and a wall that divides the box
 BLOCK = np.zeros((16, 12), dtype=bool)
 BLOCK[6:9, 5:8] = True
 
 
-def close(value, wanted, tol, name):
-    """Compare, and see that all ranks have the same."""
+def close(value, expected, tol, name):
+    """Compare with the expected value, and between ranks."""
     value = np.asarray(dp.gather(value))
-    wanted = np.asarray(wanted)
+    expected = np.asarray(expected)
     assert len(set(COMM.allgather(value.tobytes()))) == 1, name
-    error = np.max(np.abs(value - wanted), initial=0.0) / np.max(np.abs(wanted), initial=1e-300)
-    assert value.shape == wanted.shape and error <= tol, (name, error)
+    error = np.max(np.abs(value - expected), initial=0.0) / np.max(np.abs(expected), initial=1e-300)
+    assert value.shape == expected.shape and error <= tol, (name, error)
 
 
 def derivatives(loss, x, along):
@@ -32,27 +32,27 @@ def derivatives(loss, x, along):
     return *dp.value_and_grad(loss)(x), dp.jvp(loss, x, along)[1], dp.hvp(loss, x, along)
 
 
-def whole(space, u):
-    """A field that every rank knows."""
+def as_array(space, u):
+    """Return a field that every rank holds."""
     return u
 
 
-def lying(space, u):
-    """The same, in blocks."""
+def in_blocks(space, u):
+    """Return the same field in blocks."""
     return dp.identity(space)(u)
 
 
-def on_both(name, plain, look, tol=1e-10, fields=(whole, lying)):
-    """What ``look(grid, field)`` gives on one process, and on ranks of whole arrays and of fields in blocks."""
+def on_both(name, plain, compute, tol=1e-10, fields=(as_array, in_blocks)):
+    """Compare ``compute(grid, field)`` on one process and on ranks, for arrays and for fields in blocks."""
     grid = dp.distribute(plain, COMM)
-    wanted = look(plain, whole)
+    expected = compute(plain, as_array)
     for field in fields:
-        for number, pair in enumerate(zip(look(grid, field), wanted, strict=True)):
+        for number, pair in enumerate(zip(compute(grid, field), expected, strict=True)):
             close(*pair, tol, f"{name} on {plain}, number {number}")
 
 
 def projections():
-    """P, its transpose, its pressure and derivatives: obstacles, regions, openings, widths, lines that are shut."""
+    """P, its transpose, its pressure and derivatives: obstacles, regions, open sides, stretched grids, closed lines."""
     uneven = dp.Grid((12, 10), spacing=[np.linspace(1, 2, 12), np.linspace(2, 1, 10)])
     cases = [
         (dp.Grid((12, 10), size=(1.0, 2.0)), {}),
@@ -72,7 +72,7 @@ def projections():
         v, t = rng.standard_normal((2, plain.faces.size))
         g = rng.standard_normal(plain.shape)
 
-        def look(grid, field, v=v, t=t, g=g, options=options):
+        def compute(grid, field, v=v, t=t, g=g, options=options):
             P = dp.projection(grid, rtol=1e-13, **options)
             loss = lambda v: anp.sum(anp.sin(P(v * v)) ** 2) + anp.sum(anp.cos(P.pressure(v)))
             x = field(grid.faces, v)
@@ -81,17 +81,17 @@ def projections():
             assert P.info.forward.status.startswith(("converged", "exact"))
             return *maps, *derivatives(loss, x, along)
 
-        on_both("projection", plain, look)
+        on_both("projection", plain, compute)
 
 
 def plume():
-    """Smoke that rises round an obstacle, 20 steps with a projection each, in a rollout."""
+    """Compare smoke that rises around an obstacle: a rollout of 20 steps, each with a projection."""
     plain = dp.Grid((16, 12), size=1.0)
     x, y = plain.centres()
     smoke = np.exp(-((x - 0.3) ** 2 + (y - 0.5) ** 2) / 0.02)
     along = np.sin(3 * x + y)
 
-    def look(grid, field):
+    def compute(grid, field):
         P = dp.projection(grid, BLOCK, rtol=1e-13)
         D = dp.divergence(grid)
         A = dp.average(grid)
@@ -112,7 +112,7 @@ def plume():
         again = dp.value_and_grad(lambda start: loss(start, "30 kB"))(start)
         return value, *slope.values(), tangent, *bent.values(), again[0], *again[1].values()
 
-    on_both("plume", plain, look)
+    on_both("plume", plain, compute)
 
 
 def cavity():
@@ -120,7 +120,7 @@ def cavity():
     plain = dp.Grid((32, 32), size=1.0)
     v, along = 0.05 * np.random.default_rng(0).standard_normal((2, plain.faces.size))
 
-    def look(grid, field):
+    def compute(grid, field):
         lift = dp.face_lift(grid)
         lid = lift(lift.domain.join(0.0, 0.0, 0.0, 1.0))
         step = dp.flow_step(grid, 0.01, lambda p: p["nu"], lambda v, p: p["nu"] * p["lid"] * lid)
@@ -136,7 +136,7 @@ def cavity():
         again = dp.value_and_grad(lambda x: loss(x, "300 kB"))(start)
         return value, *slope.values(), tangent, *bent.values(), again[0], *again[1].values()
 
-    on_both("cavity", plain, look)
+    on_both("cavity", plain, compute)
 
 
 def flows():
@@ -161,7 +161,7 @@ def flows():
         v, t = 0.05 * np.random.default_rng(0).standard_normal((2, plain.faces.size))
         s, r = np.random.default_rng(1).random((2, *plain.shape))
 
-        def look(grid, field, v=v, t=t, s=s, r=r, options=options):
+        def compute(grid, field, v=v, t=t, s=s, r=r, options=options):
             step = dp.flow_step(grid, 0.02, **options)
 
             def loss(x):
@@ -174,7 +174,7 @@ def flows():
             value, slope, tangent, bent = derivatives(loss, start, {"v": field(grid.faces, t), "s": r, "p": 0.1})
             return value, *slope.values(), tangent, *bent.values()
 
-        on_both(f"flow_step {sorted(options)}", plain, look, 1e-9)  # its solves are good to 1e-10
+        on_both(f"flow_step {sorted(options)}", plain, compute, 1e-9)  # its solves are good to 1e-10
 
 
 def moving_walls():
@@ -195,7 +195,7 @@ def moving_walls():
         v, t = 0.05 * rng.standard_normal((2, plain.faces.size))
         w, s = 0.1 * rng.standard_normal((2, dp.face_lift(plain, boundary).domain.size))
 
-        def look(grid, field, options=options, boundary=boundary, v=v, t=t, w=w, s=s):
+        def compute(grid, field, options=options, boundary=boundary, v=v, t=t, w=w, s=s):
             space = dp.face_lift(grid, boundary).domain
             step = dp.flow_step(grid, 0.02, walls=lambda p: p["walls"] * anp.cos(p["angle"]), **options)
 
@@ -208,20 +208,20 @@ def moving_walls():
             value, slope, tangent, bent = derivatives(loss, x, along)
             return value, *slope.values(), tangent, *bent.values()
 
-        on_both(f"moving walls, {sorted(options)}", plain, look, 1e-9)
+        on_both(f"moving walls, {sorted(options)}", plain, compute, 1e-9)
 
     one_wall = {"x": (dp.inflow, dp.outflow), "y": dp.free_slip}
     for plain, boundary in ((box, dp.no_slip), (uneven, one_wall)):
         v = 0.05 * np.random.default_rng(0).standard_normal(plain.faces.size)
 
-        def look_at_constant_walls(grid, field, boundary=boundary, v=v):
+        def compute_with_constant_walls(grid, field, boundary=boundary, v=v):
             lift = dp.face_lift(grid, boundary)
             lifted = lift(field(lift.domain, np.linspace(0.1, 0.5, lift.domain.size)))
             step = dp.flow_step(grid, 0.02, 0.01, boundary=boundary, walls=lifted)
             end = dp.rollout(step, step.start(field(grid.faces, v)), None, 3)
             return end["v"], end["p"]
 
-        on_both(f"constant walls, {boundary}", plain, look_at_constant_walls, 1e-9)
+        on_both(f"constant walls, {boundary}", plain, compute_with_constant_walls, 1e-9)
     grid = dp.distribute(room, COMM)
     meeting = {"z": (dp.inflow, dp.outflow)}
     lift = dp.face_lift(grid, meeting)
@@ -235,8 +235,8 @@ def refused(kind, words, act):
     try:
         act()
     except kind as error:
-        told = COMM.allgather(str(error))
-        assert len(set(told)) == 1 and words in told[0], told
+        messages = COMM.allgather(str(error))
+        assert len(set(messages)) == 1 and words in messages[0], messages
     else:
         raise AssertionError(words)
 

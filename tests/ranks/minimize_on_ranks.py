@@ -1,4 +1,4 @@
-"""minimize of fields that lie on ranks, by PETSc's TAO, beside the search of one process.
+"""minimize of fields on ranks, by PETSc's TAO, compared with one process.
 
 mpirun -n 2 python -m mpi4py tests/ranks/minimize_on_ranks.py
 """
@@ -36,8 +36,8 @@ def minima():
             assert best.converged and best.x["n"] == 3 and type(best.x["k"]) is float, best
             assert best.history[-1].evaluations <= best.evaluations and best.history[0].gradient_norm > 0
             results.append((best.value, best.x["u"], best.x["k"], best.x["w"]))
-        for found, wanted, tol in zip(*reversed(results), (1e-10, 1e-5, 1e-5, 1e-5)):
-            close(found, wanted, tol, f"minimize with {bounds}")
+        for actual, expected, tol in zip(*reversed(results), (1e-10, 1e-5, 1e-5, 1e-5)):
+            close(actual, expected, tol, f"minimize with {bounds}")
     grid = dp.distribute(PLAIN, COMM)
     both = [dp.minimize(*problem(one, np.zeros(PLAIN.shape)), maxiter=9) for one in (PLAIN, grid)]
     close(both[1].x["u"], both[0].x["u"], 1e-9, "minimize of what all know")

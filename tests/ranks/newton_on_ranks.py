@@ -1,4 +1,4 @@
-"""Newton's method for unknowns in blocks, beside one process: roots, steady states and their derivatives; refusals.
+"""Newton's method for unknowns in blocks compared with one process: roots, steady states, derivatives, errors.
 
 The first line that is printed is the same on any number of ranks: bits of products with Jacobians.
 
@@ -11,7 +11,7 @@ from hashlib import sha256
 
 import autograd.numpy as anp
 import numpy as np
-from flow_on_ranks import COMM, close, derivatives, lying, on_both, refused
+from flow_on_ranks import COMM, close, derivatives, in_blocks, on_both, refused
 
 import sparsedp as dp
 from sparsedp.autodiff.tape import plain
@@ -68,7 +68,7 @@ def flux(grid):
 
 
 def guess(make, grid, field):
-    """Where Newton's method begins."""
+    """Return the guess."""
     zeros = field(grid.cells, np.zeros(grid.shape))
     if make is species:
         return {"a": zeros, "b": zeros + 1.0}
@@ -77,7 +77,7 @@ def guess(make, grid, field):
     return zeros
 
 
-def looked_at(make, grid, field):
+def root_and_derivatives(make, grid, field):
     """The root, and a loss of it with its derivatives to second order."""
     solve = dp.implicit(make(grid), rtol=1e-13)
     start = guess(make, grid, field)
@@ -138,19 +138,19 @@ def jacobian_given(matrix, grid, field):
 
 
 def roots():
-    """All of these on all grids."""
+    """Compare all problems on all grids."""
     for one in GRIDS:
         for make in (diffusion, bratu, pointwise, species, flux):
-            on_both(make.__name__, one, partial(looked_at, make), fields=(lying,))
-    on_both("cavity", dp.Grid((12, 12), size=1.0), cavity, fields=(lying,))
+            on_both(make.__name__, one, partial(root_and_derivatives, make), fields=(in_blocks,))
+    on_both("cavity", dp.Grid((12, 12), size=1.0), cavity, fields=(in_blocks,))
     for matrix in (False, True):
-        on_both("jacobian", PLAIN, partial(jacobian_given, matrix), fields=(lying,))
+        on_both("jacobian", PLAIN, partial(jacobian_given, matrix), fields=(in_blocks,))
 
 
-def entries_that_come_late():
-    """A residual that meets its neighbours only where it has got far; and other unknowns than before."""
+def entries_that_are_0_at_first():
+    """Compare a residual whose coupling to neighbours is 0 near the guess; and one root for several spaces."""
 
-    def look(grid, field):
+    def compute(grid, field):
         L = dp.laplacian(grid, dp.dirichlet)
         A = dp.average(grid)
         solve = dp.implicit(lambda x, k: x - k - 1e-2 * L(anp.maximum(x - 5.0, 0.0)), rtol=1e-13)
@@ -161,25 +161,25 @@ def entries_that_come_late():
         places = [cube(1.0 + abs(x), 2.0) for x in others]
         return *dp.value_and_grad(loss)(6.0), *both, *places
 
-    on_both("late entries", PLAIN, look, fields=(lying,))
+    on_both("late entries", PLAIN, compute, fields=(in_blocks,))
 
 
 def bits():
     """The digest of products with Jacobians."""
-    found = sha256()
+    digest = sha256()
     for one in GRIDS:
         grid = dp.distribute(one, COMM)
         for make in (diffusion, bratu, species, flux):
-            start = guess(make, grid, lying)
+            start = guess(make, grid, in_blocks)
             unknowns = Unknowns(start, "f")
-            params = (lying(grid.cells, np.ones(grid.shape)), 0.7)
+            params = (in_blocks(grid.cells, np.ones(grid.shape)), 0.7)
             equation = Equation(make(grid), unknowns, params, "f")
             settings = check_settings("auto", 1e-10, None, "raise", {})
             x = unknowns.distribute(np.sin(np.arange(float(unknowns.size))))
             J = RanksJacobians("f", None, None, settings).evaluate(equation, x, equation.variables(params))
-            found.update(dp.gather(J.product(x)).tobytes())
+            digest.update(dp.gather(J.product(x)).tobytes())
     if COMM.rank == 0:
-        print(found.hexdigest())
+        print(digest.hexdigest())
 
 
 def narrow(x, k):
@@ -190,9 +190,9 @@ def narrow(x, k):
 
 
 def errors_are_the_same_on_all_ranks():
-    """What is raised on one rank, or cannot be, in the same words on all."""
+    """Compare error messages between ranks, of errors that one rank or all raise."""
     grid = dp.distribute(PLAIN, COMM)
-    one = lying(grid.cells, np.ones(grid.shape))
+    one = in_blocks(grid.cells, np.ones(grid.shape))
     L = dp.laplacian(grid)
     refused(dp.errors.UnstableStepError, "planted", lambda: dp.implicit(narrow)(3 * one, 2.0))
     solve = dp.implicit(narrow)
@@ -202,7 +202,7 @@ def errors_are_the_same_on_all_ranks():
     assert solve.info.forward.iterations > 3
     hole = np.ones(grid.shape)
     hole[-1, -1] = np.nan
-    refused(dp.errors.NonFiniteError, "1 that are NaN", lambda: dp.implicit(narrow)(lying(grid.cells, hole), 2.0))
+    refused(dp.errors.NonFiniteError, "1 that are NaN", lambda: dp.implicit(narrow)(in_blocks(grid.cells, hole), 2.0))
     refused(dp.errors.ConvergenceError, "Newton steps", lambda: dp.implicit(lambda x, k: x**2 + k)(one, 1.0))
     free = dp.implicit(lambda x, k: k * L(x))
     refused(dp.errors.ConvergenceError, "not isolated", lambda: dp.grad(lambda k: anp.sum(free(one, k) ** 2))(1.3))
@@ -214,7 +214,7 @@ if __name__ == "__main__":
     bits()
     if sys.argv[1:] != ["bits"]:
         roots()
-        entries_that_come_late()
+        entries_that_are_0_at_first()
         errors_are_the_same_on_all_ranks()
     if COMM.rank == 0:
         print("all agree")

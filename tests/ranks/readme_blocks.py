@@ -21,7 +21,7 @@ WORDS = "u in the middle: ", "pressure fitted", "derivatives through 100 steps",
 def blocks():
     """(code, what it prints) of the blocks that are run, in their order; each goes on from those before."""
     found = re.findall(r"```python\n(.*?)```\n\n```text\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
-    chosen = [(code, told) for code, told in found if any(word in code for word in WORDS)]
+    chosen = [(code, output) for code, output in found if any(word in code for word in WORDS)]
     assert len(chosen) == len(WORDS), [code for code, _ in chosen]
     return chosen
 
@@ -34,14 +34,14 @@ def distributed(code):
 def main():
     """Run them; those that need transport as soon as that works on ranks."""
     names: dict = {}
-    for code, told in blocks():
+    for code, output in blocks():
         if "dp.transport" in code and "transport" not in SUPPORTED:
             continue
         assert ("dp.Grid(" in code) == ("dp.distribute(" in distributed(code))
         printed = io.StringIO()
         with redirect_stdout(printed):
             exec(distributed(code), names)
-        assert printed.getvalue() == told, (printed.getvalue(), told)
+        assert printed.getvalue() == output, (printed.getvalue(), output)
     assert names["grid"].layout is not None
 
 

@@ -53,17 +53,17 @@ def main(folder, iterations):
     for make in (diffused, elliptic):
         loss, start = make()
         best = dp.minimize(loss, start, maxiter=iterations, tolerance=0, checkpoint=folder / make.__name__)
-        told = make.__name__, repr(best.value), digest(best.x), best.resumed.split(" in ")[0]
+        row = make.__name__, repr(best.value), digest(best.x), best.resumed.split(" in ")[0]
         if COMM.rank == 0:
-            print(*told)
+            print(*row)
     path = folder / "state.npy"
     L = dp.laplacian(GRID, dp.dirichlet)
     state = np.load(path, mmap_mode="r") if path.exists() else TARGET
     end = dp.gather(dp.rollout(lambda u, k: u + k * L(u), np.array(state), 2e-3, 20))
-    told = "steps", np.linalg.norm(end), digest(end)  # all have read the file
+    row = "steps", np.linalg.norm(end), digest(end)  # all have read the file
     if COMM.rank == 0:
         np.save(path, end)
-        print(*told)
+        print(*row)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Inverses on ranks, forward and adjoint, beside one process; null spaces, islands, refusals, the same on all ranks.
+"""Inverses on ranks, forward and adjoint, compared with one process; null spaces, isolated regions, errors.
 
 mpirun -n 2 python -m mpi4py tests/ranks/solves_on_ranks.py
 """
@@ -39,12 +39,12 @@ def operators(grid):
         yield "held", -dp.laplacian(grid, dp.dirichlet, WALL, dp.dirichlet)
 
 
-def close(value, wanted, tol, name):
+def close(value, expected, tol, name):
     """Compare, and see that all ranks have the same."""
     value = np.asarray(dp.gather(value))
-    wanted = np.asarray(wanted)
+    expected = np.asarray(expected)
     assert len(set(COMM.allgather(value.tobytes()))) == 1
-    error = np.max(np.abs(value - wanted), initial=0.0) / np.max(np.abs(wanted), initial=1e-300)
+    error = np.max(np.abs(value - expected), initial=0.0) / np.max(np.abs(expected), initial=1e-300)
     assert error <= tol, (name, error)
 
 
@@ -53,15 +53,15 @@ def inverses_are_those_of_one_process():
     for plain in (*GRIDS, ISLANDS):
         grid = dp.distribute(plain, COMM)
         for (name, one), (_, op) in zip(operators(plain), operators(grid)):
-            wanted, found = (dp.inverse(A, rtol=1e-12, nullspace="project") for A in (one, op))
+            expected, actual = (dp.inverse(A, rtol=1e-12, nullspace="project") for A in (one, op))
             b = np.random.default_rng(1).standard_normal(plain.shape)
             b = b if name not in ("islands", "held") else np.where(WALL, 0.0, b)
             where = f"{name} on {plain}"
-            close(found(b), wanted(b), 1e-9, where)
-            close(found.T(b), wanted.T(b), 1e-9, f"{where}, adjoint")
-            close(found(1e-200 * b), wanted(1e-200 * b), 1e-9, f"{where}, small")
-            assert found.info.forward.residual <= 1e-12 or found.info.forward.status == "converged_at_roundoff"
-            slopes = [dp.grad(lambda b, inv=inv: anp.sum(anp.sin(inv(b)) ** 2))(b) for inv in (found, wanted)]
+            close(actual(b), expected(b), 1e-9, where)
+            close(actual.T(b), expected.T(b), 1e-9, f"{where}, adjoint")
+            close(actual(1e-200 * b), expected(1e-200 * b), 1e-9, f"{where}, small")
+            assert actual.info.forward.residual <= 1e-12 or actual.info.forward.status == "converged_at_roundoff"
+            slopes = [dp.grad(lambda b, inv=inv: anp.sum(anp.sin(inv(b)) ** 2))(b) for inv in (actual, expected)]
             close(*slopes, 1e-8, f"{where}, gradient")
     grid = dp.distribute(ISLANDS, COMM)
     assert dp.inverse(-dp.laplacian(grid, solid=WALL), nullspace="project").solver.system.null_space.count == 3
@@ -89,8 +89,8 @@ def elliptic_misfits():
                 loss = lambda x, solve=solve, mean=mean: anp.sum(anp.sin(solve(mean(anp.exp(x[0])), x[1], x[2])) ** 2)
                 value, slopes = dp.value_and_grad(loss)(x)
                 results.append((value, *slopes, dp.jvp(loss, x, along)[1], *dp.hvp(loss, x, along)))
-            for found in results[1:]:
-                for number, pair in enumerate(zip(found, results[0])):
+            for actual in results[1:]:
+                for number, pair in enumerate(zip(actual, results[0])):
                     close(*pair, 1e-10, f"elliptic_solver on {plain}, number {number}")
 
 
@@ -104,8 +104,8 @@ def products_with_inverses():
         P = inside + G @ dp.inverse(-D @ G, rtol=1e-12, nullspace="project") @ D @ inside
         v = np.random.default_rng(2).standard_normal(grid.faces.size)
         results.append((P(v), P.T(v)))
-    for found, wanted in zip(results[1], results[0]):
-        close(found, wanted, 1e-9, "projection")
+    for actual, expected in zip(results[1], results[0]):
+        close(actual, expected, 1e-9, "projection")
 
 
 def refused(kind, words, act):
@@ -113,8 +113,8 @@ def refused(kind, words, act):
     try:
         act()
     except kind as error:
-        told = COMM.allgather(str(error))
-        assert len(set(told)) == 1 and words in told[0], told
+        messages = COMM.allgather(str(error))
+        assert len(set(messages)) == 1 and words in messages[0], messages
     else:
         raise AssertionError(words)
 

@@ -1,4 +1,4 @@
-"""Steps in time on ranks, beside one process: every method of stepper.
+"""Time steps on ranks compared with one process: every method of stepper.
 
 mpirun -n 2 python -m mpi4py tests/ranks/steps_on_ranks.py
 """
@@ -7,7 +7,7 @@ from functools import partial
 
 import autograd.numpy as anp
 import numpy as np
-from flow_on_ranks import COMM, derivatives, lying, on_both, refused, whole
+from flow_on_ranks import COMM, as_array, derivatives, in_blocks, on_both, refused
 
 import sparsedp as dp
 
@@ -37,7 +37,7 @@ def rates(method, **options):
 
 
 def stiff(method, **options):
-    """A rate beside a linear part, and a source."""
+    """Return a stepper of a nonlinear rate, a linear part and a source."""
 
     def make(grid):
         L = dp.laplacian(grid)
@@ -94,7 +94,7 @@ KNOWN_TO_ALL = {
 }
 
 
-def looked_at(name, make, grid, field):
+def steps_and_derivatives(name, make, grid, field):
     """Two steps in a rollout and their gradient; of some methods derivatives of all kinds, of one step."""
     u, t = RNG_FIELDS[grid.shape]
     step = make(grid)
@@ -119,17 +119,17 @@ def steps():
     A root whose residual has a sum in it is found of whole states alone.
     """
     for number, (name, make) in enumerate(EVERYWHERE.items()):
-        fields = (whole,) if make is root else (whole, lying) if make is tree else (lying,)
+        fields = (as_array,) if make is root else (as_array, in_blocks) if make is tree else (in_blocks,)
         plain = UNEVEN if number % 2 else PLAIN
-        on_both(name, plain, partial(looked_at, name, make), fields=fields)
+        on_both(name, plain, partial(steps_and_derivatives, name, make), fields=fields)
 
 
-def steps_of_what_all_know():
+def steps_of_arrays():
     """The same, or the refusal."""
     for name, make in KNOWN_TO_ALL.items():
-        on_both(name, PLAIN, partial(looked_at, name, make), fields=(whole,))
+        on_both(name, PLAIN, partial(steps_and_derivatives, name, make), fields=(as_array,))
         grid = dp.distribute(PLAIN, COMM)
-        u = lying(grid.cells, RNG_FIELDS[PLAIN.shape][0])
+        u = in_blocks(grid.cells, RNG_FIELDS[PLAIN.shape][0])
         words = f"{name}) does not work on a field on ranks; write dp.gather(u) for the whole array"
         refused(TypeError, words, lambda make=make, u=u, grid=grid: make(grid)(u, 0.7))
     grid = dp.distribute(PLAIN, COMM)
@@ -137,10 +137,10 @@ def steps_of_what_all_know():
     refused(TypeError, words, lambda: rates("radau")(grid)(np.ones(PLAIN.shape), 0.7))
 
 
-def states_on_the_way():
+def intermediate_states():
     """All states, and what a function makes of each: on ranks fields apart, numbers in stacks."""
 
-    def look(grid, field):
+    def compute(grid, field):
         L = dp.laplacian(grid, dp.dirichlet)
         step = lambda state, k: {"u": state["u"] + 0.01 * k * L(anp.tanh(state["u"])), "t": state["t"] + k}
         start = lambda x: ({"u": x[0], "t": 0.0}, x[1], 4)
@@ -159,12 +159,12 @@ def states_on_the_way():
         value, slopes, tangent, bent = derivatives(loss, x, along)
         return value, *slopes, tangent, *bent, *every(x)["u"], every(x)["t"]
 
-    on_both("states", PLAIN, look)
+    on_both("states", PLAIN, compute)
 
 
 if __name__ == "__main__":
-    states_on_the_way()
+    intermediate_states()
     steps()
-    steps_of_what_all_know()
+    steps_of_arrays()
     if COMM.rank == 0:
         print("all agree")

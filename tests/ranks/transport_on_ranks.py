@@ -1,4 +1,4 @@
-"""Transport on ranks beside one process: values, derivatives to second order, rollouts, refusals, messages.
+"""Transport on ranks compared with one process: values, derivatives to second order, rollouts, refusals, messages.
 
 mpirun -n 4 python -m mpi4py tests/ranks/transport_on_ranks.py          # or: ... 0 6, a sixth of all there is
 """
@@ -111,7 +111,7 @@ def steps_of_one_process():
 def wind_of_a_rollout():
     """50 upwind steps on unequal blocks: the gradient of one process, the same bits for every memory."""
     grid = dp.distribute(SQUARE, COMM)
-    found = set()
+    actual = set()
     start = np.exp(-20 * sum((x - 0.4) ** 2 for x in SQUARE.centres()))
     wind = np.sin(np.arange(SQUARE.faces.size))
 
@@ -121,13 +121,13 @@ def wind_of_a_rollout():
         end = lambda v: dp.rollout(lambda u, v: move(u, v, 0.01), field(start), v, 50, memory=memory)
         return dp.value_and_grad(lambda v: anp.sum((end(inside(v)) - 0.3) ** 2))(wind)
 
-    wanted = gradient(SQUARE, np.array)
+    expected = gradient(SQUARE, np.array)
     for memory in (None, 400_000, 250_000):
         results = gradient(grid, dp.identity(grid.cells), memory)
-        for pair in zip(results, wanted):
+        for pair in zip(results, expected):
             close(*pair, 1e-13)
-        found.add(b"".join(np.asarray(result).tobytes() for result in results))
-    assert len(found) == 1
+        actual.add(b"".join(np.asarray(result).tobytes() for result in results))
+    assert len(actual) == 1
 
 
 def messages_of_a_step():
@@ -138,17 +138,17 @@ def messages_of_a_step():
     v = np.full(110, 0.1)
     v = dp.identity(grid.faces)(v)
     loss = lambda v, n: anp.sum(dp.rollout(lambda u, v: move(u, v, 0.1), u, v, n))
-    told = []
+    messages_per_step = []
     for act in (loss, dp.grad(loss)):
         act(v, 5)
         counts = [counted(act, v, n) for n in (5, 8)]
-        told.append([(more - less) / 3 for less, more in zip(*counts)])
+        messages_per_step.append([(more - less) / 3 for less, more in zip(*counts)])
     row = 2 * 6 * 8
     of_v = (6 * 2 + 7 + 6 + 7) * 8
     if COMM.size == 2:
-        assert told == [[1, row, 0], [4, 3 * row + of_v, 0]], told
+        assert messages_per_step == [[1, row, 0], [4, 3 * row + of_v, 0]], messages_per_step
     else:
-        assert [line[0] for line in told] == ([0, 0] if COMM.size == 1 else [1, 4]), told
+        assert [line[0] for line in messages_per_step] == ([0, 0] if COMM.size == 1 else [1, 4]), messages_per_step
 
 
 def counted(act, *args):
@@ -163,9 +163,9 @@ def told_by(act):
     try:
         act()
     except (ArithmeticError, TypeError, ValueError) as error:
-        told = f"{type(error).__name__}: {error}"
-        assert set(COMM.allgather(told)) == {told}
-        return told
+        message = f"{type(error).__name__}: {error}"
+        assert set(COMM.allgather(message)) == {message}
+        return message
     raise AssertionError("nothing was refused")
 
 
