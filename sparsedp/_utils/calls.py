@@ -13,7 +13,7 @@ from functools import wraps
 from inspect import Parameter, signature
 from pathlib import Path
 from types import FunctionType, ModuleType, TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Sequence
@@ -103,7 +103,10 @@ def advice_near(word: Any, words: Sequence[str]) -> str:
     return f"; write {near!r}"
 
 
-def public(written: str, advice: Callable | None = None) -> Callable:
+Function = TypeVar("Function", bound="Callable")
+
+
+def public(written: str, advice: Callable | None = None) -> Callable[[Function], Function]:
     """Decorate a public function: add advice to calls that do not fit, and remove internal frames from tracebacks.
 
     Parameters

@@ -140,10 +140,12 @@ class Frozen:
     def __init__(self, **values: Any):
         self.__dict__.update(values)
 
-    def __getattr__(self, name: str) -> Any:
-        if name in self.meant:
-            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}; write {self.meant[name]}")
-        return object.__getattribute__(self, name)  # raises Python's own error
+    if not TYPE_CHECKING:  # a type checker reports an attribute that does not exist
+
+        def __getattr__(self, name: str) -> Any:
+            if name in self.meant:
+                raise AttributeError(f"{type(self).__name__} has no attribute {name!r}; write {self.meant[name]}")
+            return object.__getattribute__(self, name)  # raises Python's own error
 
     def __setattr__(self, name: str, value: Any) -> None:
         raise AttributeError(f"{type(self).__name__} is frozen; make a new one instead of setting {name}")

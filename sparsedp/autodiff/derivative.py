@@ -124,7 +124,7 @@ def grad(loss: Callable, argnum: int = 0) -> Callable:
     return ReconstructibleFunction(lambda *args: both(*args)[1], grad, loss, argnum)
 
 
-def value_and_grad(loss: Callable, argnum: int = 0) -> Callable:
+def value_and_grad(loss: Callable, argnum: int = 0) -> Callable[..., tuple[Any, Any]]:
     """Return the function that returns the value and the gradient of a scalar loss of a tree.
 
     Parameters
@@ -512,7 +512,7 @@ def witnessed(see: Callable) -> Iterator[None]:
 # ---- directional derivatives -----------------------------------------------------------------------------------------
 
 
-def jvp(fun: Callable, x: Any, tangent: Any) -> tuple:
+def jvp(fun: Callable, x: Any, tangent: Any) -> tuple[Any, Any]:
     """Return the value of a function of a tree and its directional derivative.
 
     Parameters
