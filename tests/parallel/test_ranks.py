@@ -6,6 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 from launch import COUNTS, on_ranks, printed
+from pages import blocks
+from sources import ROOT
 
 import sparsedp as dp
 
@@ -56,6 +58,17 @@ def test_minimize(count):
 @pytest.mark.whole
 def test_the_blocks_of_the_readme():
     assert printed("readme_blocks.py", 2).endswith("all agree\n")
+
+
+@on_ranks
+@pytest.mark.whole
+def test_the_program_of_the_guide(tmp_path):
+    """It prints once, with the loss and the gradient of one process."""
+    page = blocks((ROOT / "docs" / "guides" / "ranks_and_ensembles.md").read_text(encoding="utf-8"))
+    numbers = [number for number, block in enumerate(page) if "is_first" in block.text]
+    (tmp_path / "scene.py").write_text("\n".join(page[number].text for number in numbers), encoding="utf-8")
+    expected = "".join(f"{page[number + 1].text}\n" for number in numbers)
+    assert len(numbers) == 2 and printed(tmp_path / "scene.py", 2) == expected
 
 
 @on_ranks
