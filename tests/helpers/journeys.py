@@ -36,5 +36,5 @@ def journey(act):
 def check_journey(act, functions, files):
     """Assert that ``act()`` enters at most these numbers of functions and files."""
     entered = journey(act)
-    assert len(entered) <= functions, sorted(entered)
+    assert len(entered) <= functions, (len(entered), sorted(entered))
     assert len({file for file, *_ in entered}) <= files, sorted(entered)

@@ -304,4 +304,4 @@ def test_the_gradient_of_a_rollout_enters_few_functions():
         return u - 0.1 * rate * u
 
     gradient = dp.value_and_grad(lambda u: anp.sum(dp.rollout(decay, u, 1.0, 3) ** 2))
-    check_journey(lambda: gradient(np.ones((20, 21))), functions=139, files=18)
+    check_journey(lambda: gradient(np.ones((20, 21))), functions=141, files=18)
