@@ -526,7 +526,10 @@ def _with_a_small_gap(evidence: DirectionEvidence) -> tuple[str, str]:
     is_noisy = evidence.jitter > THRESHOLDS.rounding_noise
     if evidence.is_close and is_noisy and evidence.bar > THRESHOLDS.noisy_agreement_share * evidence.scale:
         loudness = evidence.jitter * evidence.line.evaluations.eps
-        return "masked", f"noise of {loudness:.0e} of the loss leaves {evidence.digits:.0f} digits, 6 are needed"
+        return "masked", f"noise of {loudness:.0e} of the loss leaves {evidence.digits:.1f} digits, 6 are needed"
+    orders = (evidence.first_levels, evidence.first_order), (evidence.second_levels, evidence.second_order)
+    if any(levels >= fewest and np.isnan(order) for levels, order in orders):
+        return "few", f"no two usable steps are a factor {THRESHOLDS.pair_ratio:g} apart: orders cannot be read"
     if evidence.second_levels >= fewest and not evidence.second_order >= THRESHOLDS.second_order:
         reason = f"the second Taylor remainder is of order {evidence.second_order:.2f}: not twice differentiable here"
         return "rough", reason

@@ -183,8 +183,18 @@ def test_small_noise_costs_digits_only():
     assert result and 3 <= result.digits <= 8
     rounded = AUDIT(lambda u: float(np.float32(np.sum(u**2))), X, gradient=lambda u: 2 * u)
     assert rounded.verdict == "inconclusive" and "digits, 6 are needed" in rounded.reason
+    remaining = float(rounded.reason.split(" leaves ")[1].split(" digits")[0])
+    assert 3 < remaining < 6
     assert AUDIT(lambda u: np.float32(np.sum(u**2)), X, gradient=lambda u: 2 * u)  # it says that it is single
     assert AUDIT(lambda u: np.sum(u**2) + 1e-9 * hash_noise(u), X, gradient=lambda u: 2.02 * u).verdict == "disagrees"
+
+
+def test_orders_that_cannot_be_read_from_close_steps():
+    """Where the usable steps are close together there is no order, and none is quoted."""
+    steps = np.geomspace(1e-9, 1e-6, 12)
+    audit = dp.check.gradient(lambda x: np.sum(x**2), np.linspace(0.3, 1, 4), steps=steps)
+    assert audit.verdict == "inconclusive"
+    assert audit.reason.endswith("no two usable steps are a factor 4 apart: orders cannot be read")
 
 
 def test_a_gradient_outside_a_kink_is_wrong():
