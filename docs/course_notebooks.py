@@ -1,4 +1,4 @@
-r"""The course as notebooks: each is assembled from an example and a lesson, executed, and offered on a page.
+"""The course as notebooks: each is assembled from an example and a lesson, executed, and offered on a page.
 
 The example, `examples/NAME.py`, holds the text and the code of the steps and the questions of the exercises. The
 lesson, `examples/course/NAME.md`, holds what a course adds: goals, prerequisites, solutions of the exercises, and the
