@@ -8,8 +8,8 @@ backend of fields whose blocks are stored by several processes.
 asked of                by
 ======================  ============================================================================================
 a grid                  ``grid.backend``; `Backend.check`, `Backend.place`, `Backend.mesh`
-a field                 `Backend.split`, `Backend.join`, `Backend.volumes`, `Backend.field`, `Backend.combinable`;
-                        `as_field`, `gathered`, `replicated`
+a field                 `Backend.split`, `Backend.join`, `Backend.concatenate`, `Backend.volumes`, `Backend.field`,
+                        `Backend.combinable`; `as_field`, `gathered`, `replicated`
 a state of a rollout    `Backend.stack`, `Backend.fingerprint`
 a reduction             NumPy's functions: a field of another backend implements ``np.sum``, ``np.max``, ...
 an application          `Backend.apply`, `Backend.reference`; `match_value` for its derivative
@@ -99,6 +99,15 @@ class Backend:
     def join(self, space: Any, parts: Any) -> Any:
         """Return one field of its components; differentiable."""
         return space.join_arrays(parts)
+
+    def concatenate(self, space: Any, parts: Sequence) -> Any:
+        """Return a flat field of the numbers of some values, traced or not, one after the other."""
+        lines = [anp.reshape(replicated(part), (-1,)) for part in parts]
+        if not lines:
+            return np.zeros(0)
+        if len(lines) == 1:
+            return lines[0]
+        return anp.concatenate(lines)
 
     def field(self, space: Any, values: np.ndarray) -> Any:
         """Return a field of values that every process holds."""

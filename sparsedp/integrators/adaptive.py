@@ -237,7 +237,7 @@ class Adaptive(Scheme):
     def inspector(self, arguments: tuple) -> RateInspector | None:
         """Return what looks for jumps of the rate; None where it has none: an operator, and a constant source.
 
-        None also on ranks, whose fields it would have to gather.
+        None also for distributed fields, which it would have to gather.
         """
         problem = self.scheme.problem
         if problem.rate is None and not problem.source_takes_time:

@@ -343,10 +343,12 @@ def _fixed_scheme(
     if method in ("imex", "etdrk4") and not problem.stiff:
         raise TypeError(f"{method} needs the stiff linear term: write linear=L or linear=(L, coefficient)")
     if method in EXPLICIT:
-        has_whole_fields = all(term.op.backend.whole_fields for term in problem.stiff)
-        if problem.linear and problem.source is None and has_whole_fields:
-            return Polynomial(problem, method)
-        return Explicit(problem, method)
+        scheme: Any = Explicit
+        if problem.linear and problem.source is None:
+            scheme = Polynomial
+            for term in problem.stiff:
+                scheme = term.op.backend.implementation(scheme)
+        return scheme(problem, method)
     if method == "etdrk4":
         from sparsedp.integrators.exponential import Exponential
 

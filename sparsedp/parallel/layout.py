@@ -22,6 +22,7 @@ from sparsedp.errors import ShapeError
 from sparsedp.flow.projection_setup import ProjectionSetup
 from sparsedp.grid.grid import Grid, node_axes
 from sparsedp.grid.space import Space
+from sparsedp.integrators.runge_kutta import Explicit, Polynomial
 from sparsedp.operators.operator import Operator
 from sparsedp.operators.structure.base import Structure
 from sparsedp.optimize.minimize import minimize
@@ -144,6 +145,7 @@ class Layout(Partition, Backend):
         """Return what is called on ranks instead of a class or function of one process."""
         replacements: dict[Callable, Callable] = {
             Jacobians: RanksJacobians,
+            Polynomial: Explicit,
             ProjectionSetup: RanksProjectionSetup,
             System: self.system,
             method_and_rule: method_and_rule_on_ranks,
@@ -231,6 +233,8 @@ class Layout(Partition, Backend):
             return space.join_arrays(parts)
         pairs = zip(self._pieces(space), parts, strict=True)
         return reduce(add, (piece.embed(everywhere(part, piece.space)) for piece, part in pairs))
+
+    concatenate = join  # the values are fields on the spaces of a joint space
 
 
 def method_and_rule_on_ranks(settings: TransportSettings) -> tuple[TransportMethod, TransportOnBlocks]:

@@ -40,13 +40,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
-import autograd.numpy as anp
 import numpy as np
 
 from sparsedp._utils.counters import note
 from sparsedp._utils.pytree import TreeStructure, keys, leaves
 from sparsedp._utils.validation import check_finite, check_leaves, check_plain, check_precision, number_beside
-from sparsedp.autodiff.backend import as_field, backend_of, replicated
+from sparsedp.autodiff.backend import as_field, backend_of
 from sparsedp.autodiff.derivative import pullback, push
 from sparsedp.autodiff.tape import cast, dtype_of, is_variable, isbox, plain
 from sparsedp.autodiff.tape_constants import constant
@@ -144,7 +143,7 @@ class Unknowns(TreeStructure):
         return self.backend.join(self.space, numbers)
 
     def distribute(self, x: NDArray[Any]) -> Any:
-        """Return the flat unknowns of an array that every rank has."""
+        """Return the flat unknowns of an array that every process has."""
         return self.backend.field(self.space, x)
 
     def attempt(self, function: Callable[..., Any], *args: Any) -> Any:
@@ -266,17 +265,7 @@ class Equation:
             raise ShapeError(f"the residual of {self.name} must hold {self.size} numbers, as many as x, got {size}")
         if any(dtype_of(part).kind not in KINDS for part in parts):
             raise TypeError(f"the residual of {self.name} must be real; give real and imaginary part as two fields")
-        backend = self.unknowns.backend
-        if not backend.whole_fields:
-            return cast(backend.join(self.unknowns.space, parts), np.float64)
-        lines = [anp.reshape(replicated(part), (-1,)) for part in parts]
-        if not lines:
-            flat = np.zeros(0)
-        elif len(lines) == 1:
-            flat = lines[0]
-        else:
-            flat = anp.concatenate(lines)
-        return cast(flat, np.float64)
+        return cast(self.unknowns.backend.concatenate(self.unknowns.space, parts), np.float64)
 
     # ------------------------------------------------------------ products with J = dF/dx
 
