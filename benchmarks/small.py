@@ -97,7 +97,7 @@ def donor_cell():
 
 
 def smoke(n=32, dt=0.05):
-    """Buoyant smoke in a closed box, the scene of README: the height of the smoke, derivatives in its start."""
+    """Buoyant smoke in a closed box: the height of the smoke, derivatives in its start."""
     room = dp.Grid((n, n), size=1.0)
     carry = dp.transport(room, "semi_lagrangian")
     carry_wind = dp.transport(room, "semi_lagrangian", dp.dirichlet, of="faces")

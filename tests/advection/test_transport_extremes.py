@@ -1,4 +1,4 @@
-"""Extreme cases of explicit transport: the column "explicit upwind" of the table in CONTRIBUTING, row by row."""
+"""Extreme cases of explicit transport: no velocity, the largest Courant numbers, obstacles, numbers of extreme size."""
 
 from itertools import product
 
