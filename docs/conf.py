@@ -73,7 +73,19 @@ html_show_sphinx = False
 html_copy_source = False
 html_show_sourcelink = False
 html_show_search_summary = False  # a page that is opened from disk may not fetch others
-WITHOUT_SIDEBAR = "index", "start", "ideas", "numbers", "compare", "building", "course", "teaching", "gallery/**"
+WITHOUT_SIDEBAR = (
+    "index",
+    "start",
+    "ideas",
+    "numbers",
+    "compare",
+    "where",
+    "decisions",
+    "building",
+    "course",
+    "teaching",
+    "gallery/**",
+)
 html_sidebars = {page: [] for page in WITHOUT_SIDEBAR}
 html_theme_options = {
     "navbar_align": "left",

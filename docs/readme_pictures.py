@@ -1,10 +1,12 @@
-"""The pictures in README.md: what the demo draws, made small.
+"""The pictures of README.md and of the front page: what the demo and three examples draw, made small.
 
     python docs/readme_pictures.py
 
-All of them together are at most 300 kB (tests/test_pages.py), for every clone carries them.
+All of them together are at most 300 kB (tests/test_pages.py), because every clone contains them.
 """
 
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -12,16 +14,60 @@ from PIL import Image
 
 from sparsedp.__main__ import main
 
-NAMES = "truth", "recovery", "convergence"
-WIDTH = 640  # pixels
-COLOURS = 96  # as many serve maps of one hue and text
+ROOT = Path(__file__).parent.parent
+TARGET = ROOT / "docs" / "pictures"
+NAMES = "recovery", "plume", "cylinder", "patterns"
+SIZES = {"plume": "64", "cylinder": "20", "patterns": "48"}  # cells, the first argument of the examples
+WIDTHS = {"plume": 1.0, "cylinder": 1.0, "patterns": 0.5}  # the part that is shown, from the left
+CARD = 720, 368  # pixels of a picture of an example
+COLOURS = 256
 
-if __name__ == "__main__":
-    target = Path(__file__).parent / "pictures"
-    target.mkdir(exist_ok=True)
+
+def resized(image, width):
+    """Return an image of a given width, with the same proportions."""
+    return image.resize((width, round(image.height * width / image.width)), Image.Resampling.LANCZOS)
+
+
+def side_by_side(left, right):
+    """Return one image of two of the same height."""
+    both = Image.new("RGB", (left.width + right.width, left.height), "white")
+    both.paste(left, (0, 0))
+    both.paste(right, (left.width, 0))
+    return both
+
+
+def card(image, part):
+    """Return the left part of an image on a white card."""
+    shown = image.crop((0, 0, round(part * image.width), image.height))
+    shown.thumbnail(CARD, Image.Resampling.LANCZOS)
+    white = Image.new("RGB", CARD, "white")
+    white.paste(shown, ((CARD[0] - shown.width) // 2, (CARD[1] - shown.height) // 2))
+    return white
+
+
+def save(image, name):
+    """Write a picture with few colours."""
+    image.quantize(COLOURS).save(TARGET / f"{name}.png", optimize=True)
+
+
+def opened(path):
+    """Return the image of a file without transparency."""
+    return Image.open(path).convert("RGB")
+
+
+def draw():
+    """Run the demo and the examples, and write the pictures."""
+    TARGET.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         main(["demo", "--out", folder])
-        for name in NAMES:
-            whole = Image.open(Path(folder) / f"{name}.png").convert("RGB")
-            small = whole.resize((WIDTH, round(whole.height * WIDTH / whole.width)), Image.Resampling.LANCZOS)
-            small.quantize(COLOURS).save(target / f"{name}.png", optimize=True)
+        truth, recovery = (opened(Path(folder) / f"{name}.png") for name in ("truth", "recovery"))
+        save(resized(side_by_side(truth, recovery), 1200), "recovery")
+    for name, size in SIZES.items():
+        with tempfile.TemporaryDirectory() as folder:
+            script = ROOT / "examples" / f"{name}.py"
+            subprocess.run([sys.executable, script, size, "--out", folder], check=True)
+            save(card(opened(Path(folder) / f"{name}.png"), WIDTHS[name]), name)
+
+
+if __name__ == "__main__":
+    draw()

@@ -3,8 +3,8 @@
     import autograd.numpy as np  # NumPy whose functions are recorded for derivatives
     import sparsedp as dp
 
-``dir(dp)`` lists the public names, ``help(dp.transport)`` explains one: shapes, units, errors, an example. README.md
-shows how they work together, examples/ applies them to problems.
+``dir(dp)`` lists the public names, ``help(dp.transport)`` explains one: shapes, units, errors, an example.
+docs/guides shows how they work together, examples/ applies them to problems.
 
 Names are imported when they are first used: ``import sparsedp`` alone loads no other module.
 A new public name needs an entry in ``_PUBLIC_NAMES`` and one in ``__init__.pyi``, which type checkers read. A renamed

@@ -1,8 +1,8 @@
-"""Every command and code block of README.md runs, and prints what the page says.
+"""README.md is short, and every command and code block of it runs and prints what the page says.
 
 - Python blocks are run in order, and compared with the output that stands below them (pages.py).
-- Each command of a shell block is recognised: the demo runs small, an example runs, installs and tests are checked
-  against pyproject.toml and .ci/run.
+- Each command of a shell block, here and in CONTRIBUTING.md, is recognised: the demo runs small, an example runs,
+  installs and tests are checked against pyproject.toml and the folders of tests.
 """
 
 import os
@@ -22,6 +22,8 @@ else:
     import tomli as tomllib
 
 README = ROOT / "README.md"
+GUIDES = sorted(path for path in (ROOT / "docs" / "guides").glob("*.md") if path.name != "index.md")
+WITH_COMMANDS = [README, ROOT / "CONTRIBUTING.md"]
 COMMANDS = "<!-- commands -->"
 
 
@@ -38,16 +40,35 @@ def test_python_blocks(tmp_path, monkeypatch):
     run_blocks(README)
 
 
-def test_first_scene_is_short():
-    first = next(block for block in blocks(page()) if block.language == "python")
-    assert len([line for line in first.text.splitlines() if line.strip()]) <= 20
+def test_both_scenes_are_short():
+    scenes = [block.text.splitlines() for block in blocks(page()) if block.language == "python"]
+    poisson, rollout = [len([line for line in lines if line.strip()]) for lines in scenes]
+    assert poisson <= 15 and rollout <= 12
 
 
-def test_both_tables_of_examples_have_one_order():
-    pages = [page(), (ROOT / "examples" / "README.md").read_text(encoding="utf-8")]
-    rows = [re.findall(r"^\| (\d+) \| `(?:examples/)?(\w+\.py)`", text, flags=re.MULTILINE) for text in pages]
-    assert rows[0] == rows[1] and [int(number) for number, _ in rows[0]] == list(range(1, len(rows[0]) + 1))
-    assert {name for _, name in rows[0]} == {path.name for path in (ROOT / "examples").glob("*.py")}
+def test_the_pages_at_the_root_are_short():
+    assert len(README.read_bytes()) <= 8000
+    assert len((ROOT / "CONTRIBUTING.md").read_bytes()) <= 5000
+
+
+def test_every_guide_is_in_the_table_of_features():
+    rows = re.findall(r"^\| [^|]+ \| [^|]+ \| \[[^]]+\]\(docs/guides/(\w+\.md)\) \|$", page(), flags=re.MULTILINE)
+    assert sorted(rows) == [path.name for path in GUIDES]
+
+
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "examples/README.md"])
+def test_relative_links_lead_to_files(name):
+    path = ROOT / name
+    links = re.findall(r"\]\(([^)#]+)", path.read_text(encoding="utf-8"))
+    assert not [link for link in links if "://" not in link and not (path.parent / link).exists()]
+
+
+def test_the_table_of_examples_is_complete():
+    text = (ROOT / "examples" / "README.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (\d+) \| `(\w+\.py)`", text, flags=re.MULTILINE)
+    assert [int(number) for number, _ in rows] == list(range(1, len(rows) + 1))
+    assert {name for _, name in rows} == {path.name for path in (ROOT / "examples").glob("*.py")}
+    assert re.search(rf"\b{len(rows)} scripts", page())
 
 
 def test_comparison_of_printed_text():
@@ -112,6 +133,7 @@ def obey(words, folder, run):
         run(run_python, words[1:], folder)
     elif words[:3] == ["python", "-m", "pytest"]:
         assert "python -m pytest" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+        assert all((ROOT / word).exists() for word in words[3:] if word.startswith(("tests/", "sparsedp/")))
     elif words[0] == "python" and words[1].startswith("examples/"):
         assert (ROOT / words[1]).exists()
         run(run_python, [str(ROOT / words[1]), *words[2:]], folder)
@@ -121,8 +143,10 @@ def obey(words, folder, run):
         assert (ROOT / words[-2] / "conf.py").exists()  # tests/test_pages.py builds them
     elif words[0] == ".ci/run":
         assert os.access(ROOT / ".ci" / "run", os.X_OK)
+    elif words[0] == "pre-commit":
+        assert (ROOT / ".pre-commit-config.yaml").exists()
     else:
-        assert words[:2] == ["git", "clone"] or words[0] == "cd", f"teach tests/test_readme.py: {shlex.join(words)}"
+        assert words[:3] == ["python3", "-m", "venv"] or words[0] in (".", "cd"), f"not recognised: {shlex.join(words)}"
 
 
 @pytest.mark.parametrize(
@@ -134,8 +158,11 @@ def obey(words, folder, run):
 )
 def test_shell_blocks(tmp_path, run):
     """Every command is known; the demo and the examples themselves run beside it by default, and here as `slow`."""
-    listed = [words for block in blocks(page()) if block.language in SHELL for words in commands(block.text)]
-    assert listed, "README.md has no shell block"
+    listed = []
+    for path in WITH_COMMANDS:
+        found = [block for block in blocks(path.read_text(encoding="utf-8")) if block.language in SHELL]
+        listed += [words for block in found for words in commands(block.text)]
+        assert found or path != README, "README.md has no shell block"
     for number, words in enumerate(listed):
         folder = tmp_path / str(number)
         folder.mkdir()

@@ -11,7 +11,8 @@ from sources import ROOT
 
 MISSING = [name for name in ("petsc4py", "mpi4py") if find_spec(name) is None]
 MISSING += [] if shutil.which("mpirun") else ["mpirun"]
-on_ranks = pytest.mark.skipif(bool(MISSING), reason=f"not here: {', '.join(MISSING)}; see README.md, Processes")
+GUIDE = "docs/guides/ranks_and_ensembles.md"
+on_ranks = pytest.mark.skipif(bool(MISSING), reason=f"not here: {', '.join(MISSING)}; see {GUIDE}")
 COUNTS = [2, *(pytest.param(count, marks=pytest.mark.whole) for count in (1, 4))]  # of processes
 SECONDS = 120
 
