@@ -1,15 +1,16 @@
 """Which states of a rollout to keep: binomial checkpointing, optimal for a known number of steps.
 
-With s kept states (the first one included) and at most r runs over any step,
+The backward pass needs every state once, from the last to the first. States that are not kept are computed again. With
+s kept states (the first one included) and each step run at most r times without a tape, a backward pass over
 
     beta(s, r) = (s + r)! / (s! r!)
 
-steps can be reversed. For n steps with beta(s, r-1) < n <= beta(s, r) the least number of plain steps is
+steps is possible. For n steps with beta(s, r-1) < n <= beta(s, r) the least number of step evaluations without a tape,
+including the n - 1 evaluations of the first run, is
 
-    t(n, s) = r n - beta(s + 1, r - 1),
+    t(n, s) = r n - beta(s + 1, r - 1).
 
-the first run over n - 1 steps included. It is reached by any rule that puts the next kept state m steps ahead, where
-both parts stay in the range of their own r: beta(s, r-2) <= m <= beta(s, r-1) and
+This minimum is attained if the next kept state lies m steps ahead, with beta(s, r-2) <= m <= beta(s, r-1) and
 beta(s-1, r-1) <= n - m <= beta(s-1, r).
 
 References
@@ -41,9 +42,9 @@ __all__ = [
 ]
 
 UNITS = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
-WORKING = 4  # states in use beside the kept ones: the present, its cotangent and the one before, the result
-OWN = 5  # states reserved for the memory that a step needs by itself, where there is room for that
-SLOW = 3  # ratio of the runs of steps to those with at most twice the memory, from which on there is a warning
+WORKING = 4  # arrays of the size of a state beside the kept ones: current state, two cotangents, result
+OWN = 5  # number of states whose memory is reserved for the temporary arrays of a step, if there is enough memory
+SLOW = 3  # warn if at most twice the memory would divide the number of step evaluations by this factor
 
 
 @dataclass(frozen=True)
@@ -55,11 +56,11 @@ class CheckpointPlan:
     n : int
         Number of steps.
     slots : int or None
-        How many states may be kept; None: all of them.
+        Largest number of states that may be kept; None if all states are kept.
     tape_bytes : int
-        Memory for tapes of steps that are kept from the forward pass.
+        Memory in bytes for the tapes of steps that the forward pass keeps.
     is_reversing : bool
-        Whether no state is kept, and the backward pass reverses the steps.
+        Whether only the last state is kept, and the backward pass computes the others by reversed steps.
     """
 
     n: int
@@ -74,14 +75,14 @@ class CheckpointPlan:
         return {*checkpoints(self.n, self.slots), self.n}
 
     def next_index(self, start: int, stop: int, kept: int) -> int:
-        """Return the index of the next state to keep on the way from one state to another one.
+        """Return the index of the next state to keep while states from `start` to `stop` are computed again.
 
         Parameters
         ----------
         start, stop : int
-            Index of the state reached, and of the state that is wanted.
+            Index of the current state, and of the state that the backward pass needs.
         kept : int
-            Number of states kept so far.
+            Number of states that are kept at present.
         """
         if self.slots is None:
             free = 1
@@ -91,7 +92,7 @@ class CheckpointPlan:
 
 
 def beta(s: int, r: int) -> int:
-    """Return the number of steps that s kept states and r runs can reverse; 0 where r or s is negative."""
+    """Return the largest number of steps for s kept states and at most r runs of each; 0 if r or s is negative."""
     if s >= 0 <= r:
         return comb(s + r, r)
     return 0
@@ -110,9 +111,9 @@ def repetitions(n: int, s: int) -> int:
 
 
 def advances(n: int, s: int) -> int:
-    """Return the least number of plain steps that reversing n steps takes with s kept states.
+    """Return the least number of step evaluations without a tape for a gradient over n steps with s kept states.
 
-    The first run over n - 1 steps is included.
+    The n - 1 evaluations of the first run are included.
     """
     if n <= 1:
         return 0
@@ -121,15 +122,15 @@ def advances(n: int, s: int) -> int:
 
 
 def stride(n: int, s: int) -> int:
-    """Return after how many steps the next state is kept, of n > 1 steps ahead and s states that may be kept."""
+    """Return the number of steps to the next kept state, if n > 1 steps remain and s states may be kept."""
     if s == 1:
-        return n - 1  # no further state is kept: go to the last one
+        return n - 1  # no further state can be kept, so run up to the last state that is needed
     r = repetitions(n, s)
     return min(beta(s, r - 1), n - beta(s - 1, r - 1))
 
 
 def checkpoints(n: int, s: int | None) -> Iterator[int]:
-    """Yield the indices of the states to keep in the forward pass, where s states may be kept; None: all."""
+    """Yield the indices of the states that the forward pass keeps if s states may be kept (None: all states)."""
     i = 0
     kept = 0
     while i < n:
@@ -142,7 +143,7 @@ def checkpoints(n: int, s: int | None) -> Iterator[int]:
 
 
 def slots_within(memory: float | str, state_bytes: int, n: int, beside: int = 0) -> int:
-    """Return how many states of a size fit into a memory beside those in use, at most n.
+    """Return the number of states, at most n, that can be kept in a memory beside the arrays in use.
 
     Parameters
     ----------
@@ -170,7 +171,9 @@ def slots_within(memory: float | str, state_bytes: int, n: int, beside: int = 0)
 
 
 def budget_within_reach(memory: float | str, state_bytes: int, n: int, beside: int = 0) -> int | None:
-    """Return the least number of bytes with which n steps take a third of the runs, if twice the memory is enough.
+    """Return the least memory that divides the number of step evaluations by `SLOW`.
+
+    Return None if that takes more than twice the given memory.
 
     Examples
     --------
@@ -186,12 +189,12 @@ def budget_within_reach(memory: float | str, state_bytes: int, n: int, beside: i
 
 
 def tape_bytes_within(memory: float | str, state_bytes: int, n: int, beside: int = 0) -> int:
-    """Return the bytes for tapes of steps where all n states are kept; negative where these do not fit."""
+    """Return the bytes that remain for tapes of steps if all n states are kept; negative if these do not fit."""
     return _bytes(memory) - beside - (n + WORKING + OWN) * state_bytes
 
 
 def _bytes(memory: float | str) -> int:
-    """Return a memory, a number of bytes or a text such as "200 MB", in bytes."""
+    """Return the number of bytes of a memory given as a number or as a string such as "200 MB"."""
     if isinstance(memory, str):
         match = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)\s*([A-Za-z]+)\s*", memory)
         if match and match[2].upper() in UNITS:

@@ -1,7 +1,8 @@
-"""What a rollout returns: the last state, selected or all states, or the results of a function of each.
+"""What a rollout returns: the last state, selected states, all states, or the results of a function of each state.
 
-Each kind takes the states of a forward pass as they come (`start`, `see`, `finish`) and builds the user's tree from the
-arrays of the last run (`tree`). In the backward pass `sources` says which cotangents enter at which state.
+Each class receives the states of a forward pass one by one (`start`, `see`, `finish`), and `tree` builds the result for
+the user from the arrays of the last run. In the backward pass `sources` returns the cotangents of the result that are
+added to the cotangent of a state.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ NOT_REPEATABLE = "keep returns something else when it is called again; it must d
 
 
 def make_outputs(keep: Any, form: ArgumentForm, n: int) -> LastState:
-    """Return the kind of output that `keep` of a rollout of n steps asks for; refuse anything else."""
+    """Return the output object for the argument `keep` of a rollout of n steps; raise ValueError if it is invalid."""
     if isinstance(keep, str) and keep == "last":
         return LastState(form)
     if isinstance(keep, str) and keep == "all":
@@ -57,9 +58,9 @@ class LastState:
     form : ArgumentForm
     """
 
-    enters_everywhere = False  # whether cotangents may enter at any state, not at the last one alone
-    is_exact = True  # whether the states of the backward pass have the same bits as those of the forward pass
-    holds_all_states = False  # whether every state is returned, and thereby kept
+    enters_everywhere = False  # whether the result depends directly on other states than the last one
+    is_exact = True  # whether the states of the backward pass equal those of the forward pass bit for bit
+    holds_all_states = False  # whether the result contains every state, so that none has to be computed again
 
     def __init__(self, form: ArgumentForm) -> None:
         self.form = form
@@ -69,7 +70,7 @@ class LastState:
         """Begin a run."""
 
     def see(self, state: State) -> State:
-        """Take a state of the run; return the same state, perhaps in other memory."""
+        """Process the next state of the run; return the same state, possibly stored in other arrays."""
         return state
 
     def finish(self, last: State) -> tuple:
@@ -78,7 +79,7 @@ class LastState:
         return tuple(map(owned, last.values))
 
     def tree(self, arrays: Sequence) -> Any:
-        """Return the user's result, from arrays as `finish` returns them."""
+        """Build the result for the user from arrays as `finish` returns them."""
         values = []
         for value, is_python_float in zip(arrays, self.form.is_float, strict=True):
             if is_python_float and not isbox(value):
@@ -88,7 +89,10 @@ class LastState:
         return self.form.build(values, self._statics)
 
     def sources(self, n: int, cotangents: list) -> Callable[[State], list | None]:
-        """Return a function from a state to the cotangents that enter there, or None; n is the last state."""
+        """Return a function that maps a state to the cotangents of the result at this state, or to None.
+
+        The index of the last state is n.
+        """
         if len(cotangents) > 1:
             cotangents = [None if _is_zero(g) else g for g in cotangents]
 
@@ -101,18 +105,18 @@ class LastState:
 
 
 def _is_zero(back: Any) -> bool:
-    """Whether a cotangent is zero: nothing is propagated from a field that the result does not use."""
+    """Return True for an array of zeros, so that nothing is propagated from a field that the result does not use."""
     return type(back) is np.ndarray and not back.any()
 
 
 class SelectedStates(LastState):
-    """The states of given numbers, stacked along a new first axis; a tuple of fields that cannot be stacked.
+    """The states with given indices, stacked along a new first axis; fields that cannot be stacked form a tuple.
 
     Parameters
     ----------
     form : ArgumentForm
     numbers : sequence of int
-        Rising.
+        Indices of states, in increasing order.
     """
 
     enters_everywhere = True
@@ -120,10 +124,11 @@ class SelectedStates(LastState):
     def __init__(self, form: ArgumentForm, numbers: Sequence[int]) -> None:
         super().__init__(form)
         self._rows = {number: row for row, number in enumerate(numbers)}
-        self._places: list = []  # of each variable: the place of its stack, or the slice of its states
+        # For each variable the position of its stack in the list of arrays, or the slice of its separate states.
+        self._places: list = []
 
     def start(self, runner: StepRunner) -> None:
-        """Begin a run: a block for each variable, or a list where its states are traced or not NumPy arrays."""
+        """Begin a run: allocate an array for each variable, or a list if its states are traced or distributed."""
         n = len(self._rows)
         self._blocks: list = []
         self._statics = []
@@ -135,7 +140,7 @@ class SelectedStates(LastState):
                 self._blocks.append([None] * n)
 
     def see(self, state: State) -> State:
-        """Store a state; where all are returned, the state moves to the memory of the result."""
+        """Store a state if it is selected; if all states are returned, the run continues from the stored arrays."""
         row = self._rows.get(state.i)
         if row is None:
             return state
@@ -153,7 +158,10 @@ class SelectedStates(LastState):
         return state.with_values(values)
 
     def finish(self, last: State) -> tuple:
-        """End a run; where all states are returned, the backward pass uses these very arrays."""
+        """End a run; return the arrays of the result.
+
+        If all states are returned, the backward pass reads these arrays, which are therefore read-only.
+        """
         arrays: list = []
         self._places = []
         for block in self._blocks:
@@ -172,7 +180,7 @@ class SelectedStates(LastState):
         return tuple(arrays)
 
     def _grouped(self, arrays: Sequence) -> list:
-        """Return for each variable its stack, or the tuple of its states."""
+        """Return for each variable the stack of its states, or their tuple."""
         groups: list = []
         for place in self._places:
             if isinstance(place, int):
@@ -182,12 +190,12 @@ class SelectedStates(LastState):
         return groups
 
     def tree(self, arrays: Sequence) -> Any:
-        """Return the user's result, from arrays as `finish` returns them."""
+        """Build the result for the user from arrays as `finish` returns them."""
         statics = [_along_trajectory(leaf) for leaf in zip(*self._statics, strict=True)]
         return self.form.build(self._grouped(arrays), statics)
 
     def sources(self, n: int, cotangents: list) -> Callable[[State], list | None]:
-        """Return a function from a state to the cotangents that enter there, or None."""
+        """Return a function that maps a state to the cotangents of the result at this state, or to None."""
         blocks = self._grouped(cotangents)
 
         def source(state: State) -> list | None:
@@ -206,14 +214,14 @@ class AllStates(SelectedStates):
 
 
 def _along_trajectory(leaf: tuple) -> Any:
-    """Stack the numbers and arrays of a static leaf in all states; take the first one of anything else."""
+    """Stack a static leaf over all states if it is a number or array; otherwise return its value in the first state."""
     if isinstance(leaf[0], (bool, int, np.ndarray, np.generic)):
         return np.stack(leaf)
     return leaf[0]
 
 
 class _StackedResult:
-    """Stands for a floating result in a tree: the number of its stack, and its row there; None where it is alone."""
+    """Placeholder for a floating result in a tree: the index of its stack and its row, None for a result alone."""
 
     def __init__(self, stack: int, row: int | None) -> None:
         self.stack = stack
@@ -228,7 +236,7 @@ class _StackedResult:
 
 
 class FunctionOfStates(LastState):
-    """The results of function(index, state) for each state; floating results of one shape are kept in one stack.
+    """The results of function(index, state) for each state; floating results of equal shape share one stack.
 
     Parameters
     ----------
@@ -241,9 +249,9 @@ class FunctionOfStates(LastState):
     def __init__(self, form: ArgumentForm, function: Callable) -> None:
         super().__init__(form)
         self.function = function
-        self._fingerprints: list = []  # of the results, to compare with those of further calls
+        self._fingerprints: list = []  # of the results, to detect a function that later returns other results
         self._trees: list = []  # the results, with a _StackedResult in place of each floating leaf
-        self._first_trees: list = []  # those of the first run, which decide the order of entries
+        self._first_trees: list = []  # the trees of the first run; later results get the same order of entries
 
     def start(self, runner: StepRunner) -> None:
         """Begin a run."""
@@ -264,11 +272,11 @@ class FunctionOfStates(LastState):
         return state
 
     def _paired(self, result: Any, first: Any, i: int) -> list:
-        """Return the leaves of a result in the order of that of another call."""
+        """Return the leaves of a result in the order of the leaves of an earlier result."""
         return paired(result, first, f"keep({i}, state)", advice=f"; {NOT_REPEATABLE}", error=DerivativeError)
 
     def _stored(self, leaf: Any) -> Any:
-        """Store a floating result; return its place in the stacks, or a constant for anything else."""
+        """Store a floating result and return its placeholder; return a constant copy of anything else."""
         refuse_mask("keep returned a masked array", plain(leaf))
         if not is_variable(leaf):
             return constant(leaf)
@@ -288,7 +296,7 @@ class FunctionOfStates(LastState):
         return _StackedResult(list(self._stacks).index(key), len(stack) - 1)
 
     def _compare(self, i: int, results: Sequence) -> None:
-        """Refuse a function that returns something else for a state than before."""
+        """Raise DerivativeError if the function returns other values for a state than in an earlier call."""
         values = [as_field(plain(leaf)) for leaf in results if is_variable(leaf)]
         fingerprints = [(value.shape, value.dtype, fingerprint([value])) for value in values]
         if i == len(self._fingerprints):
@@ -308,7 +316,7 @@ class FunctionOfStates(LastState):
         return tuple(arrays)
 
     def tree(self, arrays: Sequence) -> tuple:
-        """Return the tuple of what the function returned."""
+        """Return the tuple of the results of the function."""
 
         def take(leaf: Any) -> Any:
             if isinstance(leaf, _StackedResult):

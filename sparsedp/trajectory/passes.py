@@ -1,8 +1,8 @@
-"""The forward and the backward pass of a rollout, and the rule with which the tape calls them.
+"""The forward and the backward pass of a rollout, and the derivative rule by which the tape calls them.
 
-A rollout is one node on the tape of the innermost trace of its arguments, if that is a reverse-mode trace. Every other
-trace goes through the steps themselves, in both passes: a forward derivative is the loop with tangents, and derivatives
-of higher order are those of the calls that the passes execute.
+A rollout is one node on the tape of the innermost trace of its arguments, if that is a reverse-mode trace. All other
+traces follow the operations inside the steps, in both passes: a forward derivative is a loop over steps with tangents,
+and derivatives of higher order differentiate the operations that the two passes execute.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 
 __all__ = ["RolloutRule"]
 
-SAMPLES = 32  # measurements of the cotangent in a long run
-APART = 16  # least number of steps between two of them: each one reads the whole cotangent
-NODE_BYTES = 800  # of a node, its closures and tuples: 350 to 1200 were measured
+SAMPLES = 32  # number of states of a long run at which the size of the cotangent is measured
+APART = 16  # least number of steps between two measurements, because each of them reads the whole cotangent
+NODE_BYTES = 800  # memory of a node with its closures and tuples; measured values lie between 350 and 1200
 
 
 # ---- forward ---------------------------------------------------------------------------------------------------------
@@ -42,7 +42,7 @@ NODE_BYTES = 800  # of a node, its closures and tuples: 350 to 1200 were measure
 def run_forward(
     runner: StepRunner, plan: CheckpointPlan, outputs: LastState, stored: set[int], progress: bool | str
 ) -> tuple[State, list[State]]:
-    """Run all steps; return the last state and the states kept for the backward pass, the last one included."""
+    """Run all steps; return the last state, and the list of the states kept for the backward pass with the last."""
     is_differentiated = bool(runner.specification.differentiated)
     recorder = runner.recorder
     room = plan.tape_bytes
@@ -59,10 +59,12 @@ def run_forward(
             recorder.bytes = None
         state = runner.step(start, is_taped)
         if not runner.copies and True in map(is_, state.values, start.values) and _share_an_array(state, start):
-            runner.copies = True  # run from the start again: this step may have read an array that it wrote into
+            # The step writes into arrays that it has returned, and it may have read one of them after that. Run all
+            # steps again with copies of the states.
+            runner.copies = True
             return run_forward(runner, plan, outputs, stored, progress)
         if is_taped:
-            if i < 2:  # the first two tapes tell the memory of a step
+            if i < 2:  # estimate the memory of a tape from the first two steps
                 size = (recorder.bytes or 0) + len(start.tape[1]) * NODE_BYTES - runner.specification.state.nbytes
                 tape_bytes = max(size, 0)
             room -= tape_bytes
@@ -84,7 +86,10 @@ def _share_an_array(state: State, start: State) -> bool:
 
 
 def refuse_nonfinite_step(runner: StepRunner) -> None:
-    """Name the first step that makes NaN or infinity; they persist, so the forward pass looks at the last state."""
+    """Run the steps again and raise NonFiniteError for the first one that produces NaN or infinity.
+
+    These usually persist, so that the forward pass checks the last state only.
+    """
     specification = runner.specification
     state = runner.first
     for i in range(specification.n):
@@ -108,28 +113,28 @@ def run_backward(
     Parameters
     ----------
     runner, plan, outputs
-        As in the forward pass.
+        The same objects as in the forward pass.
     kept : list of State
-        The states kept, the last one included; they are removed from the list.
+        The states that the forward pass kept, with the last one; this function empties the list.
     cotangents : list
-        Of the arrays of the result.
+        Cotangents of the arrays of the result.
     progress : bool or str
 
     Returns
     -------
     cotangents : list
-        Of the variables of all arguments, None where there is none.
+        Cotangents of the variables of all arguments; None for a variable that the result does not depend on.
     norms : list of (int, float)
-        Index of a state and the largest entry of its cotangent.
+        Index of a state and the largest magnitude of an entry of its cotangent.
     recomputed : int
-        Number of steps that were run again.
+        Number of steps that were run again to recompute states.
     """
     specification = runner.specification
     n = plan.n
     interval = max(n // SAMPLES, APART)
     source = outputs.sources(n, cotangents)
-    sums: dict = {}  # root of params: (sum so far, whether it may be written to)
-    rows: list[list] = []  # cotangents of the rows of each block of inputs
+    sums: dict = {}  # for each root of params: (sum of cotangents so far, whether the sum may be modified in place)
+    rows: list[list] = []  # for each array of inputs the cotangents of its rows, one row per step
     for block, root in zip(runner.inputs, runner.input_roots, strict=True):
         if root:
             rows.append(list(zero_like(block)))
@@ -148,7 +153,7 @@ def run_backward(
         norms = [(n, largest(total))]
     for i in shown_steps(progress, range(n - 1, -1, -1), "backward"):
         if total is None and not outputs.enters_everywhere:
-            break  # cut by truncation
+            break  # truncation: earlier states get no cotangent
         is_taped = kept and kept[-1].tape
         if is_taped:
             fingerprint = []
@@ -161,7 +166,7 @@ def run_backward(
             recomputed += repeated
         if total is not None:
             if not is_taped:
-                state = state.with_values(state.values)  # the tape is freed with it
+                state = state.with_values(state.values)  # a new object, so that no kept state holds the tape
                 repeated_end = runner.step(state, True).fingerprint()
                 if not plan.is_reversing:
                     check_repeated(specification, repeated_end, fingerprint)
@@ -193,7 +198,7 @@ def run_backward(
 
 
 def _pulled_back(g: list, runner: StepRunner, state: State, sums: dict, rows: list[list]) -> list | None:
-    """Return the cotangents of a taped state, from those of the state after it; None if there are none."""
+    """Return the cotangents of a state with a tape, given those of the next state; None if no variable has one."""
     roots, nodes, ends = state.tape
     runner.current = state
     backward(nodes, ends, g, sums)
@@ -211,7 +216,7 @@ def _pulled_back(g: list, runner: StepRunner, state: State, sums: dict, rows: li
     for row, root in zip(rows, roots[len(backs) :]):
         if root in sums:
             row[state.i] = sums.pop(root)[0]
-    if not sums.keys() <= runner.lasting_nodes:  # a node of another step
+    if not sums.keys() <= runner.lasting_nodes:  # the step used a value that another step recorded
         refuse_foreign_trace("the step")
     if is_reached:
         return backs
@@ -219,7 +224,7 @@ def _pulled_back(g: list, runner: StepRunner, state: State, sums: dict, rows: li
 
 
 def _state_at(i: int, runner: StepRunner, plan: CheckpointPlan, kept: list[State]) -> tuple[State, int]:
-    """Return state i, run from the nearest kept state, and the number of steps that this took."""
+    """Return state i, computed from the nearest kept state before it, and the number of steps that were run."""
     state = kept.pop()
     repeated = 0
     while state.i < i:
@@ -233,7 +238,7 @@ def _state_at(i: int, runner: StepRunner, plan: CheckpointPlan, kept: list[State
 
 
 def _sum(total: list | None, entering: list | None) -> list | None:
-    """Return the sum of two lists of cotangents, each of which may be or hold None."""
+    """Return the elementwise sum of two lists of cotangents; None, as a list or as an entry, counts as zero."""
     if entering is None:
         return total
     if total is None:
@@ -251,7 +256,7 @@ def _sum(total: list | None, entering: list | None) -> list | None:
 
 
 def check_repeated(specification: RolloutSpecification, fingerprints: list, earlier: list) -> None:
-    """Refuse a state that differs from the same state of an earlier run; both as fingerprints."""
+    """Raise DerivativeError if the fingerprints of a state differ from its fingerprints in an earlier run."""
     if fingerprints == earlier:
         return
     form = specification.state
@@ -264,7 +269,7 @@ def check_repeated(specification: RolloutSpecification, fingerprints: list, earl
 
 
 class RolloutRule(Rule):
-    """A rollout as a rule of its variables, and the states that it keeps for the backward pass.
+    """A rollout as a derivative rule of its variables; holds the states kept for the backward pass.
 
     Parameters
     ----------
@@ -277,9 +282,9 @@ class RolloutRule(Rule):
     Attributes
     ----------
     count : int
-        How many arrays are returned.
+        Number of arrays of the result.
     truncate : int or None
-        Of the specification: a check of the gradient names it.
+        The value in the specification; `check.gradient` reads it to explain a difference.
     """
 
     name = "rollout"
@@ -308,7 +313,7 @@ class RolloutRule(Rule):
         self._last_fingerprint: list = []
 
     def forward(self, *args: Any) -> Any:
-        """Run all steps; return the array or the arrays of the result."""
+        """Run all steps; return the array of the result, or the tuple of its arrays."""
         specification = self.specification
         runner = StepRunner(specification, args)
         with runner.errors_named():
@@ -332,7 +337,7 @@ class RolloutRule(Rule):
         return results[0]
 
     def again(self, *args: Any) -> Any:
-        """Run the same steps from other values, which may be on any trace, without `progress` and `record`."""
+        """Run the same steps for other arguments, which may be on any trace, without `progress` and `record`."""
         old = self.specification
         specification = RolloutSpecification(old.step, old.forms, old.n, old.truncate, innermost(args))
         rule = RolloutRule(specification, self.plan, copy(self.outputs), False, None)
@@ -345,22 +350,22 @@ class RolloutRule(Rule):
         return [values[k] for k in range(self.count)]
 
     def vjp(self, nums: Sequence[int], ans: Any, *args: Any) -> Callable:
-        """Return the function from the cotangents of the result to those of the differentiated arguments."""
+        """Return the function that maps cotangents of the result to cotangents of the differentiated arguments."""
         return partial(self._cotangents, args, self._take_runs())
 
     def _take_runs(self) -> list:
-        """Return and clear the last run; the rule does not hold it, which would keep its states in memory."""
+        """Return and clear the last run, so that the rule does not keep its states in memory."""
         runs = self._runs
         self._runs = []
         return runs
 
     def _cotangents(self, args: tuple, runs: list, cotangent: Any) -> tuple:
-        """Return the cotangents of the differentiated arguments, which must be finite."""
+        """Return the cotangents of the differentiated arguments; raise NonFiniteError if they are not finite."""
         g = self.parts(cotangent)
         backs = self._backward_pass(args, g, runs)
         for position, back in zip(self.specification.differentiated, backs, strict=True):
             if not is_finite(back) and all(map(is_finite, g)):
-                with checking_derivatives():  # a second run names the call that made it, if one did
+                with checking_derivatives():  # run again with checks, to raise at the operation that is not finite
                     self._backward_pass(args, g, [])
                 raise NonFiniteError(
                     f"the backward pass through {self.specification.n} steps of rollout makes the gradient in "
@@ -369,7 +374,11 @@ class RolloutRule(Rule):
         return backs
 
     def _backward_pass(self, args: tuple, g: list, runs: list) -> tuple:
-        """Return the cotangents, finite or not. With limited memory a run is freed while it is used, and run again."""
+        """Return the cotangents, without a check that they are finite.
+
+        With limited memory the backward pass frees the states of the run that it uses; if it is called once more, the
+        forward pass is repeated first.
+        """
         specification = self.specification
         if not runs:
             last_fingerprint = self._last_fingerprint

@@ -1,8 +1,9 @@
 """What a rollout reports after each pass: how many steps were run, and how the cotangent grew.
 
-A cotangent that grows by exp(rate) a step belongs to a chaotic run: the gradient is exact for these very steps, but
-a change of the start by rounding changes it by about amplification * 1e-16. Nothing is clipped. Beyond `LIMIT` the
-gradient says little about the physics, and a GrowthWarning says so.
+In a chaotic run the cotangent grows by a factor exp(rate) in each step. The gradient is the exact derivative of the
+computed steps, but a rounding error in the first state changes it by a relative amount of about amplification * 1e-16.
+The cotangent is never clipped. If the amplification exceeds `LIMIT`, the gradient describes the rounding errors more
+than the physics, and a GrowthWarning is issued.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from sparsedp.errors import GrowthWarning
 
 __all__ = ["Record", "backward_record", "largest"]
 
-LIMIT = 1e8  # amplification that costs half of the digits
+LIMIT = 1e8  # amplification of rounding errors at which half of the digits of double precision are lost
 
 
 class Record(NamedTuple):
@@ -33,13 +34,13 @@ class Record(NamedTuple):
     kept : int
         Number of states kept for the backward pass.
     recomputed : int
-        Steps run again in the backward pass.
+        Number of steps that the backward pass ran again to recompute states.
     norms : tuple of (int, float)
-        Index of a state and the largest entry of its cotangent, from the last state to the first.
+        Index of a state and the largest magnitude of an entry of its cotangent, from the last state to the first.
     growth : float
-        Rate per step: the norm behaves like exp(growth * number of steps back); NaN when it was not measured.
+        Growth rate per step of the backward pass: the norm behaves like exp(growth * steps). NaN if not measured.
     amplification : float
-        Largest norm over the first one.
+        Ratio of the largest norm to the first norm that is not zero.
     """
 
     direction: str
@@ -52,12 +53,12 @@ class Record(NamedTuple):
 
     @property
     def factor(self) -> float:
-        """Return the runs of steps over the number of steps, the first run included; 1 if none was run again."""
+        """Return the average number of runs per step: 1 for the forward pass, plus those that recompute states."""
         return 1 + self.recomputed / max(self.steps, 1)
 
     @property
     def flagged(self) -> bool:
-        """Return whether the cotangent grew beyond the limit at which a gradient is useful."""
+        """Return whether the cotangent grew by more than `LIMIT`, so that the gradient is of little use."""
         return self.amplification > LIMIT
 
 
@@ -69,9 +70,9 @@ def backward_record(n: int, kept: int, recomputed: int, norms: list[tuple[int, f
     n, kept, recomputed : int
         As the attributes of `Record`.
     norms : list of (int, float)
-        Index of a state and the largest entry of its cotangent.
+        Index of a state and the largest magnitude of an entry of its cotangent.
     last_cut : int
-        The last state at which truncation sets the cotangent to zero, or -1.
+        Largest index of a state at which truncation sets the cotangent to zero, or -1.
     """
     reference = nan
     amplification = nan
@@ -79,7 +80,7 @@ def backward_record(n: int, kept: int, recomputed: int, norms: list[tuple[int, f
     for i, norm in norms:
         if norm > 0 and not reference > 0:
             reference = norm
-        if 0 < norm < inf and i > last_cut:  # at a cut the cotangent begins anew
+        if 0 < norm < inf and i > last_cut:  # before a cut the cotangent has been set to zero and starts again
             logarithms.append((i, log(norm)))
     if norms:
         amplification = max(norm for _, norm in norms) / reference
@@ -102,7 +103,7 @@ def backward_record(n: int, kept: int, recomputed: int, norms: list[tuple[int, f
 
 
 def largest(arrays: Any) -> float:
-    """Return the largest entry of some arrays, plain or traced; None counts as empty, NaN and infinity as they are."""
+    """Return the largest magnitude of an entry of some arrays, plain or traced; ignore None, propagate NaN."""
     total = 0.0
     for array in arrays:
         if array is None or not np.size(plain(array)):

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 __all__ = ["rollout"]
 
-TAPE_BYTES = 2**28  # for tapes of steps, where no memory is given
+TAPE_BYTES = 2**28  # memory for the tapes of steps if the user gives no `memory`
 
 
 def rollout(
@@ -54,62 +54,69 @@ def rollout(
     Parameters
     ----------
     step : callable
-        ``step(state, params)``, or ``step(state, params, input)`` with inputs: the next state, of the same
-        form. It uses only its arguments and constants, and does not modify them.
+        ``step(state, params)``, or ``step(state, params, input)`` if there are inputs. It returns the next state, with
+        the same tree structure, shapes and dtypes. It uses only its arguments and constants, and does not modify them.
     state : array, number, or any nesting of them in tuples, lists and dicts
-        Not modified. Leaves that are not floating (int, None, str) are passed on without a derivative.
+        The first state; it is not modified. Leaves that are not floating (int, None, str) are passed to the step and
+        have no derivative.
     params : array, number, tree of these, or None
     n : int
         Number of steps.
     inputs : array or tree of arrays, optional
-        Values that change from step to step: step i gets entry i of the first axis of every array.
+        Values that change from step to step: step i gets entry i along the first axis of every array.
     memory : None, number of bytes, text such as "200 MB", or "reverse"
-        Memory of the rollout. None keeps every state. Otherwise as many are kept as fit beside params, inputs
-        and their gradients, and the others are computed again from those, as rarely as possible. Where all fit, the
-        remaining memory holds tapes of steps (with None 256 MB): such a step runs once, not twice. Not counted:
-        the memory that one step needs by itself, and the result; with keep="all" no state is computed again.
-        "reverse" keeps the last state alone, and the backward pass calls ``step.back(state, params)``, the reversed
-        step: for leapfrog without damping. The gradient then has an error of rounding; where reversed steps miss the
-        first state by more than 1e-8 of its size, 1e-4 in single precision, it is refused.
+        Memory that the rollout may use. None keeps every state. With a number of bytes, the rollout keeps the states
+        that fit into the memory beside params, inputs and their gradients, and computes the other states again from
+        these, with as few repeated steps as possible. If all states fit, the remaining memory (256 MB with None) holds
+        tapes of steps; a step whose tape is kept is run once instead of twice. The memory that one step needs for its
+        own work and the memory of the result are not counted. With keep="all" no state is computed again.
+        "reverse" keeps only the last state, and the backward pass computes earlier states by the reversed step
+        ``step.back(state, params)``, which leapfrog without damping has. The gradient then has a rounding error. If
+        the reversed steps miss the first state by more than 1e-8 of its size (1e-4 in single precision), a
+        DerivativeError is raised.
     keep : "last", "all", list of int or callable
-        The result: the last state; all n + 1, or those after the listed numbers of steps (rising, 0 is the first
-        state), each array with a new first axis, of a field on ranks a tuple; or the tuple of the trees that
+        What is returned. "last": the last state. "all": all n + 1 states. A list of int, in increasing order: the
+        states after these numbers of steps (0 is the first state). States are stacked along a new first axis of each
+        array; distributed fields are returned as a tuple. A callable: the tuple of the trees that
         ``keep(index, state)`` returned for index = 0 ... n.
     truncate : int, optional
-        Truncated back-propagation: state i counts as a constant for the steps after it wherever n - i is a
-        multiple of `truncate`, 0 < i < n. The value is the same, derivatives of all orders are cut there.
+        Truncated back-propagation: each state i with 0 < i < n for which n - i is a multiple of `truncate` is treated
+        as a constant by the steps after it. This changes derivatives of all orders, not the value.
     progress : bool or str
-        Progress bars on standard error, a string is their label; needs the extra `plot`.
+        True shows progress bars on standard error; a string does so and is their label. Needs the extra `plot`.
     record : callable, optional
-        Called as ``record(entry)`` after every forward and backward pass: steps, states kept, steps run again,
-        growth of the cotangent. For example ``record=runs.append``.
+        Called as ``record(entry)`` after every forward and backward pass. The entry has the number of steps, of states
+        kept and of steps run again, and the growth of the cotangent. For example ``record=runs.append``.
 
     Returns
     -------
     tree
-        Fresh arrays, with the dtypes of `state`.
+        New arrays, with the dtypes of `state`; for a callable `keep`, see there.
 
     Raises
     ------
     ValueError
-        If n, memory, keep or truncate is out of range; if the step changes one of its arguments.
+        If n, memory, keep or truncate is out of range, or if the step changes one of its arguments.
     ShapeError
-        If a state has another form, shape or dtype than the first, or inputs have not n entries.
+        If a state differs from the first one in tree structure, shape or dtype, or if the first axis of an array of
+        inputs does not have n entries.
     NonFiniteError
-        If state, params or inputs hold NaN or infinity, or a step or the backward pass makes some.
+        If state, params or inputs contain NaN or infinity, or if a step or the backward pass produces NaN or infinity.
     DerivativeError
-        If the step or `keep` uses a traced value that is not an argument, or a value that one of them stored is used
-        later; if a derivative is requested of a state without floating numbers; if a step or `keep` that is run again
-        gives another result.
+        If the step or `keep` uses a traced value that is not one of its arguments; if a traced value that the step or
+        `keep` stored is used after the call; if a derivative is requested but the state has no floating values; if a
+        step or `keep` returns a different result when it is run again.
     ImportError
-        If a progress bar is wanted and tqdm is not installed.
+        If `progress` is used and tqdm is not installed.
 
     Warns
     -----
     GrowthWarning
-        If the cotangent of the state grew by more than 1e8: a chaotic run. The gradient is exact; nothing is cut.
+        If the cotangent of the state grew by a factor of more than 1e8, as in a chaotic run. The gradient is exact and
+        is not clipped.
     BudgetWarning
-        If at most twice the memory would reduce the runs of steps to a third; it says how much is needed.
+        If at most twice the memory would reduce the number of step evaluations to a third. The warning says how much
+        memory is needed.
 
     See Also
     --------
@@ -117,15 +124,16 @@ def rollout(
 
     Notes
     -----
-    Cost: n steps forward; backward n steps on a tape of their own, unless it is kept, plus those run again:
-    with s states kept and at most r runs over each step, n <= (s + r)! / (s! r!) steps can be reversed. The gradient
-    has the same bits for every `memory`. A forward derivative costs the memory of one step, the derivative of a
-    gradient (`hvp`) twice the memory of the gradient; the gradient of a gradient has all calls of both on its tape.
-    `differentiable` gives a step a hand-written derivative.
+    Cost: the forward pass runs n steps. The backward pass runs every step whose tape was not kept once more, on a
+    tape, and repeats steps to recompute states: with s states kept and each step run at most r times,
+    n <= (s + r)! / (s! r!) steps can be differentiated. The gradient is the same bit for bit for every `memory` in
+    bytes. A forward derivative needs the memory of one step, and the derivative of a gradient (`hvp`) twice the memory
+    of the gradient. The gradient of a gradient records all calls of both passes on its tape.
+    A step decorated with `differentiable` uses a hand-written derivative.
 
-    The states of the backward pass are those of one run that ends, bit by bit, in the result: a step on its
-    tape must give the state after it, and states that are run again must lead to those kept. Large ones are compared
-    by a fingerprint of 64 bits.
+    The backward pass differentiates one run of steps that ends, bit for bit, in the result: whenever it runs a step
+    again on a tape, it compares the next state with the one that it used before, by fingerprints of 64 bits. With
+    memory="reverse" only the first state is compared, up to rounding.
 
     References
     ----------
@@ -158,14 +166,14 @@ def rollout(
     else:
         check_takes("rollout", step, 3, "lambda state, params, input: ...")
     args = []
-    memory_beside = 0  # of params and inputs, and of their gradients
+    memory_beside = 0  # bytes of params and inputs, and of their gradients
     for form, tree in zip(forms, trees.values()):
         variables = list(map(contiguous, form.variables(tree)))
         args += variables
         if form is not forms[0]:
             memory_beside += (1 + any(map(isbox, variables))) * form.nbytes
     traced = [position for position, arg in enumerate(args) if isbox(arg)]
-    if traced:  # the backward pass must see the values of the forward pass
+    if traced:  # copy the constants: the caller may change them before the backward pass
         args = constant_args(args, traced)
     if truncate is not None:
         check_whole("truncate of rollout", truncate, 1, "; leave it out and nothing is cut")
@@ -195,7 +203,7 @@ def _check_inputs(inputs: Any, n: int) -> None:
 def _checkpoint_plan(
     step: Callable, memory: float | str | None, state_bytes: int, n: int, beside: int, holds_all_states: bool
 ) -> CheckpointPlan:
-    """Return the plan for a memory. An empty state counts as one byte: it takes a place among those kept, too."""
+    """Return the checkpoint plan for a given `memory`."""
     if memory is None:
         return CheckpointPlan(n, None, TAPE_BYTES)
     if memory == "reverse":
@@ -207,7 +215,7 @@ def _checkpoint_plan(
 
 
 def _check_reversible(step: Callable) -> None:
-    """Refuse a step that cannot be reversed."""
+    """Raise ValueError if a step cannot be reversed."""
     if not callable(getattr(step, "back", None)):
         raise ValueError(
             f"memory='reverse' needs a step with step.back(state, params), got {step!r}; write memory='200 MB', or "
@@ -218,7 +226,7 @@ def _check_reversible(step: Callable) -> None:
 
 
 def _warn_of_repeats(memory: Any, state_bytes: int, n: int, beside: int) -> None:
-    """Warn if a little more memory would avoid most repeated steps."""
+    """Warn if at most twice the memory would avoid most of the repeated steps."""
     larger = budget_within_reach(memory, state_bytes, n, beside)
     if larger is not None:
         runs = (advances(n, slots_within(memory, state_bytes, n, beside)) + 1) / n
@@ -233,7 +241,7 @@ def _warn_of_repeats(memory: Any, state_bytes: int, n: int, beside: int) -> None
 
 
 def _check_values(specification: RolloutSpecification, args: Sequence, traced: Sequence[int]) -> None:
-    """Refuse values that are not finite, and traced ones without a derivative."""
+    """Raise an error for values that are not finite, and for traced values that cannot have a derivative."""
     for form, values in zip(specification.forms, specification.split(args), strict=False):
         form.check_finite(values, "rollout")
     for position in traced:

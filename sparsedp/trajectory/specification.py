@@ -1,7 +1,8 @@
 """What a rollout computes: its step, the forms of its arguments, and which of them are differentiated.
 
-An `ArgumentForm` is the structure of an argument, and says whether another tree has the same form. A
-`RolloutSpecification` holds the forms of state, params and inputs; it does not change while the rollout runs.
+The form of an argument is its tree structure together with the shapes and dtypes of its floating leaves, which are
+called its variables. An `ArgumentForm` stores a form and checks whether another tree has it. A `RolloutSpecification`
+stores the forms of state, params and inputs; it does not change while the rollout runs.
 """
 
 from __future__ import annotations
@@ -37,25 +38,26 @@ __all__ = [
 
 
 class ArgumentForm(TreeStructure):
-    """The structure of an argument of a rollout, and the shapes and dtypes of its variables, the floating leaves.
+    """The tree structure of an argument of a rollout, and the shapes and dtypes of its variables (floating leaves).
 
     Parameters
     ----------
     tree : any nesting of arrays, tuples, lists and dicts
     root : str
-        Its name in messages.
+        Name of the argument in error messages.
 
     Attributes
     ----------
     is_open : bool
-        Some branch is a dict or a list, whose entries could be changed.
+        Whether some branch is mutable (a dict, a list, or a dataclass that is not frozen), so that a step could
+        replace its entries.
     shapes, dtypes, is_float : list
-        Of the variables; `is_float`: whether it is a float of Python.
+        One entry for each variable; `is_float` is True for a Python float.
     nbytes : int
-        Of all of them.
+        Total size of the variables.
     rounds : bool
-        Whether a step may widen float32 to float64, and its result is rounded: beside numbers of Python, which are
-        traced as float64, autograd widens what NumPy does not.
+        Whether a float64 result of a step is rounded to the float32 of the state. Set when some argument is a Python
+        float: NumPy keeps float32 in operations with it, but autograd traces it as float64 and thus returns float64.
     """
 
     rounds = False
@@ -91,26 +93,26 @@ class ArgumentForm(TreeStructure):
                     )
 
     def take(self, tree: Any, origin: str, number: int, outer: set[int]) -> tuple:
-        """Take a tree of the same form apart.
+        """Separate the variables and the other leaves of a tree that must have this form.
 
         Parameters
         ----------
         tree : any nesting of arrays, tuples, lists and dicts
         origin : str
-            What returned the tree, for messages.
+            Name of the function that returned the tree, for error messages.
         number : int
-            The trace of the rollout.
+            Number of the trace of the rollout.
         outer : set of int
-            The other traces that the variables may be on.
+            Numbers of the other traces that the variables may belong to.
 
         Returns
         -------
         variables : list or None
-            As they were returned; None where an array had to be converted.
+            The variables as they stand in the tree; None if one of them had to be converted.
         values : list
-            The same without the trace of the rollout, contiguous.
+            The contiguous values of the variables, without boxes of the trace of the rollout.
         nodes : list
-            Their nodes on that trace, or None.
+            For each variable its node on that trace, or None.
         statics : tuple
             The other leaves.
 
@@ -161,7 +163,7 @@ class ArgumentForm(TreeStructure):
         return variables, statics
 
     def _converted(self, k: int, value: Any, origin: str, outer: set[int]) -> Any:
-        """Return a variable as a contiguous array or number of its shape and dtype; refuse other ones."""
+        """Return variable k as a contiguous array or number; raise an error if its shape or dtype differs."""
         name = self.names[k]
         dtype = self.dtypes[k]
         if not traces_of([value]) <= outer:
@@ -182,7 +184,7 @@ class ArgumentForm(TreeStructure):
         return contiguous(value)
 
     def check_finite(self, values: Sequence, owner: str, needs: str = "must be finite") -> None:
-        """Refuse NaN and infinity in variables; the message names the leaf, the first index and the count."""
+        """Raise NonFiniteError for NaN or infinity in variables, with the leaf, the first index and the count."""
         for k, value in enumerate(values):
             if not is_finite(value):
                 check_finite(f"{self.names[k]} of {owner}", plain(value), needs)
@@ -196,23 +198,23 @@ class RolloutSpecification:
     ----------
     step : callable
     forms : list of ArgumentForm
-        Of state, params and, where there are any, inputs.
+        The forms of state, params and, if there are any, inputs.
     n : int
         Number of steps.
     truncate : int or None
     differentiated : list of int
-        Positions of the variables, of all arguments in this order, that need a cotangent.
+        Positions of the variables that need a cotangent, in the list of the variables of state, params and inputs.
 
     Attributes
     ----------
     state, params, inputs : ArgumentForm
-        `inputs` is None where there are none.
+        `inputs` is None if the rollout has no inputs.
     cuts : range
-        Indices of the states that truncation makes constants for the steps after them.
+        Indices of the states that truncation treats as constants for the steps after them.
     first_traced : int
-        Index of the first state that depends on something differentiated.
+        Index of the first state that depends on a differentiated variable; n + 1 if there is none.
     is_open : bool
-        Whether a step gets dicts or lists, whose entries it could change.
+        Whether a step gets dicts, lists or other mutable containers, whose entries it could replace.
     """
 
     step: Callable
@@ -255,7 +257,7 @@ class RolloutSpecification:
         return [name for form in self.forms for name in form.names]
 
     def split(self, variables: Sequence) -> tuple[list, list, list]:
-        """Return the variables of state, params and inputs, from those of all arguments."""
+        """Split the list of all variables into the lists of state, params and inputs."""
         first = len(self.state.places)
         second = first + len(self.params.places)
         return list(variables[:first]), list(variables[first:second]), list(variables[second:])
@@ -265,12 +267,12 @@ class RolloutSpecification:
 
 
 def is_array(value: Any) -> bool:
-    """Whether a plain value is a number or array of NumPy, not a field of another backend."""
+    """Return True for a number or a NumPy array, False for a distributed field."""
     return isinstance(value, (np.ndarray, Number))
 
 
 def contiguous(value: Any) -> Any:
-    """Return a contiguous array, or a NumPy scalar of a value without axes; values that are no arrays as they are."""
+    """Return an array in C order and a number as a NumPy scalar; return traced values and other fields unchanged."""
     if not is_array(value):
         return value
     if np.ndim(value):
@@ -279,14 +281,14 @@ def contiguous(value: Any) -> Any:
 
 
 def owned(value: Any) -> Any:
-    """Return a contiguous copy; traced values and other fields, into which nothing writes, are returned as they are."""
+    """Return a contiguous copy; return traced values and distributed fields unchanged, as they are never modified."""
     if not is_array(value):
         return value
     return contiguous(np.array(value, order="C"))
 
 
 def fingerprint(values: Sequence, statics: Sequence = ()) -> list:
-    """Return 64 bits for each variable of a state, and for each whole number, text and array of its other leaves."""
+    """Return a hash for each variable of a state, and for each integer, string and array among its other leaves."""
     marks = []
     for value in values:
         value = plain(value)
@@ -300,21 +302,21 @@ def fingerprint(values: Sequence, statics: Sequence = ()) -> list:
 
 
 def stacked(parts: Sequence) -> Any:
-    """Return values, traced or not, along a new first axis; the tuple of them if their backend cannot stack them."""
+    """Stack values, traced or not, along a new first axis; return a tuple if their backend cannot stack them."""
     return backend_of([plain(parts[-1])]).stack(parts)
 
 
-# ---- refusals --------------------------------------------------------------------------------------------------------
+# ---- errors ----------------------------------------------------------------------------------------------------------
 
 
 def refuse_mask(message: str, leaf: Any) -> None:
-    """Refuse an array with a mask, which a rollout would lose."""
+    """Raise TypeError for a masked array, because a rollout would lose the mask."""
     if isinstance(leaf, np.ma.MaskedArray):
         raise TypeError(f"{message}; fill it first, and pass the mask as an array of its own")
 
 
 def refuse_foreign_trace(origin: str) -> None:
-    """Refuse a result on a trace that the backward pass does not follow."""
+    """Raise DerivativeError for a result on a trace that the backward pass does not differentiate."""
     raise DerivativeError(
         f"{origin} uses a traced value that is not one of its arguments, and its derivative would be lost; "
         "pass it in params or make it a part of the state"

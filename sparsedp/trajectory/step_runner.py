@@ -1,4 +1,4 @@
-"""The steps of a rollout, on plain values or on a tape, and in which of them an error arose."""
+"""Run the steps of a rollout, with or without a tape, and add the number of the step to error messages."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 
 __all__ = ["State", "StepRunner"]
 
-# Of the size of each field, in double and in single precision: a gradient by reversed steps has about as many digits.
+# Largest accepted error of the first state after reversed steps, relative to the size of each field, in double and in
+# single precision. The gradient by reversed steps has about the same relative error.
 DRIFT = 1e-8
 SINGLE_DRIFT = 1e-4
 REMEDIES = {
@@ -34,24 +35,25 @@ REMEDIES = {
 
 
 class State:
-    """State i of a run.
+    """One state of a run.
 
     Attributes
     ----------
     i : int
+        Number of steps before this state.
     values : list
-        Its variables.
+        Values of the variables (floating leaves).
     statics : tuple
-        Its other leaves.
+        The other leaves.
     depends : list or None
-        True where a variable depends on something traced, None where it does not; None in place of the list: all do.
+        For each variable True if it depends on a traced value, else None. None instead of the list if all depend.
     boxes : (variables, nodes) or None
-        Its variables as they were returned, and their nodes, if the next step can continue from those; until that
-        step begins.
+        The traced variables as the step returned them, and their nodes, if the next step can use these without new
+        roots. Cleared when the next step begins.
     tape : (roots, nodes, ends) or None
-        Of the step from it: the roots of the variables of state and inputs, None where a constant is; all calls, in
-        order, so that the backward pass need not sort a graph; the nodes of the state after it, None where that does
-        not depend on anything traced.
+        Tape of the step that begins at this state. `roots`: the roots of the variables of state and inputs, None for
+        a constant. `nodes`: all recorded calls in order, so that the backward pass need not sort a graph. `ends`: the
+        nodes of the variables of the next state, None for one that does not depend on a traced value.
     """
 
     __slots__ = ("boxes", "depends", "i", "statics", "tape", "values")
@@ -65,15 +67,15 @@ class State:
         self.boxes: Any = None
 
     def with_values(self, values: list) -> State:
-        """Return the same state in other memory, without a tape."""
+        """Return the state with the given arrays as variables, and without a tape."""
         return State(self.i, values, self.statics, self.depends)
 
     def owned(self) -> State:
-        """Return a copy: a step may write again into the arrays that it has returned."""
+        """Return a copy of the state, because a step may later write into arrays that it has returned."""
         return self.with_values(list(map(owned, self.values)))
 
     def fingerprint(self) -> list:
-        """Return fingerprints of all leaves."""
+        """Return the fingerprints of the leaves, to compare states of two runs."""
         return fingerprint(self.values, self.statics)
 
 
@@ -84,21 +86,23 @@ class StepRunner:
     ----------
     specification : RolloutSpecification
     args : list of arrays
-        Variables of state, params and inputs; traced ones belong to outer traces, which record every call, too.
+        Variables of state, params and inputs. Those that are traced belong to outer traces, which also record the
+        operations of every step.
 
     Attributes
     ----------
     first : State
     params, inputs : lists
-        Variables of the two.
+        Variables of params and of inputs.
     param_roots, input_roots : lists
-        One for each variable of params, the same in all steps, and of inputs; None where no cotangent is needed.
+        A root for each variable of params and of inputs; None if it needs no cotangent. The roots of params are the
+        same in all steps.
     outer : set of int
-        The traces of the arguments.
+        Numbers of the traces of the arguments.
     current : State or None
-        The state from which the last step began.
+        The state from which the last step began, for error messages.
     copies : bool
-        Whether states are copied: the step writes into arrays that it has returned.
+        Whether the state after each step is copied, because the step writes into arrays that it has returned.
     """
 
     copies = False
@@ -128,11 +132,11 @@ class StepRunner:
 
     @cached_property
     def _untaped(self) -> Any:
-        """The root of all values without a tape: a value that a step stores is traced in any case."""
+        """The root of variables in steps without a tape, which makes a value that a step stores detectable."""
         return untaped_root(self.recorder)
 
     def step(self, state: State, is_taped: bool) -> State:
-        """Return the state after one step; if the step is taped, the given state gets its tape."""
+        """Return the state after one step; if `is_taped`, store the tape of the step in the given state."""
         specification = self.specification
         number = self.number
         boxes = state.boxes
@@ -169,17 +173,17 @@ class StepRunner:
                 for value in values:
                     if type(value) is np.ndarray:
                         value.flags.writeable = False
-        # A value that is on no tape may be an array that the step writes into again.
+        # A variable that does not depend on traced values may be an array that the step writes into again.
         if self.copies or (is_taped and following.depends):
             return following.owned()
         return following
 
     def _are_separate(self, nodes: list) -> bool:
-        """Whether each variable of a state has a sum of cotangents of its own, apart from those of params."""
+        """Return True if no two variables of a state, and no variable and a parameter, share a node."""
         return len({*nodes}) == len(nodes) and self.lasting_nodes.isdisjoint(nodes)
 
     def reversed_step(self, state: State) -> State:
-        """Return the state before a state, by the reversed step: the same to rounding."""
+        """Return the previous state, computed by the reversed step and thus equal up to rounding."""
         earlier = State(state.i - 1, state.values, state.statics)
         self.current = earlier
         result = self.specification.step.back(*self._plain_arguments(earlier))  # type: ignore[attr-defined]
@@ -188,7 +192,7 @@ class StepRunner:
         return State(earlier.i, values, statics)
 
     def state_tree(self, state: State) -> Any:
-        """Return the tree of a state, for a function that is called again on a tape."""
+        """Return the tree of a state for the function `keep`, with traced variables if they have a derivative."""
         if state.i >= self.specification.first_traced:
             root = self._untaped
         else:
@@ -197,7 +201,7 @@ class StepRunner:
         return self.specification.state.build(values, state.statics)
 
     def _new_roots(self, state: State, is_taped: bool) -> list:
-        """Return a root for each variable of state and inputs, None for a constant."""
+        """Return a list with a root for each variable of state and inputs, and None for each constant."""
         specification = self.specification
         if state.i < specification.first_traced or state.i in specification.cuts:
             depends: list = [None] * len(state.values)
@@ -214,7 +218,10 @@ class StepRunner:
         return roots
 
     def _build_params(self, roots: list) -> Any:
-        """Return the params of a step. Floats of Python stay such: as float64 they would widen a state of float32."""
+        """Return the params of a step.
+
+        Python floats are not converted to NumPy float64, which would widen a float32 state to float64.
+        """
         form = self.specification.params
         values = []
         for value, is_python_float in zip(self.params, form.is_float, strict=True):
@@ -225,7 +232,7 @@ class StepRunner:
         return form.build(boxed(values, roots, self.number))
 
     def _step_values(self, state: State) -> list:
-        """Return the variables of state and inputs that a step gets; constants where the derivative is cut."""
+        """Return the variables of state and inputs for a step; at a cut of `truncate` the state is a constant."""
         values = state.values
         if state.i in self.specification.cuts:
             values = list(map(plain, values))
@@ -235,7 +242,7 @@ class StepRunner:
         return values
 
     def _arguments(self, state: State, values: Sequence, params: Any) -> tuple:
-        """Return the arguments of a step, from the variables of state and inputs."""
+        """Build the arguments of a step from the variables of state and inputs."""
         form = self.specification.state
         inputs = self.specification.inputs
         if inputs is None:
@@ -245,16 +252,16 @@ class StepRunner:
         return form.build(values[:n], state.statics), params, inputs.build(values[n:], statics)
 
     def _plain_arguments(self, state: State) -> tuple:
-        """Return the arguments of the step from a state, on no trace of the rollout."""
+        """Return the arguments of the step that begins at a state, without boxes of the trace of the rollout."""
         return self._arguments(state, self._step_values(state), self._build_params([None] * len(self.params)))
 
     def check_drift(self, state: State, last: State) -> None:
-        """Refuse a backward pass by reversed steps, from the last state, that missed the first state."""
+        """Raise DerivativeError if reversed steps from the last state end too far from the first state."""
         drift = DRIFT
         for value in self.first.values:
             if np.finfo(dtype_of(plain(value))).eps > np.finfo(float).eps:
                 drift = SINGLE_DRIFT
-        for values in zip(state.values, self.first.values, last.values, strict=True):  # a large field hides no other
+        for values in zip(state.values, self.first.values, last.values, strict=True):  # each field by itself
             back, first, end = map(plain, values)
             error = largest([back - first])
             size = largest([first, end])
@@ -266,7 +273,7 @@ class StepRunner:
 
     @contextmanager
     def errors_named(self, place: str = "in step") -> Iterator[None]:
-        """Say in which step an error arose, and name the argument where NumPy refuses to write into one."""
+        """Add the number of the step to error messages; name the argument if the step wrote into a read-only array."""
         try:
             yield
         except (ConvergenceError, NonFiniteError, UnstableStepError) as error:
@@ -285,12 +292,13 @@ class StepRunner:
                 error if refuses else None
             )
         finally:
-            self.recorder.taken()  # the calls of a step that raised
+            self.recorder.taken()  # discard the recorded calls of a step that raised an exception
 
     def _changed_argument(self) -> str | None:
-        """Return which array the step writes into: the one that stops it when all others are writeable.
+        """Return the message that names the array which the step writes into, or None if there is none.
 
-        The step is run on plain values: with traced ones the message would be another one.
+        The step is run once for each array, with this array read-only and all others writeable, until NumPy raises.
+        It is run on plain values, because writing into a traced value raises another exception.
         """
         if self.current is None:
             return None
@@ -315,7 +323,7 @@ def _refuses_writing(error: Exception) -> bool:
 
 
 def _check_entries(arguments: tuple, entries: list) -> None:
-    """Refuse a step that changes the dicts and lists that it got, which a tape would not see."""
+    """Raise ValueError if a step has modified a dict or list among its arguments, which no tape records."""
     for name, argument, earlier in zip(REMEDIES, arguments, entries, strict=False):
         after = leaves(argument)
         if len(after) != len(earlier) or any(a is not b for a, b in zip(after, earlier, strict=True)):
