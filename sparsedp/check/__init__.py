@@ -1,7 +1,7 @@
-"""Checks of operators and gradients, beside the core.
+"""Checks of operators and gradients.
 
-Nothing else in the package imports it. Every check returns a value with `.verdict` (agrees, disagrees,
-inconclusive), is true only when it agrees, and prints its table.
+No other part of sparsedp imports this package. Every check returns a result object. Its `.verdict` is "agrees",
+"disagrees" or "inconclusive", bool(result) is True only for "agrees", and print(result) shows a table.
 """
 
 from sparsedp._utils.calls import describe_module

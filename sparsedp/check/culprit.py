@@ -1,7 +1,8 @@
-"""Find the call that is at fault when a gradient is wrong: each call on the tape is examined alone, at its own values.
+"""Find the call with a wrong derivative when a gradient is wrong: each recorded call is examined separately.
 
-The loss of a call f is <g, f(x)> with a fixed random g. Its gradient by the rule's VJP is examined like that of any
-loss. An Operator is linear: <A u, g> - <u, A^T g> and A (u + v) - A u - A v suffice, without differences.
+A call f is examined at the arguments x that it was called with, by the loss <g, f(x)> with a fixed random g. The
+gradient of this loss by the VJP of the call is audited like that of any other loss. For an Operator no finite
+differences are needed: it is linear, so <A u, g> - <u, A^T g> and A (u + v) - A u - A v show all errors.
 """
 
 from __future__ import annotations
@@ -42,42 +43,43 @@ from sparsedp.solvers.inverse import Inverse
 
 __all__ = ["culprit_of"]
 
-MOST_CALLS = 6  # of one rule that are examined, spread over its calls
+MOST_CALLS = 6  # at most this many calls of one rule are examined, evenly spread over all its calls
 RANDOM_DIRECTIONS = 2
 OMITTED_DIRECTIONS = ("constant", "gradient")
-# Error control calls a rule that is right along one of three runs only with its transpose, and refuses others.
+# The rules that error control of time steps records are skipped: they are valid only as a pair, not separately.
 ERROR_CONTROL = ".variation"
 NO_CULPRIT = "every call on the tape is right or refused at the values it met; a value may bypass the tape"
 
 
 def culprit_of(loss: Callable[[Any], Any], point: Point, spaces: Sequence[Any] = ()) -> tuple[str | None, str]:
-    """Find the first call on the tape whose derivative is at fault.
+    """Find the first recorded call whose derivative is wrong.
 
     Parameters
     ----------
     loss : callable
     point : Point
     spaces : sequence of Space
-        On which its fields may live, to name places.
+        Grid spaces in which arguments may live. They give the coordinates of wrong entries.
 
     Returns
     -------
     name : str or None
-        In the order of the calls. A call that others happen inside of (a time loop, a root) is named only when none
-        of those is at fault.
+        Name of the call; None if no call is wrong. A call that contains other calls (a time loop, a root solve) is
+        named only if none of the inner calls is wrong.
     sentence : str
+        What is wrong with the call, or which calls could not be examined.
     """
     examination = _Examination(audit_generator(None), spaces)
-    refused: dict[str, str] = {}  # calls that cannot be examined alone, and the error
+    refused: dict[str, str] = {}  # errors of calls that cannot be examined, by name of the call
     with np.errstate(all="ignore"):
         with calls_seen() as nodes:
             grad(loss)(point.fresh())
         for node in _select(nodes):
             try:
                 fault = examination.fault_of_call(node)
-            except DerivativeError:  # the call refuses the cotangents that were tried
+            except DerivativeError:  # the call does not accept the cotangents that were tried
                 continue
-            except Exception as error:  # a function of the user may raise anything; the verdict does not need it
+            except Exception as error:  # a user's function may raise any exception; skip this call
                 refused.setdefault(node.name, error_text(error))
                 continue
             if fault is not None:
@@ -87,7 +89,7 @@ def culprit_of(loss: Callable[[Any], Any], point: Point, spaces: Sequence[Any] =
 
 
 def _select(nodes: Sequence[Node]) -> list[Node]:
-    """Return calls that can be examined alone, those inside of a call before it; of many calls of one rule some."""
+    """Return the calls to examine: inner calls before the call that contains them, and at most MOST_CALLS per rule."""
     ordered = [node for node in in_order(nodes) if ERROR_CONTROL not in node.name]
     groups: dict[int, list[Node]] = {}
     for node in ordered:
@@ -114,7 +116,7 @@ class _Examination:
         self.examined_operators: set[int] = set()
 
     def fault_of_call(self, node: Node) -> tuple[str, str] | None:
-        """Return name and fault of a call: of its Operator, an Operator that it applies, or its rule; or None."""
+        """Return (name, fault) of the Operator or rule of a call, or of an Operator that it applies; None if right."""
         if isinstance(node.subject, Operator):
             return self.fault_of_operator(node.subject)
         reason = self.fault_of_rule(node)
@@ -134,7 +136,7 @@ class _Examination:
         return node.name, reason
 
     def fault_of_operator(self, op: Operator) -> tuple[str, str] | None:
-        """Return name and fault of an Operator that was not examined yet; of an inverse, also of what it inverts."""
+        """Return (name, fault) of an Operator; None if it is right or was examined before."""
         if id(op) in self.examined_operators:
             return None
         self.examined_operators.add(id(op))
@@ -147,17 +149,18 @@ class _Examination:
                 reason += f"; so is that of {inverted.name}, which it inverts"
         if reason.startswith("its transpose is"):
             reason += _entries_of_operator(op, self.rng)
-        return op.name.removesuffix(".T"), reason  # an operator and its transpose are one operator
+        return op.name.removesuffix(".T"), reason  # report an operator and its transpose under one name
 
     def fault_of_rule(self, node: Node) -> str:
-        """Return what differences say against the VJP of a call, or its VJP against its JVP; empty if nothing."""
+        """Return what is wrong with the VJP of a call by finite differences, or with its JVP; "" if nothing is."""
         try:
             point = Arguments(node)
-        except Exception:  # no values that could be moved
+        except Exception:  # the call has no floating arguments
             return ""
         weights = _weights(node, self.rng)
         loss = _functional(node, weights)
-        # In each argument alone, and the largest entry: a loss of many entries hides single ones.
+        # Directions in each argument, and in the entry with the largest gradient, show errors of single entries
+        # that average out along random directions of many entries.
         evaluations = Evaluations(loss, point, grad(loss))
         directions, findings = examine_directions(
             evaluations, RANDOM_DIRECTIONS, self.rng, lambda name: name not in OMITTED_DIRECTIONS
@@ -178,18 +181,18 @@ class _Examination:
         return f"its JVP differs from its VJP by {modes.gap:.1e}, and its VJP is right"
 
 
-Weights = dict[int, Any]  # by the number of a result
+Weights = dict[int, Any]  # arrays, by number of the result
 
 
 def _results(node: Node, value: Any) -> list[Any]:
-    """Return the results of a call as a list, traced or not."""
+    """Return the results of a call as a list. `value` may be traced."""
     if isinstance(node.value, tuple):
         return [value[number] for number in range(len(node.value))]
     return [value]
 
 
 def _weights(node: Node, rng: np.random.Generator | None) -> Weights:
-    """Return random weights for each result that has a derivative, by its number; ones without `rng`."""
+    """Return random weights for each differentiable result, by its number. Without `rng` all weights are 1."""
     weights: Weights = {}
     for number, result in enumerate(_results(node, node.value)):
         if not is_variable(result):
@@ -202,7 +205,7 @@ def _weights(node: Node, rng: np.random.Generator | None) -> Weights:
 
 
 def _functional(node: Node, weights: Weights) -> Callable[[Any], Any]:
-    """Return ``loss(values)``, the sum of weights times the results of a call."""
+    """Return the function ``loss(values)``: the weighted sum of the results of a call with these arguments."""
 
     def loss(values: Any) -> Any:
         results = _results(node, node.again(values))
@@ -212,7 +215,7 @@ def _functional(node: Node, weights: Weights) -> Callable[[Any], Any]:
 
 
 class Arguments(Point):
-    """The differentiated arguments of a call, with the names that a user knows."""
+    """The differentiated arguments of a call as a `Point`, with names such as "argument 0"."""
 
     def __init__(self, node: Node) -> None:
         super().__init__(node.values)
@@ -236,7 +239,7 @@ def _entries_of_rule(
     weights: Weights,
     spaces: Sequence[Any],
 ) -> str:
-    """Return in words where in its arguments and results the VJP of a call is wrong."""
+    """Return a phrase with the entries of arguments and results for which the VJP of a call is wrong."""
     point = evaluations.point
     in_arguments = gaps_along_entries(evaluations, directions, 1)
     sentences = listed(in_arguments, point, evaluations.slopes, spaces, "its VJP")
@@ -256,9 +259,10 @@ def _entries_of_rule(
 def _gap_of_results(
     node: Node, point: Point, worst: DirectionEvidence, weights: Weights
 ) -> Callable[[Sequence[Any]], float]:
-    """Return ``gap_along(parts)`` of a call, <w, J d> - <VJP(w), d> with w = weights * parts.
+    """Return the function ``gap_along(parts)``: <w, J d> - <VJP(w), d> with w = weights * parts.
 
-    d is the direction of the arguments in which the VJP is worst, J d a central difference. The gap is linear in parts.
+    Here d is the direction in the arguments with the largest gap, and J d is a central difference. The gap is linear in
+    `parts`.
     """
     direction = worst.line.direction
     if worst.step > 0:
@@ -290,7 +294,7 @@ def _gap_of_results(
 
 
 def _entries_of_operator(op: Operator, rng: np.random.Generator) -> str:
-    """Return in words where in its argument and result the transpose of a real Operator is wrong."""
+    """Return a phrase with the entries of argument and result for which the transpose of a real Operator is wrong."""
     if op.dtype.kind == "c":
         return ""
     op = op.tangent
@@ -320,7 +324,7 @@ def _entries_of_operator(op: Operator, rng: np.random.Generator) -> str:
 
 
 def _named(name: str, entry: EntryGap, shape: tuple[int, ...], spaces: Sequence[Any]) -> str:
-    """Return an entry, or the region that holds the whole gap, and its place in words."""
+    """Return an entry, or the region that contains the whole gap, as a subscript with its position on the grid."""
     if entry.region is None:
         block = entry.block
     else:

@@ -1,8 +1,8 @@
-"""Find where a derivative is wrong: the entries with the largest gaps, in grid coordinates where a grid is known.
+"""Find the entries in which a derivative is wrong, and name them by grid coordinates if a grid is known.
 
-The gap along a direction d is e . d with the error e of the derivative, so it is linear in d. With random weights on
-the entries of a block it is about as large as the part of e in the block. Bisection along one axis after the other
-finds an entry with a large gap in about log2(n) measurements.
+Let e be the error of the derivative. The gap along a direction d is e . d, which is linear in d. If d has random
+weights in the entries of a block and zeros elsewhere, the gap is about as large as the norm of e in the block.
+Bisection along one axis after the other therefore finds an entry with a large gap in about log2(n) measurements.
 """
 
 from __future__ import annotations
@@ -33,26 +33,28 @@ __all__ = [
     "where",
 ]
 
-MOST_ENTRIES = 3  # that are named
-NEGLIGIBLE_SHARE = 0.05  # a part of a gap below this share is none
-REMAINDER_SHARE = 0.01  # of the largest gap: no further entry is sought where all others are below
-DEFAULT_STEP = 2.0**-11  # where no step of the sweep has shown a derivative
+MOST_ENTRIES = 3  # default number of entries that are searched for
+NEGLIGIBLE_SHARE = 0.05  # a part of a gap below this share counts as 0
+REMAINDER_SHARE = 0.01  # the search stops when the other entries together have less than this share of the largest gap
+DEFAULT_STEP = 2.0**-11  # used if the sweep found no plateau
 CLEAR_OF_NOISE = 4.0  # a gap has to be this many times the noise of its measurement
 
 Block = tuple[slice, ...]
 
 
 class EntryGap(NamedTuple):
-    """A block of entries, usually a single one, where a derivative is wrong.
+    """A block of entries in which a derivative is wrong. It is usually a single entry.
 
     Attributes
     ----------
     leaf : int
+        Number of the leaf.
     block : tuple of slice
+        Position in the leaf.
     gap : float
-        Right derivative less the one under test, in units of the leaf; NaN where the block is no single entry.
+        Finite difference minus the derivative under test; NaN if the block is not a single entry.
     region : tuple of slice or None
-        A larger block that holds the whole gap of the leaf, such as all cells at one wall.
+        A larger block that contains the whole gap of the leaf, such as all cells at one wall.
     """
 
     leaf: int
@@ -62,14 +64,14 @@ class EntryGap(NamedTuple):
 
     @property
     def sort_key(self) -> float:
-        """Key that sorts the largest gap first, and unknown ones last."""
+        """Sort key: the largest gap comes first, and unknown gaps (NaN) come last."""
         if isnan(self.gap):
             return inf
         return -abs(self.gap)
 
 
 class _NotMeasured(Exception):
-    """The loss has no value that is needed."""
+    """A gap could not be measured, because the loss has no value at a point of the difference."""
 
 
 def largest_gaps(
@@ -83,12 +85,13 @@ def largest_gaps(
     Parameters
     ----------
     gap_along : callable
-        ``gap_along(weights)``, linear in a list of arrays of these shapes.
+        ``gap_along(weights)`` returns the gap along a direction, given as a list of arrays. It is linear in `weights`.
     shapes : list of tuple
+        Shapes of the arrays.
     most : int
-        Entries that are sought.
+        Largest number of entries to find.
     noise : float
-        A gap below it is none.
+        A gap below this value counts as 0.
 
     Returns
     -------
@@ -110,16 +113,16 @@ def largest_gaps(
 
 
 class _Bisection(NamedTuple):
-    """The end of a bisection.
+    """The result of a bisection.
 
     Attributes
     ----------
     low, high : int
-        The range that is left.
+        The range to which the gap was narrowed down.
     gap : float
-        Between them.
+        The gap in this range.
     beside : float
-        Root of the sum of squares of the gaps of all other halves.
+        Root of the sum of squares of the gaps of all discarded halves.
     """
 
     low: int
@@ -158,7 +161,7 @@ class _Search:
         return self.gap_along(weights)
 
     def leaves_gap(self, low: int, high: int) -> float:
-        """Return the gap of some leaves."""
+        """Return the gap of the leaves low, ..., high - 1."""
         weights = [np.zeros(shape) for shape in self.shapes]
         weights[low:high] = self.weights[low:high]
         return self.gap_along(weights)
@@ -166,12 +169,12 @@ class _Search:
     def next(self, total: float) -> EntryGap | None:
         """Find one entry, given the gap of all entries not found yet, and exclude it from later searches.
 
-        Return None where noise leads to an entry that was found before.
+        Return None if noise has led the bisection to an entry that was found before.
         """
         leaf, _, gap_of_leaf, _ = self._bisect(len(self.shapes), self.leaves_gap, total)
         gap = gap_of_leaf
         block = [slice(None)] * len(self.shapes[leaf])
-        certain_axes = []  # along which the gap lies at one place
+        certain_axes = []  # axes along which the gap is concentrated at one position
         for axis, length in enumerate(self.shapes[leaf]):
 
             def gap_between(low: int, high: int, axis: int = axis) -> float:
@@ -193,7 +196,7 @@ class _Search:
         return EntryGap(leaf, tuple(block), value, region)
 
     def _region(self, leaf: int, block: list[slice], certain_axes: list[int], gap_of_leaf: float) -> Block | None:
-        """Return the block of all entries with the same place along the certain axes, if it holds the whole gap."""
+        """Return the block of all entries at the same position along `certain_axes`, if it contains the whole gap."""
         if not 0 < len(certain_axes) < len(block):
             return None
         region = tuple(part if axis in certain_axes else slice(None) for axis, part in enumerate(block))
@@ -203,7 +206,7 @@ class _Search:
         return None
 
     def _bisect(self, length: int, gap_between: Callable[[int, int], float], gap: float) -> _Bisection:
-        """Halve a range again and again, and keep the half with the larger gap."""
+        """Halve a range repeatedly, and keep the half with the larger gap each time."""
         low = 0
         high = length
         beside = 0.0
@@ -226,12 +229,14 @@ class _Search:
 def gaps_along_entries(
     evaluations: Evaluations, directions: Sequence[DirectionEvidence], most: int = MOST_ENTRIES
 ) -> list[EntryGap]:
-    """Find entries where differences and gradient are far apart, with the step of the worst direction.
+    """Find the entries with the largest gaps between gradient and finite difference.
+
+    The step of the differences is that of the direction with the largest gap.
 
     Returns
     -------
     list of EntryGap
-        Gaps are those of derivatives of the loss; empty where nothing can be told.
+        Empty if no direction disagrees, or if `x` has only one entry.
     """
     point = evaluations.point
     wrong = [direction for direction in directions if direction.word in ("disagrees", "outside")]
@@ -273,7 +278,7 @@ def gaps_along_entries(
 
 
 def spaces_of(function: Callable[[Any], Any], x: Any) -> list[Any]:
-    """Return the spaces on a grid of the Operators that a function applies at a point."""
+    """Return the grid spaces (domains and codomains) of all Operators that `function` applies at `x`."""
     spaces: dict[str, Any] = {}
     with suppress(*REFUSALS), recording() as calls, np.errstate(all="ignore"):
         function(x)
@@ -293,7 +298,7 @@ def listed(
     spaces: Sequence[Any],
     source: str = "the gradient",
 ) -> list[str]:
-    """Return sentences about gaps: the entries with both derivatives, and the region that holds all of a gap.
+    """Return a sentence about each gap: the entry, both derivatives, and the region that contains the whole gap.
 
     Parameters
     ----------
@@ -302,8 +307,9 @@ def listed(
     gradient : vector or None
         The gradient under test at the point.
     spaces : list of Space
+        Grid spaces in which leaves may live. They give the coordinates.
     source : str
-        Its name.
+        Name of the derivative under test, for the sentences.
     """
     if gradient is None:
         slopes = [None] * len(point.values)
@@ -328,13 +334,13 @@ def listed(
 
 
 def _digits(gap: float, derivative: float) -> int:
-    """Return the number of digits that shows a gap, and two more."""
+    """Return the number of digits to print so that the gap is visible, plus two more digits."""
     share = abs(gap) / (abs(derivative) or abs(gap) or 1.0)
     return int(np.clip(3 - np.floor(np.log10(share or 1.0)), 4, 16))
 
 
 def subscript(index: Block, shape: tuple[int, ...]) -> str:
-    """Return a block as a subscript."""
+    """Return a block in subscript notation, such as ``[0, :, 3:5]``."""
     parts = []
     for part, length in zip(index, shape, strict=True):
         low, high, _ = part.indices(length)
@@ -350,7 +356,7 @@ def subscript(index: Block, shape: tuple[int, ...]) -> str:
 
 
 def where(index: Block, shape: tuple[int, ...], spaces: Sequence[Any]) -> str:
-    """Return in words at which walls or coordinates a block of a field on the grid of one of some spaces lies."""
+    """Return a phrase with the walls or grid coordinates of a block, by the first space whose shape matches."""
     for space in spaces:
         dim = len(space.shape)
         if dim and shape[len(shape) - dim :] == space.shape:
@@ -362,7 +368,7 @@ def where(index: Block, shape: tuple[int, ...], spaces: Sequence[Any]) -> str:
 
 
 def _place(space: Any, block: Block) -> str:
-    """Return in words where a block of a field on a space lies; empty if it cannot be said."""
+    """Return a phrase with the position of a block of a field on a space; "" if the position is not unique."""
     grid = space.grid
     prefix = ""
     component = 0

@@ -1,6 +1,6 @@
-"""Evaluations of a loss along lines through a point: the raw numbers of an audit.
+"""Evaluations of a loss along lines through a point. They are the data from which an audit draws its conclusions.
 
-The loss only ever sees fresh copies of the tree.
+Each evaluation receives a new copy of the tree, so that a loss that modifies its argument does not change the point.
 """
 
 from __future__ import annotations
@@ -22,15 +22,16 @@ from sparsedp.errors import SparsedpError
 
 __all__ = ["REFUSALS", "UNCHANGED", "Evaluations", "Level", "Line", "default_steps", "solvers_of"]
 
-REFUSALS = (SparsedpError, ValueError, ArithmeticError)  # what a loss may raise away from x
+REFUSALS = (SparsedpError, ValueError, ArithmeticError)  # exceptions that a loss may raise at a trial point
 UNCHANGED = "the loss does not change"
-LOST_SHARE = 0.1  # of a displacement that the rounding of x may change
+LOST_SHARE = 0.1  # a step is unusable if the rounding of x changes the displacement by more than this share
 
 
 def default_steps(eps: float) -> tuple[float, ...]:
     """Return the step sizes of an audit in units of x, over at least eight decades, from coarse to fine.
 
-    Powers of two keep the rounding of x + step * d small. Single precision has fewer decades, with closer steps.
+    The steps are powers of two, so that x + step * d has small rounding errors. Single precision has fewer usable
+    decades, and the steps are closer together.
     """
     if eps < 1e-10:
         exponents = range(2, 31, 3)
@@ -40,11 +41,11 @@ def default_steps(eps: float) -> tuple[float, ...]:
 
 
 def _no_tick() -> None:
-    """Ignore an evaluation."""
+    """Do nothing. This is the default of `Evaluations.tick`."""
 
 
 class Evaluations:
-    """A loss at a point with the gradient under test.
+    """A loss and the gradient under test at a point, with the noise and the tolerances of the loss.
 
     Parameters
     ----------
@@ -53,30 +54,30 @@ class Evaluations:
     gradient : callable or tree
         The gradient under test.
     steps : sequence of float
-        Step sizes; empty for the default ones, which are extended where they leave the derivative undecided.
+        Step sizes. If empty, the default steps are used, and more steps are added if they give no decision.
     tick : callable
-        Called at each evaluation.
+        Called without arguments at each evaluation of the loss.
 
     Attributes
     ----------
     base : float
-        The loss at the point, after `start`.
+        The loss at the point. Set by `start`.
     slopes : ndarray
-        The gradient at the point.
+        The gradient under test at the point, as a vector.
     noise : float
-        Noise of the loss in units of its rounding, from a table of differences; 0 if none was measured.
+        Noise of the loss in units of its rounding, measured by a table of differences; 0 if none was measured.
     deviation : float
-        The same in units of the loss.
+        The same noise as an absolute value.
     count : int
-        Number of evaluations.
+        Number of evaluations of the loss.
     solved : bool
-        Whether the loss takes a solve of this library at the point.
+        Whether the loss calls a linear or nonlinear solve of this library.
     tolerance : float
-        The loosest relative tolerance of the iterative solves; 0 without any.
+        The largest relative tolerance of the iterative solves; 0 if there are none.
     step_tolerance : float
-        The loosest tolerance of time steps with error control; 0 without any.
+        The largest tolerance of time steps with error control; 0 if there are none.
     eps : float
-        Rounding of the coarsest dtype that the loss has returned.
+        Machine epsilon of the dtype with the lowest precision that the loss has returned, at least that of float64.
     """
 
     def __init__(
@@ -126,7 +127,7 @@ class Evaluations:
     def start(self) -> None:
         """Evaluate the loss at the point, and find the tolerances of its solves and time steps.
 
-        These are recorded in one more run, since recording may change how things are called.
+        The tolerances are recorded in a second run, because recording may change how functions are called.
         """
         solves = thread.solves
         controlled = thread.controlled
@@ -147,7 +148,7 @@ class Evaluations:
 
 
 def solvers_of(calls: Any) -> list[tuple[str, Any]]:
-    """Return name and solver of all solves among recorded calls."""
+    """Return the names and solvers of all recorded solves."""
     return [
         (name, actor) for name, actors in calls.actors.items() for actor in actors.values() if hasattr(actor, "engine")
     ]
@@ -162,7 +163,7 @@ class Level(NamedTuple):
     plus, minus : float
         f(x + t d) and f(x - t d).
     ahead, behind : float
-        g . (x+ - x) and g . (x- - x), with the displacements that the rounding of x leaves.
+        g . (x+ - x) and g . (x- - x), where x+ and x- are x + t d and x - t d as rounded to the dtype of x.
     note : str
         Why the level cannot be used; empty if it can.
     """
@@ -181,26 +182,26 @@ class Level(NamedTuple):
 
     @property
     def slope(self) -> float:
-        """Difference quotient that the gradient predicts, for the realised displacements."""
+        """Difference quotient that the gradient predicts for the rounded displacements."""
         return (self.ahead - self.behind) / (2 * self.step)
 
 
 class Line:
-    """A sweep of step sizes along one direction, which can be extended.
+    """Evaluations of the loss along one direction at many step sizes. More steps can be added by `sweep`.
 
     Parameters
     ----------
     name : str
     direction : ndarray
-        Displacement for step 1.
+        The direction d: the displacement for step size 1.
     evaluations : Evaluations
 
     Attributes
     ----------
     slope : float
-        g . d.
+        g . d, the derivative along d by the gradient under test.
     typical : float
-        Root of the sum of squares of the terms of g . d.
+        2-norm of the vector of terms g_i d_i of g . d.
     levels : list of Level
         From coarse to fine.
     """
@@ -217,19 +218,19 @@ class Line:
         self.levels: list[Level] = []
 
     def end(self, step: float) -> tuple[float, float, str]:
-        """Evaluate one end of the line.
+        """Evaluate the loss at x + step d.
 
         Returns
         -------
         value : float
-            The loss at x + step d, NaN if there is none.
+            The loss, NaN if it raised an exception or the step is too small for the precision of x.
         change : float
             The change of the loss that the gradient predicts.
         note : str
-            Why there is no value.
+            Why the value cannot be used; empty if it can.
         """
         arrays = self.point.arrays(self.point.vector + step * self.direction)
-        displacement = joined(arrays) - self.point.vector  # as the rounding of x realises it
+        displacement = joined(arrays) - self.point.vector  # after rounding to the dtype of x
         change = float(self.gradient @ displacement)
         if not abs(norm(displacement) / (abs(step) * norm(self.direction)) - 1) < LOST_SHARE:
             return np.nan, change, "the step is lost in the rounding of x"
@@ -240,7 +241,7 @@ class Line:
         return value, change, "" if np.isfinite(value) else "the loss overflows"
 
     def sweep(self, steps: Iterable[float]) -> None:
-        """Evaluate the loss at x + t d and x - t d for every new t of `steps`."""
+        """Evaluate the loss at x + t d and x - t d for each t in `steps` that was not evaluated before."""
         earlier = {level.step: level for level in self.levels}
         all_steps = sorted({*earlier, *steps}, reverse=True)
         self.levels = [earlier.get(step) or self.level(step) for step in all_steps]
@@ -261,7 +262,7 @@ class Line:
 
     @property
     def unchanged_steps(self) -> list[float]:
-        """Steps that left the loss the same, if no level is usable: the loss is constant to rounding along the line."""
+        """Steps at which the loss has the same value as at x. Empty if the loss changes at another step."""
         if self.usable:
             return []
         return [level.step for level in self.levels if level.note == UNCHANGED]

@@ -1,4 +1,4 @@
-"""The audit of a gradient: differences over many step sizes, Taylor orders, determinism, forward against reverse."""
+"""Audit of a gradient: finite differences at many step sizes, Taylor orders, determinism, forward and reverse mode."""
 
 from __future__ import annotations
 
@@ -41,45 +41,49 @@ def gradient(
     rng: int | np.random.Generator | None = None,
     quick: bool = False,
 ) -> Audit:
-    """Audit the gradient of a loss at x: compare it with differences of the loss and with other derivatives.
+    """Audit the gradient of a loss at x: compare it with finite differences and with other ways to differentiate.
 
     Parameters
     ----------
     loss : callable
-        ``loss(x) -> real scalar``. Any function: of this library, of autograd, or foreign (then give `gradient`).
+        ``loss(x) -> real scalar``. A function written with this library or with autograd, or any other function if
+        `gradient` is given.
     x : array, number, or any nesting of them in tuples, lists and dicts
-        At least one floating leaf, real or complex, float32 or float64. Never modified.
+        At least one leaf must have a floating dtype: real or complex, in single or double precision. `x` is not
+        modified.
     gradient : callable or tree, optional
-        ``gradient(x)``, or its value, with the structure of `x`. Default: reverse mode through the tape. For a
-        complex leaf it is dL/dRe - i dL/dIm, as on the tape.
+        The gradient to check: a function of `x`, or its value at `x`, with the same tree structure as `x`. For a
+        complex leaf it is dL/dRe - i dL/dIm, as in autograd. Default: reverse mode of this library.
     steps : sequence of float, optional
-        Step sizes in units of x (the root mean square of each leaf), at least eight. Default: ten over
-        eight decades, and more on a line where they leave the derivative undecided.
+        At least eight step sizes, relative to the root mean square of each leaf. Default: ten steps over eight
+        decades; for a direction in which these give no decision, more steps are added.
     directions : int
-        Number of random directions. Structured ones are added: each leaf alone, constant, the gradient itself,
-        its largest entry.
+        Number of random directions. The audit also examines a random direction in each leaf, a constant direction,
+        the gradient itself, and the entry with the largest gradient.
     rng : None, int or numpy Generator
-        Source of the directions; default: a fixed seed.
+        Seed or generator of the random directions. Default: a fixed seed.
     quick : bool
-        One random direction and the gradient itself, for a loss that takes minutes. The reason lists what was not
-        examined, also where the gradient agrees: other random directions, single leaves and entries, complex steps,
-        the Hessian product.
+        If True, examine only one random direction and the gradient direction. Use it for a loss that takes minutes.
+        A note lists what a quick audit omits: other directions, single leaves and entries, complex steps and the
+        Hessian product. If the gradient agrees, `.reason` repeats this list.
 
     Returns
     -------
     Audit
-        `.verdict` is "agrees" (with `.digits`), "disagrees" or "inconclusive" (with `.reason`); true only
-        for "agrees", so that ``assert dp.check.gradient(loss, x)`` works. `.rows` are the numbers,
-        `.lines` the result for each direction, str() the table, `.to_dict()` plain data.
+        `.verdict` is "agrees", "disagrees" or "inconclusive". `.digits` is the number of digits that agree, and
+        `.reason` explains the other verdicts. bool(audit) is True only for "agrees", so that
+        ``assert dp.check.gradient(loss, x)`` works. `.lines` has the result for each direction, `.rows` the values
+        for each direction and step, str() returns a table, and `.to_dict()` returns plain Python data.
 
     Raises
     ------
     ValueError
-        If `steps` are fewer than eight, or not positive, or `directions` is no whole number >= 0.
+        If `steps` has fewer than eight different values or a value that is not positive and finite, or if
+        `directions` is negative or not an integer.
     DerivativeError
-        If x has no floating leaf, or the gradient does not have the structure of x.
+        If `x` has no floating leaf, or the gradient does not have the same structure as `x`.
     NonFiniteError
-        If x holds NaN or infinity.
+        If `x` contains NaN or infinity.
 
     See Also
     --------
@@ -87,46 +91,49 @@ def gradient(
 
     Notes
     -----
-    Conditions for agreement along every direction. The gap between differences and gradient is at most 1e-8 of the
-    derivative, or the error bar of the sweep where that is larger (1e-6 behind a solve, or in measured noise of
-    1e-10). Taylor remainders: f(x + t d) - f has order 1 +- 0.05 in t; with the gradient subtracted, the order is
-    1.95 or more on every pair of steps, from at least three steps at which the remainder is 100 times the noise. With
-    one or two, or with a lower order, the verdict is inconclusive, however small the gap. Two cases have no order,
-    and the gap alone decides: the remainder is noise on all steps (a linear loss: order 2 is "exact"), and a slope so
-    small that the loss bends before it climbs (near a minimum, or in the kernel of a Laplacian: no order 1).
-    Forward and reverse mode differ by at most 1e-10, and 1e-6 behind a solve or in noise. All thresholds are in
-    `sparsedp.check.audit_thresholds`.
+    **Conditions for agreement.** They must hold along every direction. The gap between the finite difference and the
+    gradient is at most 1e-8 of the derivative, or at most the error bar of the sweep if that is larger. If the loss
+    contains an iterative solve, or has measured noise of 1e-10, the limit is 1e-6 instead of 1e-8. The Taylor
+    remainder f(x + t d) - f(x) has order 1 +- 0.05 in t. With the gradient term subtracted, the remainder has order
+    1.95 or more on every pair of steps, from at least three steps at which it is 100 times the noise. With fewer such
+    steps, or with a lower order, the verdict is "inconclusive", however small the gap. In two cases there is no order,
+    and the gap alone decides: if the remainder is noise at all steps (a linear loss; order 2 is shown as "exact"), or
+    if the slope is so small that the quadratic term dominates at all steps (near a minimum, or in the kernel of a
+    Laplacian; there is no order 1). Forward and reverse mode differ by at most 1e-10, or by at most 1e-6 with an
+    iterative solve or with noise. All thresholds are in `sparsedp.check.audit_thresholds`.
 
-    Noise is measured by a table of differences of neighbouring values. Where it is more than rounding, agreement
-    needs six digits; with fewer the verdict is inconclusive and says how many there are. A ripple (a part of the loss
-    that is small, with a derivative that is not) is inconclusive too: where fine steps show another derivative than
-    coarse ones, or the gradient itself varies within steps that the noise hides. A ripple below the rounding of the
-    loss that the gradient does not contain either cannot be detected. A loss that is 0 to rounding, with a gradient
-    that is rounding, is inconclusive.
+    **Noise.** It is measured by a table of differences of neighbouring values. If the noise is larger than rounding,
+    agreement needs six digits; with fewer digits the verdict is "inconclusive", and the reason says how many digits
+    agree. A ripple (a small part of the loss with a derivative that is not small) also gives "inconclusive". It is
+    detected if fine steps show another derivative than coarse steps, or if the gradient itself varies within steps
+    that are below the noise. A ripple that is below the rounding of the loss and is also missing from the gradient
+    cannot be detected. If both the loss and the gradient are 0 up to rounding, the verdict is "inconclusive".
 
-    The Hessian product along the first direction is examined by the third Taylor remainder, of order 2.9 or more:
-    `.hessian` and a note give the result. The verdict, which is about the gradient, does not depend on it.
+    **Hessian product.** It is examined along the first direction by the third Taylor remainder, which should have order
+    2.9 or more. `.hessian` and a note give the result. The verdict on the gradient does not depend on it.
 
-    Cost: two evaluations of the loss for each step and direction (100 to 200 in all, about 60 in a quick audit), and
-    a few gradients. On a terminal, standard error shows how many evaluations are expected, with a bar if tqdm is
-    installed. Where the verdict is "disagrees", the entries with the largest gaps are found by bisection, with about
-    2 log2(n) more evaluations for each of three (one in a quick audit), and the calls on the tape are examined one by
-    one for the culprit: seconds for most losses, minutes where a loss takes a thousand implicit steps.
+    **Cost.** The audit takes two evaluations of the loss for each step and direction (100 to 200 in all, about 60 in a
+    quick audit), and a few gradients. On a terminal, standard error shows how many evaluations are expected, with a
+    progress bar if tqdm is installed. If the verdict is "disagrees", bisection finds the three entries with the
+    largest gaps (one entry in a quick audit), with about 2 log2(n) more evaluations for each. The recorded calls are
+    then examined one by one to find the culprit. This takes seconds for most losses, and minutes for a loss with a
+    thousand implicit time steps.
 
-    A `stepper` with a `tolerance` is differentiable to that tolerance, not to rounding: its gradient differs from that
-    of the value it returns by a few tolerances. Where the gap is at most ten tolerances, and no other call is at
-    fault, the verdict is "inconclusive" and says so. Check such a loss with a fixed dt, or with a tolerance of 1e-9.
+    **Adaptive time steps.** A `stepper` with a `tolerance` is differentiable only up to this tolerance: its gradient
+    differs from the derivative of the value that it returns by a few tolerances. If the gap is at most ten tolerances,
+    and no other call is at fault, the verdict is "inconclusive", and the reason says so. Check such a loss with a
+    fixed dt, or with a tolerance of 1e-9.
 
-    Detection limits, as shares of the gradient. An error in all entries: 1e-8 or less where the loss is smooth, 1e-6
-    behind an iterative solve or in noise, ten tolerances of time steps with error control where no call is at fault,
-    1e-4 in single precision. A single wrong entry of n counts by its share of the derivative along the examined
-    directions, which include its own where it is the largest.
+    **Detection limits.** An error in all entries of the gradient is detected if its relative size is above 1e-8 for a
+    smooth loss, 1e-6 with an iterative solve or with noise, 1e-4 in single precision, and ten tolerances for adaptive
+    time steps if no call is at fault. A single wrong entry is detected if its share of the derivative along an examined
+    direction is above the same limit. The entry with the largest gradient has a direction of its own.
 
-    Everything is relative: a loss times 1e-200 or 1e200 has the same verdict. A loss that refuses a trial
-    point (unstable step, no convergence, not finite, a ValueError) makes that step unusable. At a kink
-    central differences prove nothing, and the verdict is inconclusive.
+    All conditions are relative, so that a loss multiplied by 1e-200 or 1e200 has the same verdict. If the loss raises
+    an exception at a trial point (unstable step, no convergence, NaN or infinity, ValueError), this step is not used.
+    At a kink the central difference does not converge to the gradient, and the verdict is "inconclusive".
 
-    Complex numbers: see docs/guides/complex_numbers.md.
+    For complex leaves see docs/guides/complex_numbers.md.
 
     Examples
     --------
@@ -154,14 +161,14 @@ def gradient(
     lines = len(point.directions(point.vector, count, audit_generator(0), is_wanted))
     ticks = _announced(3 + POINTS * min(lines, 2) + 2 * len(evaluations.steps) * lines)
     evaluations.tick = lambda: next(ticks, None)
-    with unwarned(), closing(ticks):  # a gradient that is not finite is a verdict
+    with unwarned(), closing(ticks):  # a gradient that is not finite affects the verdict and needs no warning
         return _Auditor(evaluations, gradient is None, count, audit_generator(rng), quick).audit()
 
 
 def _announced(total: int) -> Generator[Any, None, None]:
-    """Tell those who watch a terminal how many evaluations are expected, and yield as many ticks of a bar.
+    """On a terminal, print how many evaluations are expected, and advance a progress bar at each `next`.
 
-    The bar disappears when the generator is closed; an open one would push later bars of the caller down a line.
+    Close the generator to remove the bar. Otherwise later progress bars of the caller would start one line below.
     """
     if sys.stderr.isatty():
         sys.stderr.write(f"check.gradient: about {total} evaluations of the loss to come\n")
@@ -169,13 +176,13 @@ def _announced(total: int) -> Generator[Any, None, None]:
 
 
 class _Auditor:
-    """One audit, step by step.
+    """The state of one audit; its methods are the steps of the audit.
 
     Parameters
     ----------
     evaluations : Evaluations
     is_taped : bool
-        Whether the tape gives the gradient.
+        Whether the gradient under test is computed by reverse mode (no `gradient` was given).
     count : int
         Number of random directions.
     rng : Generator
@@ -232,7 +239,7 @@ class _Auditor:
             self.findings.append(("unsound", "the loss gives another value after the audit: it keeps a state"))
 
     def examine_first(self, first: DirectionEvidence) -> None:
-        """Examine a complex step and a Hessian product along the first direction."""
+        """Compare with a complex step, and check the Hessian product, along the first direction."""
         if not self.point.complex:
             note = check_complex_step(self.loss, self.point, first, self.evaluations.base)
             if note is not None:
@@ -242,9 +249,10 @@ class _Auditor:
             self.findings.append(("note", note))
 
     def find_fault(self) -> None:
-        """Find the call at fault and the entries with the largest gaps, where something speaks against the gradient.
+        """Find the call at fault and the entries with the largest gaps, if there is evidence against the gradient.
 
-        Where loose time steps or rounding may explain a gap, the calls on the tape decide.
+        If the tolerance of time steps or rounding may explain a gap, the recorded calls are examined too. The verdict
+        becomes "disagrees" if one of them is at fault.
         """
         words = {direction.word for direction in self.directions} | {word for word, _ in self.findings}
         is_excused = bool(words & {"loose steps", "hidden modes"})
@@ -264,7 +272,7 @@ class _Auditor:
             self.notes.append(f"largest gaps: {'; '.join(self.gaps)}")
 
     def find_culprit(self, is_excused: bool, spaces: list[Any]) -> None:
-        """Find the call on the tape that is at fault, which may change the verdict."""
+        """Find the recorded call that is at fault. The verdict may change."""
         self.culprit, why = culprit_of(self.loss, self.point, spaces)
         if self.culprit or self.verdict == "disagrees":
             self.notes.append(f"culprit: {why}")
@@ -277,7 +285,7 @@ class _Auditor:
             self.reason += f"; no call is at fault, but solves stop at rtol {tolerance:g}: tighten them"
 
     def say_what_was_not_examined(self) -> None:
-        """Say along which directions a quick audit looked, and what it omitted."""
+        """Add a note with the directions that a quick audit examined, and with what it omitted."""
         names = " and ".join(direction.direction for direction in self.directions) or "no direction"
         note = f"quick: looked at along {names}; {NOT_EXAMINED}"
         self.notes.append(note)
@@ -308,31 +316,37 @@ class _Auditor:
 
 
 class Audit(Result):
-    """The result of `check.gradient`. Frozen; true only when the gradient agrees.
+    """The result of `check.gradient`. Immutable; bool(audit) is True only if the gradient agrees.
 
     Attributes
     ----------
     verdict : "agrees", "disagrees" or "inconclusive"
     reason : str
-        Why, when it does not simply agree.
+        Explanation of the verdict. Empty if the gradient agrees and there is nothing to add.
     digits : int or None
-        Digits that are proved, in the worst direction; None unless it agrees.
+        Number of digits that agree in the worst direction. None if the verdict is not "agrees".
     culprit : str or None
-        Name of the first operator, rule or function of autograd on the tape whose VJP or JVP is at
-        fault, when the verdict is "disagrees"; a note says what is wrong with it. None when each is right:
-        then a value bypasses the tape, or `gradient` was an argument.
+        If the verdict is "disagrees": the name of the first recorded operator, rule or autograd function whose VJP or
+        JVP is wrong. A note says what is wrong. None if all recorded calls are right (the loss then uses a value that
+        was not recorded), or if the gradient was given as an argument.
     gaps : tuple of str
-        Entries of x where gradient and differences are farthest apart, when the verdict is "disagrees": both
-        derivatives, the place where the loss uses Operators on a grid, and the region that holds the whole gap.
+        If the verdict is "disagrees": the entries of `x` with the largest gaps between gradient and finite difference.
+        Each string has both derivatives. If the loss applies Operators on a grid, it also has the coordinates of the
+        entry, or the region that contains the whole gap.
     hessian : "agrees", "disagrees", "inconclusive" or None
-        Result of the third Taylor remainder for a Hessian product along the first direction; the verdict on the
-        gradient does not depend on it. None where there is no product: no second derivatives, or a `gradient` argument.
+        Result of the third Taylor remainder for a Hessian product along the first direction. The verdict on the
+        gradient does not depend on it. None if no Hessian product was computed: `gradient` was given, the audit was
+        quick, `x` is complex, a rule has no second derivative, or the first direction does not agree.
+    notes : tuple of str
+        Further observations.
     lines : tuple of DirectionResult
         One for each direction: word, difference, slope, gap, bar, scale, step, rates, digits, note, bend.
     value : float
-        The loss at x.
+        The loss at `x`.
     evaluations : int
-        How often the loss was evaluated.
+        Number of evaluations of the loss.
+    size : int
+        Number of entries of all floating leaves.
     """
 
     _plain = (
@@ -353,7 +367,7 @@ class Audit(Result):
     @property
     @np.errstate(all="ignore")
     def rows(self) -> tuple[dict[str, Any], ...]:
-        """One dict for each direction and step: the numbers of the table and of the V-curve."""
+        """One dict for each direction and step, with the values in the table and in the V-curve."""
         rows = []
         for direction in self.lines:
             for level in direction.line.levels:
@@ -365,7 +379,7 @@ class Audit(Result):
         return tuple(rows)
 
     def parts(self) -> list[str | Table]:
-        """Gaps over steps and directions, one line for each direction, notes, the verdict."""
+        """Return the tables of gaps and directions, the notes, and the verdict."""
         parts: list[str | Table] = [
             f"gradient at {self.size} values, loss {self.value:.6g}, {self.evaluations} evaluations"
         ]
@@ -380,7 +394,7 @@ class Audit(Result):
         return [*parts, verdict]
 
     def curves(self) -> tuple[dict[str, list[tuple[float, float]]], str, str]:
-        """|difference - gradient| of the derivative over the step, a curve for each direction."""
+        """Return the curves of the relative gap over the step, one for each direction, and the labels of the axes."""
         curves: dict[str, list[tuple[float, float]]] = {direction.direction: [] for direction in self.lines}
         for row in self.rows:
             if not row["note"]:
@@ -388,7 +402,7 @@ class Audit(Result):
         return curves, "step", "|difference - gradient| / |derivative|"
 
     def __repr__(self) -> str:
-        """One line, which is what pytest shows of an assertion that fails."""
+        """Return one line. It is what pytest shows for a failed assertion."""
         if self.reason:
             details = [self.reason]
         else:
@@ -397,9 +411,10 @@ class Audit(Result):
         return f"<gradient {self.verdict}: {'; '.join(details) or f'{self.digits} digits'}>"
 
     def _table_of_gaps(self) -> Table:
-        """Return the table of |difference - g . d| relative to the derivative, over steps (down) and directions.
+        """Return the table of |difference - g . d| relative to the derivative: rows are steps, columns are directions.
 
-        A step that fewer than half of the directions were evaluated at is omitted, unless one of them relies on it.
+        A step is omitted if fewer than half of the directions were evaluated at it, unless it is the step with which
+        one of the directions was decided.
         """
         cells: dict[float, dict[str, Any]] = {}
         for row in self.rows:
@@ -426,7 +441,7 @@ class Audit(Result):
 
 
 def _order_in_words(order: float) -> str:
-    """Return an order in a cell: "-" without one, "exact" where the remainder is noise."""
+    """Return the table cell for an order: "-" if there is none (NaN), "exact" if the remainder is noise (infinity)."""
     if isnan(order):
         return "-"
     if isinf(order):

@@ -1,6 +1,7 @@
 """Checks of operators: their transposes, forms and derivatives.
 
-Figures are in units of rounding times the size of the operator; each check is a function of random fields, and a row.
+Each check compares two sides of an identity for random fields. Its result is one row of a table, with the difference
+in units of machine epsilon times the norm of the operator.
 """
 
 from __future__ import annotations
@@ -31,18 +32,18 @@ __all__ = ["OperatorSummary", "fault_of", "field", "layouts", "operator", "trans
 
 LIMIT = Summary.limit
 DTYPES = ("float64", "complex128", "float32", "complex64")
-LARGEST = 2**21  # unknowns above which no matrix is built for a check
-MOST_COLUMNS = 512  # columns that are computed one application at a time
-LINEAR_SHARE = 1e-6  # share of the result up to which A (i u) is i A u
+LARGEST = 2**21  # no matrix is built for a check if an operator has more rows or columns
+MOST_COLUMNS = 512  # an operator without entries is applied to all unit vectors up to this number of columns
+LINEAR_SHARE = 1e-6  # A (i u) and i A u count as equal up to this relative difference
 POWER_ITERATIONS = 8
-DECADES = {"float32": 25, "float64": 290}  # sizes 10^+-d of operators fit into a dtype, with room for the fields
-SCALING = 900  # power of two of the scaled fields
+DECADES = {"float32": 25, "float64": 290}  # norms within 10^+-d can be tested in this dtype
+SCALING = 900  # exponent of the power of two by which fields are scaled
 
 Rng = int | np.random.Generator | None
 
 
 def field(rng: np.random.Generator, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-    """Return a random normal field of a dtype."""
+    """Return a field of normal random values in the given dtype."""
     values = rng.standard_normal(shape)
     if np.dtype(dtype).kind == "c":
         values = values + 1j * rng.standard_normal(shape)
@@ -50,32 +51,33 @@ def field(rng: np.random.Generator, shape: tuple[int, ...], dtype: DTypeLike) ->
 
 
 class Probe:
-    """An operator under test: random fields for it, and what its rounding errors are measured against.
+    """An operator under test, with random fields and with the reference size of its rounding errors.
 
     Parameters
     ----------
     op : Operator
-        Its tangent is tested: an inverse without its check of primal data.
+        Its tangent is tested (for an inverse: without the check that the right-hand side is compatible).
     seeds : int
-        Random fields of each test and dtype.
+        Number of random fields for each test and dtype.
     rng : None, int or numpy Generator
 
     Attributes
     ----------
     real_linear : "", "domain" or "codomain"
-        Of an operator on complex numbers that is linear over the real numbers only: which of its fields are real. A
-        real FFT has a real domain, its inverse a real codomain.
+        For an operator of complex dtype that is linear only over the real numbers: which of its fields are real. A real
+        FFT has a real domain, and its inverse has a real codomain. Empty for all other operators.
     listed : bool
-        Whether the entries can be listed at a fair price.
+        Whether the matrix is built for the tests.
     forms : tuple of Operator
-        Explicit and matrix-free, where they can.
+        The explicit and the matrix-free form; empty if not `listed`.
     matrix : sparse matrix
-        The entries, where they can.
+        The matrix of the operator; None if not `listed`.
     bounds : tuple of functions
-        For A and A^T: |u| to |A| |u|, what rounding in A u is relative to, entry by entry. Empty without entries.
+        Two functions that map |u| to |A| |u| and to |A^T| |u|. The rounding error in A u is relative to |A| |u|,
+        elementwise. Empty if the operator was given by functions, or if its matrix is not built.
     size : float
-        sqrt(|A|_1 |A|_inf), or a lower bound of the 2-norm from products. A bound from below makes the tests
-        stricter, never weaker.
+        sqrt(|A|_1 |A|_inf) from the entries. Without entries: a lower bound of the 2-norm from products with A, which
+        makes the tests stricter.
     """
 
     def __init__(self, op: Operator, seeds: int = 1, rng: Rng = None) -> None:
@@ -93,7 +95,7 @@ class Probe:
             largest = LARGEST
         else:
             largest = MOST_COLUMNS
-        self.listed = max(op.shape) <= largest and not self.real_linear  # a matrix is linear over complex numbers
+        self.listed = max(op.shape) <= largest and not self.real_linear  # a complex matrix cannot represent it
         self.bounds: tuple[Callable[[Any], Any], ...] = ()
         if self.listed and structure.has_entries:
             self.bounds = (structure.magnitude(), structure.transpose().magnitude())
@@ -109,7 +111,7 @@ class Probe:
 
     @cached_property
     def transposed_forms(self) -> list[Any]:
-        """The forms of the transpose, and the entries that it assembles by itself."""
+        """The transpose assembled directly, and the transposes of both forms."""
         return [self.op.structure.transpose().explicit(), *(form.T for form in self.forms)]
 
     def domain(self, dtype: DTypeLike = float) -> NDArray[Any]:
@@ -117,32 +119,32 @@ class Probe:
         return field(self.rng, self.op.domain.shape, dtype)
 
     def codomain(self, dtype: DTypeLike = float) -> NDArray[Any]:
-        """Return a random field of the codomain, complex where the operator is."""
+        """Return a random field of the codomain. It is complex if the operator is complex."""
         if not self.real:
             dtype = np.result_type(dtype, np.complex64)
         return field(self.rng, self.op.codomain.shape, dtype)
 
     def rows(self, name: str, dtypes: Sequence[str] = ()) -> list[Row]:
-        """Return for each dtype (default: those of the identity) how far its two sides are apart, at worst."""
+        """Return one row for each dtype, with the largest difference between the two sides of an identity."""
         rows: list[Row] = []
         default = IDENTITIES[name].dtypes or DTYPES[: 1 if self.real else 2]
         for dtype in map(np.dtype, dtypes or default):
             if self.real_linear == "domain" and dtype.kind == "c":
                 continue
-            # A clean refusal of complex fields is fine where real fields work.
+            # A real operator that works for real fields may raise an error for complex fields.
             is_optional = dtype.kind == "c" and self.real and rows[0].ok is True
             rows.append(self._row(name, dtype, is_optional))
         return rows
 
     def _row(self, name: str, dtype: np.dtype[Any], is_optional: bool) -> Row:
-        """Return the row of an identity in one dtype; where it is not optional, an error fails."""
+        """Return the row of an identity in one dtype. An exception fails the row unless it is optional."""
         label = f"{name}, {dtype}"
         decades = DECADES[np.finfo(dtype).dtype.name] / IDENTITIES[name].power_of_size
         if self.size and abs(log10(self.size)) >= decades:
             return Row(label, note=f"entries of size {self.size:.1e} leave the range of {dtype}")
         try:
             gap = float(self.gap(name, dtype))
-        except Exception as error:  # a function may raise anything
+        except Exception as error:  # a user's function may raise any exception
             note = error_text(error)
             if is_optional:
                 return Row(label, note=f"refused, {note}")
@@ -150,7 +152,7 @@ class Probe:
         return Row(label, inf if isnan(gap) else gap, LIMIT, gap <= LIMIT)
 
     def gap(self, name: str, dtype: np.dtype[Any]) -> float:
-        """Return the distance of the two sides of an identity in units of rounding, at worst over entries and seeds."""
+        """Return the largest difference between the two sides of an identity over entries and seeds, in roundings."""
         identity = IDENTITIES[name]
         if identity.is_exact:
             tolerance = 0.0
@@ -170,23 +172,24 @@ class Probe:
         return worst
 
     def bound(self, u: NDArray[Any], transposed: bool = False) -> Any:
-        """Return what rounding in A u is relative to: |A| |u|, entry by entry.
+        """Return the reference size of the rounding errors in A u: |A| |u|, elementwise.
 
-        Functions round relative to the whole result (transforms, solves): |A| |u| in norms.
+        For operators without entries (transforms, solves) the error of an entry is relative to the whole result, and
+        the reference size is the product of the norms of A and u.
         """
         if self.bounds:
             return self.bounds[transposed](np.abs(u).ravel().astype(float))
         return self.size * norm(u)
 
     def product(self, a: NDArray[Any], b: NDArray[Any]) -> Any:
-        """Return the sum of a b; its real part where only that is the same for an operator and its transpose."""
-        product = np.sum(a * b.astype(np.result_type(b, float)))  # in double precision: the sum is not what is tested
+        """Return sum(a * b), or its real part for an operator that is linear only over the real numbers."""
+        product = np.sum(a * b.astype(np.result_type(b, float)))  # in float64: the sum itself is not tested
         if self.real_linear:
             return np.real(product)
         return product
 
     def transposed(self, g: NDArray[Any], real: bool) -> NDArray[Any]:
-        """Return A^T g by the transposed matrix, or by `.T` without one; of real fields the real part."""
+        """Return A^T g by the transposed matrix, or by `.T` if there is no matrix; its real part if `real`."""
         if self.listed:
             result = (self.matrix.T @ g.ravel()).reshape(self.op.domain.shape)
         else:
@@ -196,14 +199,14 @@ class Probe:
         return result
 
     def _find_real_side(self) -> str:
-        """Return which fields of an operator are real, if it is not linear over the complex numbers."""
+        """Return which fields are real ("domain" or "codomain") if A is linear only over the real numbers, else ""."""
         u = self.domain()
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # NumPy may say that it discards imaginary parts
+            warnings.simplefilter("ignore")  # NumPy may warn that it discards imaginary parts
             of_real = self.op.apply(u)
             try:
                 of_imaginary = self.op.apply(1j * u)
-            except Exception:  # a foreign function may refuse complex fields in any way
+            except Exception:  # a user's function may raise any exception for complex fields
                 return "domain"
             if norm(of_imaginary - 1j * of_real) <= LINEAR_SHARE * norm(of_real):
                 return ""
@@ -219,7 +222,7 @@ class Probe:
         return prod(sqrt(np.max(sizes, initial=0.0)) for sizes in sums)
 
     def _size_from_products(self) -> float:
-        """Return the 2-norm, from below, by power iteration; only products of A itself count."""
+        """Return a lower bound of the 2-norm by power iteration. It is valid even if the transpose is wrong."""
         size = 0.0
         x = self.domain()
         for _ in range(POWER_ITERATIONS):
@@ -235,17 +238,17 @@ class Probe:
 
 
 def tolerance_of(structure: Any) -> float:
-    """Return the largest tolerance of a structure that solves, or has members that do; else 0.
+    """Return the largest relative tolerance of the solves in a structure and its members; 0 if there are none.
 
-    An inverse has it in `solver.system.rtol`: its residual is accepted there, whatever the method.
+    All methods of an inverse accept the residual at `solver.system.rtol`.
     """
     system = getattr(getattr(structure, "solver", None), "system", structure)
     members = getattr(structure, "members", ())
     return max(float(getattr(system, "rtol", 0.0)), *map(tolerance_of, members), 0.0)
 
 
-# ------------------------------------------------------------ identities of a right operator
-# Each returns the left side, the right side, and what their rounding is relative to.
+# ------------------------------------------------------------ identities that every correct operator satisfies
+# Each function returns the left side, the right side, and the reference size of their rounding errors.
 
 Sides = tuple[Any, Any, Any]
 Array = NDArray[Any]
@@ -287,62 +290,62 @@ def _second_order(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
 
 
 def _scaled_results(op: Any, u: Array) -> Array:
-    """Return the results for a field times 2^+-SCALING, scaled back."""
+    """Return the results for fields times 2^SCALING and 2^-SCALING, scaled back."""
     return np.stack([op.apply(u * 2.0**k) * 2.0**-k for k in (SCALING, -SCALING)])
 
 
 def _scaling(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
-    """Compare the result with that for a field times 2^+-900, scaled back."""
+    """Compare A u with the results for u times 2^900 and u times 2^-900, scaled back."""
     return _scaled_results(probe.op, u), probe.op.apply(u), probe.bound(u)
 
 
 def _scaling_transposed(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
-    """Compare the result with that for a cotangent times 2^+-900, scaled back."""
+    """Compare A^T g with the results for g times 2^900 and g times 2^-900, scaled back."""
     return _scaled_results(probe.op.T, g), probe.op.T.apply(g), probe.bound(g, True)
 
 
 def _results_of_two_applications(op: Any, u: Array) -> Sides:
-    """Return the result of a second application and of a first one, each with the field after and before."""
+    """Return (second result, field afterwards) and (first result, field before), which must be bit for bit equal."""
     before = u.copy()
     first = op.apply(u)
     return np.append(op.apply(u), u), np.append(first, before), 0.0
 
 
 def _same_bits(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
-    """Compare two applications, and their argument before and after."""
+    """Compare two applications bit for bit, and check that the argument is not modified."""
     return _results_of_two_applications(probe.op, u)
 
 
 def _same_bits_transposed(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
-    """Compare two applications of the transpose."""
+    """Compare two applications of the transpose bit for bit."""
     return _results_of_two_applications(probe.op.T, g)
 
 
 def _forms_agree(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
-    """Compare all forms with the product with the matrix."""
+    """Compare the products of all forms with the product of the matrix."""
     products = np.stack([form @ u.ravel() for form in probe.forms])
     return probe.matrix @ u.ravel(), products, probe.bound(u)
 
 
 def _transposed_forms_agree(probe: Probe, u: Array, v: Array, g: Array) -> Sides:
-    """Compare all forms of the transpose with the product with the transposed matrix."""
+    """Compare the products of all forms of the transpose with the product of the transposed matrix."""
     products = np.stack([form @ g.ravel() for form in probe.transposed_forms])
     return probe.matrix.T @ g.ravel(), products, probe.bound(g, True)
 
 
 class Identity(NamedTuple):
-    """An identity of a right operator.
+    """An identity that every correct operator satisfies.
 
     Attributes
     ----------
     sides : callable
         ``sides(probe, u, v, g)`` with random fields u and v of the domain and g of the codomain.
     dtypes : tuple of str
-        Default: float64, and complex128 of a complex operator.
+        Dtypes of the fields. Default: float64, and also complex128 for a complex operator.
     is_exact : bool
-        Whether the tolerance of a solve does not enter.
+        If True, the two sides must agree to rounding even if the operator contains an iterative solve.
     power_of_size : int
-        Which power of the size of an operator has to be a number of the dtype, with room for the fields.
+        The test is skipped if this power of the norm of the operator would overflow or underflow in the dtype.
     """
 
     sides: Callable[[Probe, Array, Array, Array], Sides]
@@ -364,7 +367,7 @@ IDENTITIES = {
     "forward": Identity(_forms_agree, DTYPES[:3]),
     "transposed": Identity(_transposed_forms_agree, DTYPES[:3]),
 }
-FORM_IDENTITIES = ("forward", "transposed")  # of an operator whose entries can be listed
+FORM_IDENTITIES = ("forward", "transposed")  # need the matrix of the operator
 
 
 # ------------------------------------------------------------ transpose
@@ -377,15 +380,15 @@ def transpose(op: Operator, seeds: int = 5, rng: Rng = None) -> Summary:
     ----------
     op : Operator
     seeds : int
-        Pairs of random fields for each dtype.
+        Number of pairs of random fields for each dtype.
     rng : None, int or numpy Generator
-        Source of the fields; default: a fixed seed.
+        Seed or generator of the random fields. Default: a fixed seed.
 
     Returns
     -------
     Summary
-        One row for float64, complex128, float32 and complex64, each <= 10. `.verdict`, `.ok`,
-        `.worst`, `.rows`; str() is the table.
+        One row for each of float64, complex128, float32 and complex64. The figure must be at most 10. It has the
+        attributes `.verdict`, `.ok`, `.worst` and `.rows`, and str() returns the table.
 
     See Also
     --------
@@ -393,11 +396,11 @@ def transpose(op: Operator, seeds: int = 5, rng: Rng = None) -> Summary:
 
     Notes
     -----
-    The figure is |<A u, v> - <u, A^T v>| / (eps sqrt(|A|_1 |A|_inf) |u| |v|). The products are plain, without
-    conjugation, as `.T` is; of an operator that is linear over the real numbers only (see `operator`) their real parts
-    are compared. The norms come from the entries; without entries they are lower bounds from products with A, which
-    makes the test stricter. An operator that contains a solve is measured by the tolerance of the solve in place of
-    eps.
+    The figure is |<A u, v> - <u, A^T v>| / (eps sqrt(|A|_1 |A|_inf) |u| |v|). The products <a, b> = sum(a * b) have no
+    complex conjugation, because `.T` is the plain transpose. For an operator that is linear only over the real numbers
+    (see `operator`), the real parts are compared. The norms are computed from the matrix entries. An operator without
+    entries has lower bounds of its norm from products with A instead, which makes the test stricter. For an operator
+    that contains a solve, the tolerance of the solve takes the place of eps.
 
     Examples
     --------
@@ -422,16 +425,16 @@ def twin(op: Operator, seeds: int = 3, rng: Rng = None) -> Summary:
     ----------
     op : Operator
     seeds : int
-        Random fields for each dtype.
+        Number of random fields for each dtype.
     rng : None, int or numpy Generator
-        Source of the fields; default: a fixed seed.
+        Seed or generator of the random fields. Default: a fixed seed.
 
     Returns
     -------
     Summary
-        The difference of the two products, entry by entry, in units of eps |A| |u| (for products of
-        operators |A| |B| |u|), each <= 10. The transposed products are also compared with the matrix that the
-        transpose assembles by itself.
+        The largest elementwise difference of the two products, in units of eps |A| |u| (for a product of operators:
+        eps |A| |B| |u|). It must be at most 10. The transposed products are also compared with the matrix that the
+        transpose of the operator assembles.
 
     See Also
     --------
@@ -439,10 +442,10 @@ def twin(op: Operator, seeds: int = 3, rng: Rng = None) -> Summary:
 
     Notes
     -----
-    Some operators have one form only, and the first row says so. One that was given as a matrix is
-    compared with the product of that matrix by SciPy. One that was given by functions is compared
-    with its columns, computed one application at a time, up to 512 unknowns; above, only the functions
-    are there, nothing can be compared, and the verdict is inconclusive.
+    Some operators have only one form; the first row says so. An operator given as a matrix is compared with SciPy's
+    product of that matrix. An operator given by functions is compared with the matrix of its columns, which are
+    computed one application at a time, up to 512 unknowns. For more unknowns there is nothing to compare with, and the
+    verdict is "inconclusive".
 
     Examples
     --------
@@ -455,7 +458,7 @@ def twin(op: Operator, seeds: int = 3, rng: Rng = None) -> Summary:
 
 
 def _rows_of_forms(probe: Probe) -> list[Row]:
-    """Return the rows that compare both forms in three dtypes, entry by entry."""
+    """Return the rows that compare both forms elementwise in three dtypes."""
     if probe.real_linear:
         return [Row("forms", note="one form: given by functions, and no matrix of complex numbers stands for it")]
     rows = [Row("forms", note=_forms_in_words(probe.op.structure, probe.listed))]
@@ -466,7 +469,7 @@ def _rows_of_forms(probe: Probe) -> list[Row]:
 
 
 def _forms_in_words(structure: Any, listed: bool) -> str:
-    """Say which forms an operator has."""
+    """Return a sentence that says which forms an operator has."""
     if isinstance(structure, Matrix):
         return "one form: given as a matrix; compared with the product by SciPy"
     if structure.has_entries:
@@ -481,7 +484,7 @@ def _forms_in_words(structure: Any, listed: bool) -> str:
 
 
 def fault_of(op: Operator, rng: np.random.Generator) -> str:
-    """Return in words what is wrong with the linearity or the transpose of an operator; empty if nothing."""
+    """Return a phrase that says what is wrong with the linearity or the transpose of an operator; "" if nothing is."""
     probe = Probe(op, 1, rng)
     if probe.real or probe.real_linear == "domain":
         dtypes = DTYPES[:1]
@@ -498,7 +501,7 @@ def fault_of(op: Operator, rng: np.random.Generator) -> str:
 
 
 def layouts(u: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    """Return the same numbers in other layouts in memory, by name."""
+    """Return arrays with the values of `u` in other memory layouts, by name of the layout."""
     return {
         "Fortran order": np.asfortranarray(u),
         "strided": np.stack([u, np.nan * u], axis=-1)[..., 0],
@@ -511,22 +514,22 @@ def layouts(u: NDArray[Any]) -> dict[str, NDArray[Any]]:
 
 
 def operator(op: Operator, seeds: int = 3, rng: Rng = None) -> OperatorSummary:
-    """Check all properties of a right operator, and summarize its spaces, form and entries.
+    """Check all properties that a correct operator has, and summarize its spaces, form and entries.
 
     Parameters
     ----------
     op : Operator
-        From the catalogue, or from outside: `from_matrix`, `from_functions`, `from_linear_operator`.
+        An operator of this library, or one from `from_matrix`, `from_functions` or `from_linear_operator`.
     seeds : int
-        Random fields for each test and dtype.
+        Number of random fields for each test and dtype.
     rng : None, int or numpy Generator
-        Source of the fields; default: a fixed seed.
+        Seed or generator of the random fields. Default: a fixed seed.
 
     Returns
     -------
     OperatorSummary
-        `.verdict` and `.ok`; `.rows` with name, figure, limit, ok, note; `.failed` names what failed;
-        print(summary) shows it all.
+        It has the attributes `.verdict` and `.ok`; `.rows`, each with name, figure, limit, ok and note; and `.failed`,
+        the names of the rows that failed. print(summary) shows the whole table.
 
     See Also
     --------
@@ -534,16 +537,18 @@ def operator(op: Operator, seeds: int = 3, rng: Rng = None) -> OperatorSummary:
 
     Notes
     -----
-    Rows: linearity, transpose (scaled dot test in four dtypes), twin (explicit against matrix-free,
-    forward and transposed), JVP, VJP, second order, same bits twice, the same digits for a field times 2^+-900.
-    Beside them stand facts without a verdict (`facts`): row sums, spectrum, the largest stable step. Whether an
-    operator is the derivative that it should be, and of which order, `check.order` tells. Figures are in units of
-    rounding; an inverse is measured by the tolerance of its solve, without its check of primal data. Shapes, dtypes,
-    integers, batches and memory layouts are the same code for every Operator: no rows.
+    The rows are: linearity; transpose (scaled dot test in four dtypes); twin (explicit form against matrix-free form,
+    forward and transposed); JVP; VJP; second derivatives; equal bits of two applications; and equal digits for fields
+    scaled by 2^900 and 2^-900. The summary also has facts without a verdict (`facts`), such as row sums, spectrum and
+    the largest stable time step. Use `check.order` to test whether an operator approximates the intended derivative,
+    and with which order. Figures are in units of rounding. For an inverse they are in units of the tolerance of its
+    solve, and its check of the right-hand side is switched off. Shapes, dtypes, integers, batches and memory layouts
+    have no rows, because all Operators share the code that handles them.
 
-    An operator with ``dtype=complex`` whose domain or codomain is real (a real FFT, or its inverse) is linear over the
-    real numbers only. Its transpose is right if Re sum(g * A u) = Re sum(A^T g * u) for all complex g, which is what
-    derivatives need; a row says so, and there is no matrix to compare with.
+    An operator with ``dtype=complex`` whose domain or codomain is real (a real FFT, or its inverse) is linear only over
+    the real numbers. Its transpose is correct if Re sum(g * A u) = Re sum(A^T g * u) for all complex g, which is the
+    condition for correct derivatives. A row says that real parts are compared. The twin is not tested, because no
+    complex matrix represents such an operator.
 
     Examples
     --------
@@ -557,10 +562,10 @@ def operator(op: Operator, seeds: int = 3, rng: Rng = None) -> OperatorSummary:
     True
     """
     check_operator("check.operator", op)
-    with np.errstate(all="ignore"), unwarned():  # what overflows shows in the figures
+    with np.errstate(all="ignore"), unwarned():  # an overflow shows in the figures
         try:
             probe = Probe(op, seeds, rng)
-        except Exception as error:  # a foreign function may raise anything
+        except Exception as error:  # a user's function may raise any exception
             return OperatorSummary(op, None, [Row("application", inf, LIMIT, False, error_text(error))])
         return OperatorSummary(op, probe, _rows(probe))
 
@@ -583,19 +588,19 @@ def _rows(probe: Probe) -> list[Row]:
 
 
 class OperatorSummary(Summary):
-    """The properties of one operator, and whether it is right. Prints itself.
+    """The result of `check.operator`. str() returns the verdict, the facts and the table of rows.
 
     Attributes
     ----------
     op : Operator
     size : float or None
-        sqrt(|A|_1 |A|_inf), from below without entries.
+        sqrt(|A|_1 |A|_inf). For an operator without entries: a lower bound of its 2-norm.
     nnz : int or None
-        Number of stored entries, where listing them costs no application.
+        Number of stored entries; None if the operator was given by functions or is too large.
     facts : dict
-        What the operator is: domain, codomain, form, dtype, nnz, size; row sums, symmetry; of a square one spectral
-        radius, definiteness, null space and the largest stable step of u' = A u by explicit Euler. Computed when they
-        are asked for; what cannot be computed at a fair price is left out.
+        Domain, codomain, form, dtype, nnz, size, row sums and symmetry. For a square operator also spectral radius,
+        definiteness, dimension of the null space, and the largest stable step of explicit Euler for u' = A u. The
+        facts are computed at first access. Facts that are too expensive to compute are omitted.
     """
 
     def __init__(self, op: Operator, probe: Probe | None, rows: Sequence[Row]) -> None:
@@ -609,7 +614,7 @@ class OperatorSummary(Summary):
 
     @cached_property
     def facts(self) -> dict[str, Any]:
-        """Dict of what the operator is."""
+        """Facts about the operator, by name."""
         op = self.op
         facts = {"domain": str(op.domain), "codomain": str(op.codomain), "form": op.form, "dtype": str(op.dtype)}
         facts |= {"nnz": self.nnz, "size": self.size}
@@ -618,7 +623,7 @@ class OperatorSummary(Summary):
         return facts
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the summary as plain numbers, strings and lists."""
+        """Return the summary and the facts as plain numbers, strings and lists."""
         return super().to_dict() | self.facts
 
     def parts(self) -> list[str | Table]:

@@ -1,7 +1,7 @@
-"""The point where a loss is audited, as one real vector, and the directions along which it is left.
+"""The point where a gradient is audited, flattened to one real vector, and the directions of the audit.
 
-Complex leaves are pairs of real numbers, and so are gradients and directions: the derivative along a direction is a
-plain dot product.
+A complex entry is stored as two real entries in points, gradients and directions, so that the derivative along a
+direction is an ordinary dot product.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from sparsedp.autodiff.flattening import Packing, joined
 
 __all__ = ["QUICK_DIRECTIONS", "Point", "audit_generator", "root_mean_square"]
 
-MOST_LEAVES = 8  # a tree with more leaves gets no direction for each of them
-LARGEST_SHARE = 4.0  # an entry moves by at most this many units along the gradient
-QUICK_DIRECTIONS = ("random 1", "gradient")  # for a loss that takes minutes
+MOST_LEAVES = 8  # a tree with more leaves has no separate direction for each leaf
+LARGEST_SHARE = 4.0  # the gradient direction moves an entry by at most this many units
+QUICK_DIRECTIONS = ("random 1", "gradient")  # the only directions of a quick audit
 SEED = 20240229
 
 
 def audit_generator(rng: int | np.random.Generator | None) -> np.random.Generator:
-    """Return a generator of its own for an audit; None stands for a fixed seed."""
+    """Return the random generator of an audit. None gives a new generator with a fixed seed."""
     return np.random.default_rng(SEED if rng is None else rng)
 
 
 def root_mean_square(vector: NDArray[Any]) -> float:
-    """Return the root mean square of the entries, 0 without entries."""
+    """Return the root mean square of the entries; 0 for an empty vector."""
     return norm(vector) / np.sqrt(max(vector.size, 1))
 
 
 def _as_numpy(leaf: Any) -> Any:
-    """Return a leaf as a number or array of NumPy; of a distributed field all of it.
+    """Return a leaf as a NumPy scalar or array. A distributed field is gathered from all ranks.
 
-    Python's numbers refuse to divide by 0 and do not take complex steps.
+    Python scalars are converted, because they raise an error for a division by 0 and do not accept complex steps.
     """
     if isinstance(leaf, (float, complex)):
         return np.asarray(leaf)[()]
@@ -48,8 +48,8 @@ def _as_numpy(leaf: Any) -> Any:
 class Point(Packing):
     """The point where a loss is audited, as a vector.
 
-    Each leaf has a unit: the root mean square of its values, 1 if they are all 0. A step of size t moves every leaf
-    by t times its unit, so that leaves of different physical size are all examined.
+    Each leaf has a unit: the root mean square of its values, or 1 if all values are 0. A step of size t moves each leaf
+    by t times its unit, so that leaves of different magnitude are changed by the same relative amount.
 
     Parameters
     ----------
@@ -58,10 +58,11 @@ class Point(Packing):
     Attributes
     ----------
     vector : ndarray
+        All floating leaves, flattened and concatenated.
     units : ndarray
         The unit of each entry of the vector.
     entries : int
-        Number of entries of all floating leaves; a complex one counts once.
+        Number of entries of all floating leaves. A complex entry counts once.
     """
 
     def __init__(self, x: Any) -> None:
@@ -69,20 +70,20 @@ class Point(Packing):
         for name, values in zip(self.names, self.values):
             check_finite(name, values, "must be finite where a gradient is checked")
         self.vector = joined(self.values)
-        self.values = self.arrays(self.vector)  # copies: the caller may write into the arrays of x
+        self.values = self.arrays(self.vector)  # copies, because the caller may modify the arrays of x later
         self.units = self._leaf_sizes(self.vector)
         self.entries = sum(map(np.size, self.values))
 
     def tree(self, arrays: list[Any]) -> Any:
-        """Return the tree with these arrays, and copies of the other leaves."""
+        """Return a tree like x that has `arrays` as its floating leaves, and copies of the other leaves."""
         return copied(super().tree(arrays))
 
     def fresh(self) -> Any:
-        """Return a copy of the tree."""
+        """Return a new copy of x."""
         return self.unpack(self.vector)
 
     def gradient(self, tree: Any) -> NDArray[Any]:
-        """Return a gradient, a tree like x, as a vector."""
+        """Return a gradient, given as a tree like x, as a vector."""
         return joined(self.slopes(tree))
 
     def directions(
@@ -92,14 +93,14 @@ class Point(Packing):
         rng: np.random.Generator,
         is_wanted: Callable[[str], bool] | None = None,
     ) -> list[tuple[str, NDArray[Any]]]:
-        """Return names and displacements of the directions of an audit.
+        """Return the names of the directions of an audit and their displacements for step size 1.
 
         Parameters
         ----------
         gradient : ndarray
             The gradient under test.
         count : int
-            Number of random directions of all leaves.
+            Number of random directions in all leaves together.
         rng : Generator
         is_wanted : callable, optional
             ``is_wanted(name)`` selects directions; default: all.
@@ -107,8 +108,9 @@ class Point(Packing):
         Returns
         -------
         list of (str, ndarray)
-            Random directions; and those that see errors which random ones average out: each leaf alone, all entries
-            by the same, along the gradient, and its largest entry.
+            Random directions, and special directions for errors that would average out in random ones: one random
+            direction in each leaf, the same displacement in all entries of a leaf, the gradient, and the entry with
+            the largest gradient.
         """
         displacements = {f"random {number + 1}": self.random(rng) for number in range(count)}
         if 1 < len(self.names) <= MOST_LEAVES:
@@ -136,9 +138,9 @@ class Point(Packing):
         return self.units * (values / self._leaf_sizes(values))
 
     def _leaf_sizes(self, vector: NDArray[Any]) -> NDArray[Any]:
-        """Return for each entry the root mean square of its leaf, 1 for a leaf of zeros."""
+        """Return for each entry the root mean square of its leaf, or 1 if the leaf is zero."""
         return self._for_each_entry([root_mean_square(part) or 1.0 for part in self.split(vector)])
 
     def _for_each_entry(self, leaf_values: Sequence[float]) -> NDArray[Any]:
-        """Repeat a value of each leaf for each of its entries."""
+        """Return a vector in which each entry has the value of its leaf."""
         return np.repeat(leaf_values, [part.size for part in self.split(self.vector)])

@@ -1,6 +1,6 @@
-"""What an operator is: its signs and its spectrum.
+"""Facts about an operator for its summary: row sums, symmetry, spectrum and definiteness.
 
-Facts for the summary of an operator, not verdicts.
+These are information only. They do not change the verdict of a check.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from sparsedp.operators.operator import Operator
 
 __all__ = ["facts_of"]
 
-MOST_DENSE_ROWS = 256  # up to which all eigenvalues are computed
-MOST_ROWS = 100_000  # above which no eigenvalue is computed
-ZERO_SHARE = 1e-10  # of the largest: a smaller eigenvalue or row sum is 0
-ZERO_SHARE_OF_ENDS = 1e-4  # the same where only the ends of the spectrum are computed
+MOST_DENSE_ROWS = 256  # all eigenvalues are computed up to this number of rows
+MOST_ROWS = 100_000  # no eigenvalue is computed for more rows
+ZERO_SHARE = 1e-10  # an eigenvalue or row sum below this share of the largest counts as 0
+ZERO_SHARE_OF_ENDS = 1e-4  # the same if only the extreme eigenvalues are computed
 SYMMETRIC_SHARE = 1e-13
 
 
 @np.errstate(all="ignore")
 def facts_of(op: Operator, listed: bool, is_right: bool) -> dict[str, Any]:
-    """Return what an operator is, by name.
+    """Return facts about an operator, by name.
 
     Parameters
     ----------
     op : Operator
     listed : bool
-        Whether its entries are listed.
+        Whether the matrix of the operator may be used.
     is_right : bool
-        Whether nothing is wrong with it: otherwise its spectrum is omitted.
+        Whether all checks of the operator passed. If not, the spectrum is omitted.
     """
     is_square = fits(op.domain, op.codomain)
     facts: dict[str, Any] = _facts_of_entries(op.matrix, is_square) if listed else {}
@@ -47,7 +47,7 @@ def facts_of(op: Operator, listed: bool, is_right: bool) -> dict[str, Any]:
 
 
 def _facts_of_entries(A: Any, is_square: bool) -> dict[str, Any]:
-    """Return row sums and symmetry."""
+    """Return the range of the row sums, and whether the matrix is symmetric."""
     sums = A.sum(axis=1)
     largest = np.max(abs(A).sum(axis=1), initial=0.0)
     facts: dict[str, Any] = {"row sums": "0"}
@@ -61,8 +61,9 @@ def _facts_of_entries(A: Any, is_square: bool) -> dict[str, Any]:
 def _facts_of_spectrum(op: Operator, is_symmetric: bool) -> dict[str, Any]:
     """Return spectral radius, definiteness, null space and the largest stable step of u' = A u.
 
-    All eigenvalues of a small operator; of a large one the ends only, by Lanczos or Arnoldi from a fixed start.
-    Explicit Euler is stable when |1 + dt e| <= 1 for every eigenvalue e: dt <= -2 Re(e) / |e|^2.
+    For a small operator all eigenvalues are computed. For a large one, Lanczos or Arnoldi iteration from a fixed start
+    vector gives only the extreme eigenvalues. Explicit Euler is stable if |1 + dt e| <= 1 for every eigenvalue e, that
+    is, dt <= -2 Re(e) / |e|^2.
     """
     is_whole = op.shape[0] <= MOST_DENSE_ROWS
     values = _all_eigenvalues(op, is_symmetric) if is_whole else _ends_of_spectrum(op, is_symmetric)
@@ -94,7 +95,7 @@ def _all_eigenvalues(op: Operator, is_symmetric: bool) -> NDArray[Any]:
 
 
 def _ends_of_spectrum(op: Operator, is_symmetric: bool) -> NDArray[Any] | None:
-    """Return both ends of a real spectrum, or the largest eigenvalue; None where the iteration fails."""
+    """Return the two extreme eigenvalues if A is symmetric, else that of largest modulus; None if ARPACK fails."""
     start = np.random.default_rng(0).standard_normal(op.shape[0])
     options = {"v0": start, "tol": 1e-6, "return_eigenvectors": False}
     try:
@@ -106,7 +107,7 @@ def _ends_of_spectrum(op: Operator, is_symmetric: bool) -> NDArray[Any] | None:
 
 
 def _definiteness(values: NDArray[Any], nonzero: NDArray[Any], is_whole: bool) -> str:
-    """Return in words whether a symmetric operator is definite."""
+    """Return a word such as "positive definite" or "indefinite" for a symmetric operator."""
     if np.all(nonzero > 0):
         sign = "positive"
     elif np.all(nonzero < 0):

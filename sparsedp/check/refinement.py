@@ -15,7 +15,7 @@ from sparsedp.check.table import Table
 
 __all__ = ["Refinement", "order"]
 
-MARGIN = 0.1  # on both sides of an expected number
+MARGIN = 0.1  # tolerance on both sides of an expected order
 
 
 def order(
@@ -26,24 +26,25 @@ def order(
     Parameters
     ----------
     error_at : callable
-        ``error_at(n) -> float``: builds the problem with n cells along an axis and returns the norm of
-        the error against the exact answer.
+        ``error_at(n)`` solves the problem with n cells along an axis, and returns the norm of the difference to the
+        exact solution as a float.
     sizes : sequence of int
-        At least three, increasing. The step is 1 / n.
+        At least three increasing values of n. The mesh size is 1 / n.
     expected : float or (low, high), optional
-        What the order should be: an interval, or a number with 0.1 on both sides.
+        The expected order: an interval, or a number p, which stands for the interval (p - 0.1, p + 0.1).
 
     Returns
     -------
     Refinement
-        `.order` is the slope of log(error) over log(1 / n) through the last three sizes, `.orders` the
-        slope of each pair. `.verdict`: agrees or disagrees with `expected`; inconclusive when nothing was
-        expected, or when an error is 0 or not finite. str() is the table.
+        `.order` is the least-squares slope of log(error) over log(1 / n) for the last three sizes, and `.orders` are
+        the slopes between neighbouring sizes. `.verdict` is "agrees" or "disagrees" with `expected`. It is
+        "inconclusive" if no order was expected, or if the slope is not finite because one of the last three errors is
+        0, NaN or infinite. str() returns the table.
 
     Raises
     ------
     ValueError
-        If there are fewer than three sizes, or they do not increase.
+        If there are fewer than three sizes, or they do not increase, or the first one is less than 1.
 
     See Also
     --------
@@ -85,26 +86,26 @@ def order(
 
 
 class Refinement(Result):
-    """Errors over sizes, and the order they show. Frozen.
+    """The result of `check.order`: errors for several grid sizes, and the observed order. Immutable.
 
     Attributes
     ----------
     sizes, errors : tuples
     expected : (low, high) or None
     orders : tuple of float
-        Observed order between neighbouring sizes; NaN where it cannot be told.
+        Observed order between neighbouring sizes; NaN if one of the two errors is 0 or not finite.
     order : float
         Least-squares slope through the last three sizes.
     verdict : "agrees", "disagrees" or "inconclusive"
     reason : str
-        Why the verdict is what it is.
+        Explanation of the verdict.
     """
 
     def __float__(self) -> float:
         return self.order
 
     def parts(self) -> list[str | Table]:
-        """Return the order, and the error on each grid with the order of the step to it."""
+        """Return the title line, and the table of errors with the order relative to the previous grid."""
         orders = ("", *(f"{slope:.2f}" for slope in self.orders))
         head = f"order {self.order:.2f} over the last three sizes: {self.verdict} ({self.reason})"
         return [head, Table(("n", "error", "order"), list(zip(self.sizes, self.errors, orders)))]

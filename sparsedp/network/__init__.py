@@ -1,7 +1,7 @@
 """Small networks as plain functions of a parameter tree: dense and convolution layers, nothing more.
 
-A layer is ``layer(p, x)`` with p a dict of arrays; a network is a Python function that calls layers; its parameters
-are any nesting of such dicts, and minimize takes them as they are.
+A layer is a function ``layer(p, x)``, where p is a dict of arrays. A network is a Python function that calls layers.
+Its parameters are these dicts, nested in dicts, lists or tuples; `minimize` accepts such a tree directly.
 """
 
 from sparsedp._utils.calls import describe_module

@@ -8,7 +8,8 @@ arguments:
     with respect to w: correlation of P x with g;
     with respect to g: y itself;
 
-and the derivatives of each of the three maps are the other two. So one rule serves all of them.
+and the partial derivatives of each of these three maps are given by the other two maps. A single derivative rule
+therefore covers all three maps, and derivatives of every order.
 """
 
 from __future__ import annotations
@@ -28,21 +29,23 @@ if TYPE_CHECKING:
 
 __all__ = ["check_widths", "convolution", "weight_and_bias"]
 
-X, W, Y = 0, 1, 2  # arguments of the trilinear form; Y is that of g
+X, W, Y = 0, 1, 2  # positions of x, w and g in the trilinear form; the derivative with respect to g is y
 
 
 def convolution(p: dict[str, Any], x: Any, padding: str = "periodic") -> Any:
-    """Filter fields on cells: each output is a sum of filtered inputs plus a bias, on the same cells.
+    """Apply a convolution layer to cell fields: each output is the sum of all filtered inputs plus a bias.
+
+    The filters are correlated with the field (they are not reversed), and the output lies on the same cells as `x`.
 
     Parameters
     ----------
     p : dict
         weight : (outputs, inputs, width) in 1-D, (outputs, inputs, width_x, width_y) in 2-D, odd widths;
         bias : (outputs,).
-        Both may have an additional leading axis, one copy for each sample of x.
+        Both may have an additional leading axis, with separate parameters for each sample of `x`.
     x : (samples, inputs, n) or (samples, inputs, nx, ny) array
     padding : "periodic", "zero" or "replicate"
-        The values beyond the field.
+        How the field is continued outside the domain: periodically, by zeros, or by the value of the nearest cell.
 
     Returns
     -------
@@ -51,9 +54,9 @@ def convolution(p: dict[str, Any], x: Any, padding: str = "periodic") -> Any:
     Raises
     ------
     ValueError
-        If the padding is not known or a width is even.
+        If `padding` is none of the three names, or a width is even.
     ShapeError
-        If the shapes do not fit.
+        If the shapes of `x`, the weight and the bias do not match.
 
     See Also
     --------
@@ -72,7 +75,7 @@ def convolution(p: dict[str, Any], x: Any, padding: str = "periodic") -> Any:
 
 
 def weight_and_bias(p: dict[str, Any], layer: str) -> tuple[Any, Any]:
-    """Return the two arrays of a layer, or raise TypeError with its name."""
+    """Return the weight and the bias from the parameters of a layer; raise TypeError if one of them is missing."""
     try:
         return p["weight"], p["bias"]
     except (KeyError, TypeError, IndexError):
@@ -85,13 +88,13 @@ def weight_and_bias(p: dict[str, Any], layer: str) -> tuple[Any, Any]:
 
 
 def check_widths(widths: Sequence[int]) -> None:
-    """Refuse filters without a central entry."""
+    """Raise ValueError for a filter of even width, which has no central entry."""
     if any(width % 2 == 0 for width in widths):
         raise ValueError(f"convolution needs odd widths, so that the output lies on the same cells, got {widths}")
 
 
 def _check(weight, bias, x, padding):
-    """Refuse shapes of a layer and a field that do not fit, and an unknown padding."""
+    """Raise an error if the shapes of weight, bias and field do not match, or if the padding is unknown."""
     check_choice("padding", padding, PADDINGS)
     dim = len(x) - 2
     if dim not in (1, 2) or len(weight) not in (dim + 2, dim + 3):
@@ -110,10 +113,11 @@ def _check(weight, bias, x, padding):
 def _derivative_of_form(a, b, argument, weight_shape, padding):
     """Return the derivative of T(x, w, g) with respect to one argument, X, W or Y.
 
-    `a` and `b` are the two others, in cyclic order after it: w, g for X; g, x for W; x, w for Y.
+    `a` and `b` are the values of the other two arguments in cyclic order (x, w, g): they are w and g for X, g and x
+    for W, x and w for Y.
     """
     field = b if argument == X else a
-    if np.ndim(field) == 3:  # a field in 1-D is one in 2-D with one line
+    if np.ndim(field) == 3:  # treat a 1-D field as a 2-D field with a single line
         shape = (*weight_shape[:-1], 1, weight_shape[-1])
         return _derivative_of_form(a[..., None, :], b[..., None, :], argument, shape, padding)[..., 0, :]
     widths = weight_shape[-2:]
@@ -127,7 +131,10 @@ def _derivative_of_form(a, b, argument, weight_shape, padding):
 
 
 def _vjp(nums, y, a, b, argument, *rest):
-    """Return the pullback: in cyclic order `a` follows the argument, and `b` follows `a`."""
+    """Return the VJP with respect to `a` and `b`.
+
+    `a` and `b` are the arguments (argument + 1) % 3 and (argument + 2) % 3 of the trilinear form.
+    """
 
     def pull(g):
         cotangents = []
@@ -142,7 +149,7 @@ def _vjp(nums, y, a, b, argument, *rest):
 
 
 def _jvp(nums, tangents, y, a, b, *rest):
-    """Return the product rule of a bilinear map."""
+    """Return the JVP: the product rule for a map that is linear in `a` and in `b`."""
     total = None
     for num, tangent in zip(nums, tangents, strict=True):
         if num == 0:

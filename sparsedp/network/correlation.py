@@ -1,8 +1,8 @@
 """Correlations of stacks of fields with small filters as matrix products, on plain arrays.
 
-Shifts along the last axis become rows of one matrix; each shift along the other axis is then one product with a
-slice of its columns, which the matrix product reads in place. So a field is copied once for each entry of a filter's
-last axis, not for each entry of the filter.
+The fields, shifted along the last axis, become the rows of one matrix. For each shift along the other axis, the result
+is a product with a slice of the columns of this matrix, and the matrix product reads the slice without a copy.
+A field is therefore copied as often as the filter is wide along the last axis, not once for each filter entry.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["PADDINGS", "correlate", "filter_gradient", "pad", "pad_transposed"]
 
-BLOCK_BYTES = 1 << 22  # of the copied matrix that are built at a time: they stay in the cache
+BLOCK_BYTES = 1 << 22  # the copied matrix is built in blocks of about this size, which fit into the cache
 PADDINGS: dict[str, Any] = {"periodic": "wrap", "zero": "constant", "replicate": "edge"}  # modes of np.pad
 
 
@@ -30,7 +30,7 @@ def pad(x: NDArray[Any], widths: Sequence[int], padding: str) -> NDArray[Any]:
     ----------
     x : (samples, channels, nx, ny) array
     widths : (int, int)
-        Of the filters; odd.
+        Widths of the filters; odd.
     padding : str
         A key of `PADDINGS`.
 
@@ -39,13 +39,13 @@ def pad(x: NDArray[Any], widths: Sequence[int], padding: str) -> NDArray[Any]:
     array
     """
     mode = PADDINGS[padding]
-    if not x.size:  # the other modes refuse axes without cells
+    if not x.size:  # np.pad raises an error for empty axes in the other modes
         mode = "constant"
     return np.pad(x, [(0, 0), (0, 0), *((width // 2, width // 2) for width in widths)], mode)
 
 
 def pad_transposed(x: NDArray[Any], widths: Sequence[int], padding: str) -> NDArray[Any]:
-    """Apply the transpose of `pad`: add what lies on the padded cells to the cells that were copied there.
+    """Apply the transpose of `pad`: add the value of each padding cell to the cell of which it is a copy.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def correlate(x: NDArray[Any], weight: NDArray[Any]) -> NDArray[Any]:
     Parameters
     ----------
     x : (samples, inputs, *padded cells) array
-    weight : (outputs, inputs, wx, wy) array, or (samples, outputs, inputs, wx, wy) with filters for each sample
+    weight : (outputs, inputs, wx, wy) array, or (samples, outputs, inputs, wx, wy) with separate filters per sample
 
     Returns
     -------
@@ -87,7 +87,7 @@ def correlate(x: NDArray[Any], weight: NDArray[Any]) -> NDArray[Any]:
     y[s, o, i] = sum over c, d of weight[o, c, d] x[s, c, i + d].
     """
     cells = [n - width + 1 for n, width in zip(x.shape[2:], weight.shape[-2:])]
-    matrices = np.moveaxis(weight, -2, 0)  # one for each shift along the first axis
+    matrices = np.moveaxis(weight, -2, 0)  # one matrix for each shift along the first axis
     matrices = matrices.reshape(*matrices.shape[:-2], -1)
     per_sample = weight.ndim == 5
     y = np.zeros((len(x), weight.shape[-4], prod(cells)), np.result_type(x, weight))
@@ -100,18 +100,19 @@ def correlate(x: NDArray[Any], weight: NDArray[Any]) -> NDArray[Any]:
 
 
 def filter_gradient(x: NDArray[Any], g: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """Correlate padded fields with a cotangent: the derivative of `correlate` with respect to the filters.
+    """Correlate padded fields with a cotangent. This is the VJP of `correlate` with respect to the filters.
 
     Parameters
     ----------
     x : (samples, inputs, *padded cells) array
     g : (samples, outputs, *cells) array
     shape : tuple of int
-        Of the filters, as in `correlate`. With a leading axis of samples these are kept apart.
+        Shape of the filters, as in `correlate`. With a leading axis of samples, the result has one gradient for each
+        sample; without it, the result is the sum over samples.
 
     Returns
     -------
-    array of that shape
+    array with the given shape
 
     Notes
     -----
@@ -133,8 +134,8 @@ def filter_gradient(x: NDArray[Any], g: NDArray[Any], shape: tuple[int, ...]) ->
 def _shifted_blocks(x, widths) -> Iterator[tuple[slice, int, NDArray[Any]]]:
     """Yield blocks of samples whose copies fit into the cache, for each shift along the first axis.
 
-    Each item is the slice of the samples, the shift, and the shifted fields as a matrix (samples, inputs times shifts
-    along the last axis, cells). Nothing is yielded if there are no cells.
+    Each item is a tuple of the slice of samples, the shift, and the shifted fields. The shifted fields are an array of
+    shape (samples, inputs * last width, cells). Nothing is yielded if there are no output cells along the last axis.
     """
     first_width, last_width = widths
     lines = x.shape[2] - first_width + 1

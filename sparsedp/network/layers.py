@@ -21,8 +21,8 @@ def dense(p: dict[str, Any], x: Any) -> Any:
     Parameters
     ----------
     p : dict
-        weight : (inputs, outputs); bias : (outputs,). Both may have an additional leading axis, one copy for each
-        sample.
+        weight : (inputs, outputs); bias : (outputs,). Both may have an additional leading axis, with separate
+        parameters for each sample of `x`.
     x : (samples, inputs) array
 
     Returns
@@ -32,7 +32,7 @@ def dense(p: dict[str, Any], x: Any) -> Any:
     Raises
     ------
     ShapeError
-        If the shapes do not fit.
+        If the shapes of `x`, the weight and the bias do not match.
 
     See Also
     --------
@@ -67,11 +67,11 @@ def _tanh_jvp(nums, tangents, y, x):
     return tangents[0] * (1.0 - y * y)
 
 
-_TANH = Rule("tanh", np.tanh, _tanh_vjp, _tanh_jvp)  # autograd's own derivative overflows
+_TANH = Rule("tanh", np.tanh, _tanh_vjp, _tanh_jvp)  # 1 - tanh(x)^2 cannot overflow; autograd divides by cosh(x)^2
 
 
 def tanh(x: Any) -> Any:
-    """Compute the hyperbolic tangent of each number.
+    """Compute the hyperbolic tangent elementwise.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def tanh(x: Any) -> Any:
 
 
 def relu(x: Any) -> Any:
-    """Compute max(x, 0) of each number; the derivative at 0 is 1/2, the mean of both sides.
+    """Compute max(x, 0) elementwise. The derivative at 0 is 1/2, the mean of the one-sided derivatives.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def relu(x: Any) -> Any:
 
 
 def softplus(x: Any) -> Any:
-    """Compute log(1 + exp(x)) of each number, without overflow.
+    """Compute log(1 + exp(x)) elementwise, without overflow.
 
     Parameters
     ----------
@@ -142,16 +142,17 @@ def softplus(x: Any) -> Any:
 def residual_block(
     p: dict[str, dict[str, Any]], x: Any, activation: Callable[[Any], Any] = tanh, padding: str = "periodic"
 ) -> Any:
-    """Add two convolutions to the identity: x + second(activation(first(x))).
+    """Apply a residual block: x + second(activation(first(x))), where first and second are convolutions.
 
     Parameters
     ----------
     p : dict
-        first, second : weights of convolutions; see residual_weights.
+        first, second : parameters of the two convolutions; see `residual_weights`.
     x : (samples, channels, *cells) array
     activation : callable
+        Applied between the two convolutions.
     padding : str
-        As for convolution.
+        See `convolution`.
 
     Returns
     -------
@@ -160,7 +161,7 @@ def residual_block(
     Raises
     ------
     ShapeError, ValueError
-        As convolution.
+        See `convolution`.
 
     See Also
     --------

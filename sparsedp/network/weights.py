@@ -1,4 +1,4 @@
-"""Parameters of layers: drawn at random with a given gain, and stored in files without pickle."""
+"""Draw random initial parameters of layers with a given gain; save and load parameters without pickle."""
 
 from __future__ import annotations
 
@@ -22,14 +22,15 @@ FORMAT = "sparsedp network 1"
 def dense_weights(
     rng: np.random.Generator, inputs: int, outputs: int, gain: float = 1.0
 ) -> dict[str, NDArray[np.float64]]:
-    """Draw the parameters of a dense layer: normal weights of deviation gain / sqrt(inputs), and a bias of 0.
+    """Draw parameters of a dense layer: normal weights with standard deviation gain / sqrt(inputs), and zero bias.
 
     Parameters
     ----------
     rng : numpy.random.Generator
     inputs, outputs : int
     gain : float
-        1 keeps the size of a signal through a linear layer; 5/3 through tanh, sqrt(2) through relu.
+        Scale of the weights. Outputs have about the same size as inputs with gain 1 for a linear layer, 5/3 for a
+        layer followed by tanh, and sqrt(2) for a layer followed by relu.
 
     Returns
     -------
@@ -52,16 +53,16 @@ def dense_weights(
 def convolution_weights(
     rng: np.random.Generator, inputs: int, outputs: int, widths: int | Sequence[int], gain: float = 1.0
 ) -> dict[str, NDArray[np.float64]]:
-    """Draw the parameters of a convolution: normal weights, and a bias of 0.
+    """Draw the parameters of a convolution: normal weights and zero bias.
 
     Parameters
     ----------
     rng : numpy.random.Generator
     inputs, outputs : int
     widths : int or tuple of int
-        Odd: an int in 1-D, a pair in 2-D.
+        Odd widths of the filters: an int in 1-D, a pair in 2-D.
     gain : float
-        See dense_weights. The deviation is gain / sqrt(inputs * entries of a filter).
+        See `dense_weights`. The standard deviation is gain / sqrt(inputs * number of entries of a filter).
 
     Returns
     -------
@@ -83,7 +84,10 @@ def convolution_weights(
 
 
 def _drawn(rng, shape, summands, outputs, gain):
-    """Return weights of which `summands` enter each output, and a bias of 0."""
+    """Return random weights with standard deviation gain / sqrt(summands), and zero bias.
+
+    `summands` is the number of weights that contribute to each output.
+    """
     if not hasattr(rng, "standard_normal"):
         raise TypeError(f"weights are drawn from a numpy Generator, got {rng!r}; write np.random.default_rng(0)")
     return {"weight": rng.standard_normal(shape) * (gain / np.sqrt(max(summands, 1))), "bias": np.zeros(outputs)}
@@ -99,13 +103,14 @@ def residual_weights(
     rng : numpy.random.Generator
     channels : int
     widths : int or tuple of int
+        See `convolution_weights`.
     gain : float
-        Of the second convolution; 0 makes the block the identity at the start.
+        Gain of the second convolution. With 0 the block is initially the identity.
 
     Returns
     -------
     dict
-        first and second, parameters of convolutions.
+        The parameters of the two convolutions, under the keys ``first`` and ``second``.
 
     See Also
     --------
@@ -122,7 +127,7 @@ def residual_weights(
 
 
 def save(path: str | os.PathLike[str], parameters: Any) -> None:
-    """Store parameters in a .npz file without pickle; the structure stands beside the arrays as JSON.
+    """Save parameters to an .npz file without pickle. The structure of the tree is stored in the file as JSON.
 
     Parameters
     ----------
@@ -132,9 +137,9 @@ def save(path: str | os.PathLike[str], parameters: Any) -> None:
     Raises
     ------
     TypeError
-        If a leaf is something else, or a key of a dict is not a string.
+        If a leaf has another type, or a key of a dict is not a string.
     OSError
-        If the file cannot be written; a previous file of this name is kept.
+        If the file cannot be written. An existing file with this name is then unchanged.
 
     See Also
     --------
@@ -161,11 +166,12 @@ def load(path: str | os.PathLike[str]) -> Any:
     Returns
     -------
     tree
+        The parameters, with the structure that was saved.
 
     Raises
     ------
     ValueError
-        If `save` did not write the file, or it is damaged.
+        If the file was not written by `save`, or is damaged.
 
     See Also
     --------
