@@ -1,22 +1,22 @@
-"""Backends: where the numbers of fields are stored, and what the library asks of that place.
+"""Backends: a backend stores fields as arrays and implements the operations that depend on how they are stored.
 
-Code outside of ``parallel/`` calls the methods of `Backend` and the functions below, and never asks where a field is
-stored. The class `Backend` itself is the default: fields are NumPy arrays of this process. ``parallel/`` derives the
-backend of fields whose blocks are stored by several processes.
+Code outside of ``parallel/`` calls the methods of `Backend` and the functions below, and does not depend on where a
+field is stored. The class `Backend` itself is the default: a field is a NumPy array in the memory of this process.
+``parallel/`` derives a backend whose fields are split into blocks, one for each of several processes.
 
 ======================  ============================================================================================
-asked of                by
+operation on            interface
 ======================  ============================================================================================
-a grid                  ``grid.backend``; `Backend.check`, `Backend.place`, `Backend.mesh`
-a field                 `Backend.split`, `Backend.join`, `Backend.concatenate`, `Backend.volumes`, `Backend.field`,
+grids                   ``grid.backend``; `Backend.check`, `Backend.place`, `Backend.mesh`
+fields                  `Backend.split`, `Backend.join`, `Backend.concatenate`, `Backend.volumes`, `Backend.field`,
                         `Backend.combinable`; `as_field`, `gathered`, `replicated`
-a state of a rollout    `Backend.stack`, `Backend.fingerprint`
-a reduction             NumPy's functions: a field of another backend implements ``np.sum``, ``np.max``, ...
-an application          `Backend.apply`, `Backend.reference`; `match_value` for its derivative
-a solve                 `Backend.local_structure`; `Backend.implementation`: the class or function that the backend uses
-                        instead of a default
-the tape                `ArrayKind`: derivative formulas of calls with fields that are no NumPy arrays
-a public call           `collectively`: all processes run it, or all raise
+states of a rollout     `Backend.stack`, `Backend.fingerprint`
+reductions              NumPy's functions: fields of another backend implement ``np.sum``, ``np.max``, ...
+operator products       `Backend.apply`, `Backend.reference`; `match_value` for their derivatives
+solves                  `Backend.local_structure`; `Backend.implementation` for the class or function that the backend
+                        uses instead of a default
+the tape                `ArrayKind`: derivative formulas of calls with fields that are not NumPy arrays
+public calls            `collectively`: either the call succeeds on all processes, or all of them raise an error
 ======================  ============================================================================================
 """
 
@@ -51,9 +51,11 @@ __all__ = [
 ]
 
 BOX = anp.numpy_boxes.ArrayBox
-FOLD = 509  # words in a line of a fingerprint: a prime, so that a field that was shifted has another one
-OTHER_FOLD = 521  # where an axis of the array is a multiple of the first
-WHOLE = 8192  # bytes up to which a fingerprint is that of all bytes
+# A fingerprint of a large array is computed from the sum of lines of FOLD words of 64 bits. FOLD is a prime, so that
+# shifting a field along an axis changes the sum; OTHER_FOLD is used if the length of an axis is a multiple of FOLD.
+FOLD = 509
+OTHER_FOLD = 521
+WHOLE = 8192  # arrays with fewer bytes are hashed in full
 
 
 class Backend:
@@ -62,7 +64,7 @@ class Backend:
     Attributes
     ----------
     whole_fields : bool
-        Whether a field is one array of this process, which compiled loops and SciPy can take.
+        Whether a field is one NumPy array of this process, which can be passed to compiled loops and to SciPy.
     """
 
     whole_fields: bool = True
@@ -83,7 +85,7 @@ class Backend:
         return grid
 
     def mesh(self, grid: Any, lines: list[np.ndarray]) -> tuple:
-        """Return a field of coordinates for each axis, from the coordinates along the axes."""
+        """Return for each axis the field of its coordinate, given the coordinates along all axes."""
         return tuple(np.array(full) for full in np.meshgrid(*lines, indexing="ij"))
 
     # ------------------------------------------------------------ fields
@@ -97,11 +99,11 @@ class Backend:
         return space.split_array(v)
 
     def join(self, space: Any, parts: Any) -> Any:
-        """Return one field of its components; differentiable."""
+        """Join the components of a field to one field; differentiable."""
         return space.join_arrays(parts)
 
     def concatenate(self, space: Any, parts: Sequence) -> Any:
-        """Return a flat field of the numbers of some values, traced or not, one after the other."""
+        """Flatten some values, traced or not, and concatenate them to one flat field."""
         lines = [anp.reshape(replicated(part), (-1,)) for part in parts]
         if not lines:
             return np.zeros(0)
@@ -110,7 +112,7 @@ class Backend:
         return anp.concatenate(lines)
 
     def field(self, space: Any, values: np.ndarray) -> Any:
-        """Return a field of values that every process holds."""
+        """Return a field from an array of all its values that every process has."""
         return values
 
     def combinable(self, value: Any) -> Any:
@@ -122,31 +124,37 @@ class Backend:
         return field.reshape(-1)
 
     def stack(self, fields: Sequence) -> Any:
-        """Return fields, traced or not, along a new first axis; where that is not possible, the tuple of them."""
+        """Stack fields, traced or not, along a new first axis; return a tuple if this is not possible."""
         if any(type(field) is BOX for field in fields):
             return anp.stack(fields)
         return np.stack(fields)
 
     def fingerprint(self, field: Any) -> int:
-        """Return 64 bits that depend on all bits of a plain field."""
+        """Return a hash of 64 bits that depends on all entries of a plain field."""
         return hash(folded(np.asarray(field, order="C")))
 
     # ------------------------------------------------------------ applications and solves
 
     def apply(self, op: Any, u: Any, out: np.ndarray | None = None) -> Any:
-        """Return the result of an Operator for a plain field."""
+        """Apply an Operator to a plain field."""
         return op.apply_array(u, out)
 
     def local_structure(self, op: Any) -> Any:
-        """Return the Structure of an Operator on the entries of fields that this process holds."""
+        """Return the Structure of an Operator restricted to the entries of fields that this process stores."""
         return op.structure
 
     def reference(self, u: Any) -> Any:
-        """Return what the VJP of an Operator must know of its argument to return a gradient of the same form."""
+        """Return the data about the argument of an Operator that its VJP needs to return a gradient of the same form.
+
+        NumPy arrays need none.
+        """
         return None
 
     def attempt(self, act: Callable, *args: Any) -> Any:
-        """Return ``act(*args)``; the caller handles its error, and all processes that share the fields do so."""
+        """Return ``act(*args)``; if it raises on one process, raise on all processes that share the fields.
+
+        So the caller can catch the error and continue in the same way on all processes.
+        """
         return act(*args)
 
     def implementation(self, default: Callable) -> Callable:
@@ -158,7 +166,7 @@ NUMPY = Backend()
 
 
 def folded(value: Any) -> bytes:
-    """Return bytes that depend on all bits of an array; a large one is cut into lines, added as whole numbers."""
+    """Return bytes that depend on all entries of an array; a large array is reduced to a sum of lines of integers."""
     if value.nbytes < WHOLE:
         return value.tobytes()
     if any(size % FOLD == 0 for size in value.shape):
@@ -171,18 +179,21 @@ def folded(value: Any) -> bytes:
 
 
 class ArrayKind(ABC):
-    """What the tape and public calls ask of fields that are not NumPy arrays.
+    """The operations of the tape and of public calls that depend on a type of field other than NumPy arrays.
 
-    The type of such a field has the methods ``gather()`` (the whole field as a NumPy array), ``fingerprint()`` (an int
-    of all bits, the same on all processes), ``astype(dtype)`` and an attribute ``backend``.
+    The type of such a field has the methods ``gather()`` (return the whole field as a NumPy array), ``fingerprint()``
+    (return a hash of all entries, the same on all processes), ``astype(dtype)``, and the attribute ``backend``.
     """
 
     @abstractmethod
     def formulas(self, fun: Callable, value: Any, args: tuple, nums: tuple) -> tuple | None:
-        """Return the VJP and JVP of a call ``value = fun(*args)`` for arguments `nums`; None: use autograd's."""
+        """Return the VJP and JVP of a call ``value = fun(*args)`` for the arguments at positions `nums`.
+
+        Return None to use the formulas of autograd.
+        """
 
     def match(self, derivative: Any, value: Any) -> Any:
-        """Return a derivative in the form (number, array or field) of the value that it belongs to."""
+        """Convert a derivative to the type (number, array or field) of the value that it belongs to."""
         return derivative
 
     def collectively(self, what: str, arguments: Any, act: Callable, *args: Any) -> Any:
@@ -194,11 +205,11 @@ class ArrayKind(ABC):
         return 1
 
 
-ARRAY_KINDS: dict[type, ArrayKind] = {}  # by the type of the fields; empty until fields are distributed
+ARRAY_KINDS: dict[type, ArrayKind] = {}  # type of field -> ArrayKind; empty until distributed fields are used
 
 
 def _type_of(value: Any) -> type:
-    """Return the type of a value, or of the value in its boxes."""
+    """Return the type of a value; of a traced value, the type of the value inside its boxes."""
     while type(value) is BOX:
         value = value._value
     return type(value)
@@ -213,12 +224,12 @@ def array_types() -> tuple[type, ...]:
 
 
 def is_field(value: Any) -> bool:
-    """Return whether a plain value is a number, an array, or a field of any backend."""
+    """Return True if a plain value is a number, an array, or a field of any backend."""
     return isinstance(value, (np.ndarray, Number)) or type(value) in ARRAY_KINDS
 
 
 def backend_of(values: Iterable) -> Backend:
-    """Return the backend of the first plain value that is no NumPy array or number; NUMPY if there is none."""
+    """Return the backend of the first distributed field among plain values; NUMPY if there is none."""
     for value in values:
         if type(value) in ARRAY_KINDS:
             return value.backend
@@ -231,12 +242,12 @@ def as_field(value: Any) -> Any:
 
 
 def gathered(value: Any) -> Any:
-    """Return a plain value; a distributed field as the array of all its entries."""
+    """Return a distributed field as a NumPy array of all its entries, any other plain value unchanged."""
     return value.gather() if type(value) in ARRAY_KINDS else value
 
 
 def replicated(value: Any) -> Any:
-    """Return a value, traced or not; a distributed field as an array that every process holds. Differentiable."""
+    """Return a distributed field, traced or not, as an array on every process; return other values unchanged."""
     kind = ARRAY_KINDS.get(_type_of(value))
     if kind is None:
         return value
@@ -254,7 +265,7 @@ def require_arrays(name: str, values: Iterable) -> None:
 
 
 def formulas_of_kind(fun: Callable, value: Any, args: tuple, nums: tuple) -> tuple | None:
-    """Return the formulas of a call by the first argument that is no NumPy array: see `ArrayKind.formulas`."""
+    """Return `ArrayKind.formulas` of the first argument that is a distributed field; None if there is none."""
     for arg in args:
         kind = ARRAY_KINDS.get(_type_of(arg))
         if kind is not None:
@@ -263,7 +274,7 @@ def formulas_of_kind(fun: Callable, value: Any, args: tuple, nums: tuple) -> tup
 
 
 def match_value(derivative: Any, value: Any) -> Any:
-    """Return a derivative, traced or not, in the form of the value that it belongs to."""
+    """Convert a derivative, traced or not, to the type (number, array or field) of the value that it belongs to."""
     if not ARRAY_KINDS:
         return derivative
     kind = ARRAY_KINDS.get(_type_of(derivative)) or ARRAY_KINDS.get(_type_of(value))
@@ -275,7 +286,7 @@ def match_value(derivative: Any, value: Any) -> Any:
 def collectively(what: str, arguments: Any, act: Callable, *args: Any) -> Any:
     """Return ``act(*args)``, called by all processes that share fields.
 
-    If one of them raises, all raise its error. A tree of arguments must be the same on all of them.
+    If one process raises an error, all processes raise it. The tree `arguments` must be the same on all processes.
     """
     for kind in ARRAY_KINDS.values():
         return kind.collectively(what, arguments, act, *args)
@@ -283,7 +294,7 @@ def collectively(what: str, arguments: Any, act: Callable, *args: Any) -> Any:
 
 
 def process_count() -> int:
-    """Return the number of processes that share the fields of this one."""
+    """Return the number of processes that share fields with this one, itself included."""
     for kind in ARRAY_KINDS.values():
         return kind.process_count()
     return 1

@@ -1,4 +1,4 @@
-"""Derivatives of whole programs: any function of a tree of arrays, forward and backward."""
+"""Derivatives of a function of a tree of arrays, in forward and reverse mode: grad, vjp, jvp, hvp."""
 
 from __future__ import annotations
 
@@ -70,23 +70,24 @@ __all__ = [
     "zero_like",
 ]
 
-# What `pushforward` raises where a rule of this library or of autograd has no JVP.
+# Exceptions of `pushforward` if a rule of this library or of autograd has no JVP.
 NO_JVP = (DerivativeError, NotImplementedError)
 # Advice for a gradient of the wrong shape.
 SPREAD = ": autograd's np.where does not add up what it spreads; multiply by the condition instead, a * c + b * (1 - c)"
-LARGE = 1e100  # cotangents above this overflow in other calls, whose own derivatives are finite
+LARGE = 1e100  # a larger cotangent can overflow in a call whose own derivative is finite
 
 # ---- gradients -------------------------------------------------------------------------------------------------------
 
 
 def grad(loss: Callable, argnum: int = 0) -> Callable:
-    """Return the function that returns the gradient of a scalar loss of a tree; see `value_and_grad`.
+    """Return a function that computes the gradient of a scalar loss; see `value_and_grad`.
 
     Parameters
     ----------
     loss : callable
+        ``loss(x, *rest) -> real scalar``; `x` is any nesting of tuples, lists, dicts and dataclasses of arrays.
     argnum : int
-        Position of the argument `x`.
+        Position of the argument `x`; default: the first.
 
     Returns
     -------
@@ -100,12 +101,12 @@ def grad(loss: Callable, argnum: int = 0) -> Callable:
     ValueError
         If `argnum` is not a whole number >= 0.
     ShapeError, DerivativeError
-        On use, as `value_and_grad`.
+        When the returned function is called, in the same cases as for `value_and_grad`.
 
     Warns
     -----
     NonFiniteGradientWarning
-        If the gradient holds NaN or infinity; it names the call whose derivative is not finite.
+        If the gradient contains NaN or infinity. The warning names the call whose derivative is not finite.
 
     See Also
     --------
@@ -125,38 +126,37 @@ def grad(loss: Callable, argnum: int = 0) -> Callable:
 
 
 def value_and_grad(loss: Callable, argnum: int = 0) -> Callable[..., tuple[Any, Any]]:
-    """Return the function that returns the value and the gradient of a scalar loss of a tree.
+    """Return a function that computes the value and the gradient of a scalar loss.
 
     Parameters
     ----------
     loss : callable
-        ``loss(x, *rest) -> real scalar``; `x` is any nesting of tuples, lists, dicts and
-        dataclasses of arrays.
+        ``loss(x, *rest) -> real scalar``; `x` is any nesting of tuples, lists, dicts and dataclasses of arrays.
     argnum : int
         Position of the argument `x`; default: the first.
 
     Returns
     -------
     callable
-        ``f(*args) -> (value, gradient)``. The gradient has the structure of `x`, each leaf the
-        shape and dtype of the leaf of `x`. Leaves that are not floating (int, bool, None, str) are
-        passed to the loss unchanged; their place in the gradient holds None.
+        ``f(*args) -> (value, gradient)``. The gradient has the tree structure of `x`, and each of its leaves has the
+        shape and dtype of the leaf of `x`. Leaves that are not floating (int, bool, None, str) are passed to the loss
+        unchanged, and the gradient has None in their place.
 
     Raises
     ------
     TypeError
-        If `loss` is not a function; on use, if there is no such argument.
+        If `loss` is not a function, or if the returned function is called with too few arguments.
     ValueError
         If `argnum` is not a whole number >= 0.
     ShapeError
         If the loss is not a scalar.
     DerivativeError
-        If the loss is complex, or `x` holds no floating value.
+        If the loss is complex, or if `x` contains no floating value.
 
     Warns
     -----
     NonFiniteGradientWarning
-        If the gradient holds NaN or infinity; it names the call whose derivative is not finite.
+        If the gradient contains NaN or infinity. The warning names the call whose derivative is not finite.
 
     See Also
     --------
@@ -165,10 +165,10 @@ def value_and_grad(loss: Callable, argnum: int = 0) -> Callable[..., tuple[Any, 
     Notes
     -----
     Complex numbers: the gradient in a complex leaf is dL/dRe - i dL/dIm, see docs/guides/complex_numbers.md.
-    The caller, and the loss between two calls, may write into `x` and into constant arrays (``work[:] = c`` in a loop):
-    what the backward pass needs is copied. An array that is read-only with all its memory is not copied;
-    ``mask.flags.writeable = False`` saves the time of one product with the mask for each call. Other objects,
-    sparse matrices too, must not be changed until the gradient is computed.
+    The loss may write into constant arrays while it runs (``work[:] = c`` in a loop), because the tape copies the
+    values that the backward pass needs. Arrays that are read-only, together with the array that owns their memory, are
+    not copied: ``mask.flags.writeable = False`` saves a copy of the mask, which takes about as long as a product with
+    it, in each call. Other objects, such as sparse matrices, must not be modified until the gradient is computed.
 
     Examples
     --------
@@ -188,7 +188,7 @@ def value_and_grad(loss: Callable, argnum: int = 0) -> Callable[..., tuple[Any, 
 
 
 def _value_and_gradient(loss, argnum, args):
-    """Return the value of a loss, and its gradient in one of its arguments."""
+    """Return the value of a loss, and its gradient with respect to the argument at position `argnum`."""
 
     def of_argument(x):
         return loss(*args[:argnum], x, *args[argnum + 1 :])
@@ -200,8 +200,8 @@ def _value_and_gradient(loss, argnum, args):
         return _value_and_gradient(loss, argnum, args)
 
     try:
-        gradient = pull(np.float64(1.0))  # a number of Python has no entries, which derivatives of it may ask for
-    except NonFiniteError as error:  # a call refused a cotangent, as of a forward argument that the user looks for
+        gradient = pull(np.float64(1.0))  # not a Python float: pullbacks may use its shape and dtype
+    except NonFiniteError as error:  # a pullback got a cotangent that is not finite: name the call that produced it
         if not (thread.quiet or isbox(value)):
             cause = _cause_of_non_finite(again)
             if cause not in (None, str(error)):
@@ -214,7 +214,7 @@ def _value_and_gradient(loss, argnum, args):
 
 
 def check_loss(value: Any) -> None:
-    """Refuse the value of a loss, traced or not, if it is not one real number."""
+    """Raise ShapeError or DerivativeError if the value of a loss, traced or not, is not one real number."""
     if keys(value) is not None:
         raise ShapeError(f"the loss must be a scalar, got a {type(value).__name__}; return one number")
     if np.shape(plain(value)) != ():
@@ -224,20 +224,22 @@ def check_loss(value: Any) -> None:
 
 
 def vjp(fun: Callable, *x: Any) -> tuple[Any, Callable]:
-    """Return the value of a function, and the function from a cotangent to the VJP.
+    """Return the value of a function, and the function that computes the VJP for a cotangent.
 
     Parameters
     ----------
     fun : callable
         ``fun(*x) -> array``.
     *x : trees of arrays
-        Leaves that are not floating (int, None, str) are passed through and get None.
+        Arguments. Leaves that are not floating (int, None, str) are passed to `fun` unchanged, and the cotangent has
+        None in their place.
 
     Returns
     -------
     value : array
     pull : callable
-        ``pull(g)``, with g of the shape of `value`: a cotangent like x; a tuple where there are several arguments.
+        ``pull(g)``, with a cotangent `g` of the shape of `value`, returns the cotangent of `x` as a tree like `x`; if
+        `fun` has several arguments, a tuple with one tree for each of them.
 
     Raises
     ------
@@ -246,12 +248,12 @@ def vjp(fun: Callable, *x: Any) -> tuple[Any, Callable]:
     DerivativeError
         If no leaf of `x` is a floating array or number, or the value of `fun` is not one array.
     ShapeError
-        On use of `pull`, if `g` has another shape than the value.
+        When `pull` is called, if the shape of `g` is not that of the value.
 
     Warns
     -----
     NonFiniteGradientWarning
-        If a result of `pull` holds NaN or infinity; it names the call whose derivative is not finite.
+        If a result of `pull` contains NaN or infinity. The warning names the call whose derivative is not finite.
 
     See Also
     --------
@@ -287,31 +289,32 @@ def vjp(fun: Callable, *x: Any) -> tuple[Any, Callable]:
 
 
 def pullback(fun: Callable, x: Any) -> tuple[Any, Callable]:
-    """Return the value of a function of a tree, and the function from a cotangent to the VJP.
+    """Return the value of a function of one tree, and the function that computes the VJP for a cotangent.
 
     Parameters
     ----------
     fun : callable
         ``fun(x) -> array``.
     x : tree of arrays
-        Leaves that are not floating (int, None, str) are passed through and get None.
+        Leaves that are not floating (int, None, str) are passed to `fun` unchanged, and the cotangent has None in
+        their place.
 
     Returns
     -------
     value : array
     pull : callable
-        ``pull(g)`` has the structure of `x`; `g` has the shape of `value`.
+        ``pull(g)``, with a cotangent `g` of the shape of `value`, returns a tree like `x`.
 
     Raises
     ------
     DerivativeError
         If no leaf of `x` is a floating array or number, or the value of `fun` is not one array.
     ShapeError
-        On use of `pull`, if `g` has another shape than the value.
+        When `pull` is called, if the shape of `g` is not that of the value.
 
     Notes
     -----
-    The caller may write into `x`, the value, `g` and the results: the tape and they share no memory.
+    The caller may write into `x`, the value, `g` and the results, because none of them shares memory with the tape.
 
     Examples
     --------
@@ -351,7 +354,7 @@ def pullback(fun: Callable, x: Any) -> tuple[Any, Callable]:
 
 
 def gradient_of(leaf: Any, cotangent: Any) -> Any:
-    """Return a cotangent as the gradient in a leaf, of its shape and dtype; zeros if there is no cotangent."""
+    """Convert a cotangent to the shape, dtype and type of a leaf; return zeros if the cotangent is None."""
     if cotangent is None:
         return _as_leaf(anp.zeros_like(plain(leaf)), leaf)
     check_shape("the gradient", cotangent, np.shape(leaf), SPREAD)
@@ -359,16 +362,16 @@ def gradient_of(leaf: Any, cotangent: Any) -> Any:
 
 
 def _as_leaf(derivative, leaf):
-    """Return a derivative of a number of Python as such a number, unless it is traced."""
+    """Convert the derivative of a Python float to a Python float, unless it is traced."""
     if isinstance(leaf, float) and not isbox(derivative):
         return float(derivative)
     return derivative
 
 
 def _without_shared_memory(gradients, g):
-    """Copy gradients that share memory with each other or with the cotangent g: the caller may write into one.
+    """Copy gradients that share memory with each other or with the cotangent g, as the caller may modify one of them.
 
-    autograd returns one array for both terms of a sum, and g itself.
+    For a sum, autograd returns g itself as the cotangent of both terms.
     """
     owners = {id(_owner(g))}
     for number, gradient in enumerate(gradients):
@@ -386,7 +389,7 @@ def _owner(value):
 
 
 def _apart_from_caller(value):
-    """Return an array as it is now: pullbacks need it, and the caller may write into it before they run."""
+    """Copy an array that is not immutable, because the caller may write into it before the pullbacks use it."""
     if isinstance(value, np.ndarray) and not is_fixed(value):
         return value.copy("K")
     return value
@@ -405,11 +408,11 @@ class Tape(NamedTuple):
     rebuild : callable
         Builds the result from its leaves.
     ends : list
-        Nodes of the leaves of the result, or None.
+        For each leaf of the result its node, or None if it does not depend on a variable.
     nodes : list
-        Of all calls.
+        Nodes of all calls, in order.
     roots : list
-        Nodes of the leaves of the tree, or None.
+        For each leaf of the argument its node, or None if it is not a variable.
     """
 
     values: list
@@ -419,7 +422,7 @@ class Tape(NamedTuple):
     roots: list
 
     def pull(self, cotangents: Sequence) -> list:
-        """Return a cotangent for each leaf of the tree, or None, from those of the leaves of the result."""
+        """Return the cotangents of the leaves of the argument (or None), given those of the leaves of the result."""
         sums: dict = {}
         backward(self.nodes, self.ends, cotangents, sums)
         cotangents = []
@@ -440,7 +443,7 @@ def taped(fun: Callable, tree: Any, moving: Iterable, *witnesses: Callable) -> T
     moving : iterable of bool
         For each leaf of the tree, whether it is a variable.
     *witnesses : callables
-        Called for every node, see `Recorder`.
+        Callbacks that are called for every node, see `Recorder`.
     """
     recorder = Recorder(*witnesses)
     roots: list = []
@@ -454,7 +457,7 @@ def taped(fun: Callable, tree: Any, moving: Iterable, *witnesses: Callable) -> T
     finally:
         nodes = recorder.taken()
         recorder.ended = True
-        recorder.witnesses = ()  # a witness that keeps nodes would be a reference cycle
+        recorder.witnesses = ()  # a callback that stores nodes would form a reference cycle with the recorder
     return Tape(values, rebuild, ends, nodes, roots)
 
 
@@ -466,14 +469,14 @@ def traced(fun: Callable, tree: Any, roots: Sequence) -> tuple[list, list, Calla
     values : list
         Leaves of the result.
     nodes : list
-        Of the leaves of the result, or None.
+        For each leaf of the result its node, or None if it is not traced.
     rebuild : callable
         Builds the result from its leaves.
 
     Raises
     ------
     DerivativeError
-        If NumPy, math or Python refuse a traced value.
+        If `fun` passes a traced value to a function that does not accept it, such as those of NumPy or math.
     """
     entries, rebuild = flatten(tree)
     number = new_trace()
@@ -482,7 +485,7 @@ def traced(fun: Callable, tree: Any, roots: Sequence) -> tuple[list, list, Calla
         values, nodes = split_boxes(ends, number)
         return values, nodes, build
     except (TypeError, ValueError, AttributeError) as error:
-        texts = str(error), str(error.__cause__)  # u[0] = traced: NumPy hides the reason in the cause
+        texts = str(error), str(error.__cause__)  # for u[0] = traced only the cause mentions the traced value
         if isinstance(error, SparsedpError) or not any("ArrayBox" in text for text in texts):
             advise(error)
             raise
@@ -520,25 +523,26 @@ def jvp(fun: Callable, x: Any, tangent: Any) -> tuple[Any, Any]:
     fun : callable
         ``fun(x)``; its result may be a tree.
     x, tangent : trees of arrays of the same structure
-        The tangent of a leaf that is not floating is ignored.
+        The point and the direction. The tangent of a leaf that is not floating is ignored.
 
     Returns
     -------
     value : tree
+        The value ``fun(x)``.
     tangent : tree
-        Of the value.
+        Directional derivative of the value, a tree like it.
 
     Raises
     ------
     TypeError
         If `fun` is not a function.
     ShapeError
-        If the tangent has another structure than `x`, or a leaf of it another shape.
+        If the tangent differs from `x` in tree structure, or a leaf of it in shape.
 
     Warns
     -----
     NonFiniteGradientWarning
-        If the derivative holds NaN or infinity; it names the call whose derivative is not finite.
+        If the derivative contains NaN or infinity. The warning names the call whose derivative is not finite.
 
     See Also
     --------
@@ -546,7 +550,7 @@ def jvp(fun: Callable, x: Any, tangent: Any) -> tuple[Any, Any]:
 
     Notes
     -----
-    Forward mode, or two reverse passes if a part of `fun` has no forward derivative.
+    Uses forward mode, or two reverse passes if a part of `fun` has no JVP.
     Complex numbers: see docs/guides/complex_numbers.md.
 
     Examples
@@ -560,29 +564,29 @@ def jvp(fun: Callable, x: Any, tangent: Any) -> tuple[Any, Any]:
 
 
 def hvp(loss: Callable, x: Any, tangent: Any) -> Any:
-    """Return the Hessian of a scalar loss of a tree times a direction.
+    """Return the product of the Hessian of a scalar loss and a direction.
 
     Parameters
     ----------
     loss : callable
         ``loss(x) -> real scalar``.
     x, tangent : trees of arrays of the same structure
-        The tangent of a leaf that is not floating is ignored.
+        The point and the direction. The tangent of a leaf that is not floating is ignored.
 
     Returns
     -------
     tree like x
-        None at leaves that are not floating.
+        The product, with None in place of leaves that are not floating.
 
     Raises
     ------
     TypeError, ShapeError, DerivativeError
-        As `jvp` and `value_and_grad`.
+        In the same cases as for `jvp` and `value_and_grad`.
 
     Warns
     -----
     NonFiniteGradientWarning
-        If the product holds NaN or infinity; it names the call whose derivative is not finite.
+        If the product contains NaN or infinity. The warning names the call whose derivative is not finite.
 
     See Also
     --------
@@ -601,7 +605,7 @@ def hvp(loss: Callable, x: Any, tangent: Any) -> Any:
 
 
 def _jvp(name, fun, x, tangent):
-    """Return what `jvp` returns; the public function of this name warns if the derivative is not finite."""
+    """Return the results of `jvp`; `name` is the public function that a warning of a non-finite derivative names."""
     check_native("jvp", *leaves((x, tangent)))
     check_leaves("x", x)
     check_leaves("tangent", tangent)
@@ -618,12 +622,12 @@ def _jvp(name, fun, x, tangent):
 
 
 def pushforward(fun: Callable, x: Any, tangent: Any) -> tuple:
-    """Return what `jvp` returns, in forward mode only, and without copies.
+    """Return the results of `jvp`, computed in forward mode only, and without copying them.
 
     Raises
     ------
     DerivativeError
-        Or another type of NO_JVP, if a part of `fun` has no forward derivative.
+        If a part of `fun` has no JVP. It may also be another exception type of NO_JVP.
 
     Examples
     --------
@@ -635,7 +639,7 @@ def pushforward(fun: Callable, x: Any, tangent: Any) -> tuple:
 
 
 def _directions(x, tangent):
-    """Return the tangent of each leaf of `x`, None where the leaf is not floating."""
+    """Return the list of the tangents of the leaves of `x`, with None for leaves that are not floating."""
     entries = leaves(x)
     tangents = paired(tangent, x, "tangent", advice="; give a tangent like x")
     for number, leaf in enumerate(entries):
@@ -652,19 +656,19 @@ def _directions(x, tangent):
 def push(fun: Callable, tree: Any, tangents: Sequence) -> tuple:
     """Return the value of a function of a tree, and its tangent.
 
-    Forward mode, or two reverse passes if a part of `fun` has no JVP.
+    Uses forward mode, or two reverse passes if a part of `fun` has no JVP.
 
     Parameters
     ----------
     fun : callable
     tree : tree
     tangents : sequence
-        For each leaf of the tree, or None.
+        For each leaf of the tree its tangent, or None for a constant.
 
     Returns
     -------
     value, tangent : trees
-        The tangent is None at leaves that are not floating.
+        The tangent has None in place of leaves that are not floating.
     """
     try:
         return forward(fun, tree, tangents)
@@ -686,7 +690,7 @@ def forward(fun: Callable, x: Any, tangents: Sequence) -> tuple:
 
 
 def tangent_of(value: Any, slope: Any) -> Any:
-    """Return the tangent of a result in its dtype: zero for a constant result, None if it is not floating."""
+    """Return the tangent of a result in the dtype of the result; zeros for a constant, None if it is not floating."""
     if not is_variable(value):
         return None
     if slope is None:
@@ -702,8 +706,8 @@ def zero_like(value: Any) -> Any:
 def _twice_reverse(fun, tree, tangents):
     """Return the value of a function, and its tangent by two reverse passes.
 
-    The pullback of a cotangent z, J^T z, is linear, so the gradient in z of <J^T z, tangent> is J tangent. It is
-    evaluated at random z: a rule may branch on a cotangent of zero, and then has no derivative there.
+    The pullback z -> J^T z is linear, so the gradient of <J^T z, tangent> with respect to z is J tangent for every z.
+    It is evaluated at a random z and not at zero, because a rule may have a special branch for zero cotangents.
     """
     tape = taped(fun, tree, [tangent is not None for tangent in tangents])
     moving = [is_variable(value) for value in tape.values]
@@ -721,7 +725,7 @@ def _twice_reverse(fun, tree, tangents):
 
 
 def _random_like(value):
-    """Return plain numbers of the shape and dtype of a value, the same in every run."""
+    """Return random numbers of the shape and dtype of a value, the same in every run."""
     numbers = np.random.default_rng(0).uniform(0.5, 1.5, np.shape(plain(value)))
     return np.asarray(numbers, dtype_of(value))[()]
 
@@ -731,7 +735,7 @@ def _random_like(value):
 
 @contextmanager
 def unwarned() -> Iterator[None]:
-    """Suppress warnings of derivatives that are not finite inside a `with` block: the caller handles them."""
+    """Suppress NonFiniteGradientWarning inside a `with` block, for callers that check derivatives themselves."""
     thread.quiet += 1
     try:
         yield
@@ -740,14 +744,14 @@ def unwarned() -> Iterator[None]:
 
 
 def _warn_unless_finite(name, derivative, again):
-    """Warn of NaN or infinity in a derivative, with the name of the call it comes from.
+    """Warn of NaN or infinity in a derivative, and name the call that produced it.
 
     Parameters
     ----------
     name : str
-        Of the public function that returns the derivative.
+        Name of the public function that returns the derivative.
     derivative : tree
-        Traced ones belong to an outer derivative, which is examined itself.
+        Not checked if it has traced leaves, because then the outer derivative is checked.
     again : callable
         ``again()`` computes the derivative again, in reverse mode.
     """
@@ -769,13 +773,15 @@ def _warn_unless_finite(name, derivative, again):
 
 
 def is_finite(value: Any) -> bool:
-    """Whether an array or number, plain or traced, holds neither NaN nor infinity."""
+    """Return True if an array or number, plain or traced, contains neither NaN nor infinity."""
     value = plain(value)
     return surely_finite(value) or bool(np.all(np.isfinite(value)))
 
 
 def _cause_of_non_finite(again):
-    """Name the first call whose own derivative is not finite; None if there is no such call, or with several processes.
+    """Return a message that names the first call in the backward pass whose own derivative is not finite.
+
+    Return None if there is no such call, or if several processes share the fields.
 
     Parameters
     ----------
@@ -789,7 +795,7 @@ def _cause_of_non_finite(again):
             again()
     except NonFiniteError as error:
         return str(error)
-    except Exception:  # a function that cannot run twice
+    except Exception:  # the function may fail when it is run a second time
         pass
     return None
 
@@ -798,7 +804,8 @@ def _cause_of_non_finite(again):
 def checking_derivatives() -> Iterator[None]:
     """Raise NonFiniteError inside a `with` block for the first call whose own derivative is NaN or infinite.
 
-    A call whose cotangent is NaN or LARGE is not to blame. For a second run, after a gradient was not finite.
+    Calls that get a cotangent with NaN or with entries above `LARGE` are not checked, since their own derivative may be
+    finite. Used in a second run, after a gradient was not finite.
     """
 
     def see(node, fun, value, args, options, nums):
@@ -819,7 +826,7 @@ def checking_derivatives() -> Iterator[None]:
 
 
 def _check_derivative(name, argument, cotangent):
-    """Refuse a cotangent of an argument of a call that is not finite."""
+    """Raise NonFiniteError if the cotangent of an argument of a call is not finite."""
     if not is_variable(cotangent):
         return
     finite = np.isfinite(plain(cotangent))
@@ -831,7 +838,7 @@ def _check_derivative(name, argument, cotangent):
 
 
 def name_of(subject: Any) -> Any:
-    """Return the name under which a user knows a rule, an Operator or a function of autograd."""
+    """Return the name of a rule, an Operator or a function of autograd for error messages."""
     return getattr(subject, "name", None) or getattr(subject, "__name__", type(subject).__name__)
 
 
@@ -839,7 +846,7 @@ def name_of(subject: Any) -> Any:
 
 
 def entrywise(name: str, value: Callable, slopes: Callable) -> Rule:
-    """Return the rule of a function of two fields that acts entry by entry.
+    """Return a rule for an elementwise function of two fields.
 
     Parameters
     ----------
@@ -847,7 +854,7 @@ def entrywise(name: str, value: Callable, slopes: Callable) -> Rule:
     value : callable
         ``value(a, b)``.
     slopes : callable
-        ``slopes(a, b)``: the derivatives in both arguments, also for traced values.
+        ``slopes(a, b)`` returns the derivatives with respect to `a` and `b`; it must accept traced values.
     """
 
     def vjp(nums, ans, a, b):
@@ -862,9 +869,9 @@ def entrywise(name: str, value: Callable, slopes: Callable) -> Rule:
 
 
 def of_argument(cotangent: Any, value: Any) -> Any:
-    """Return a cotangent of a product of fields in the form of an argument.
+    """Convert a cotangent of a product of fields to the shape of an argument, and to real if the argument is real.
 
-    It is summed over batches, and for a real argument its real part is taken.
+    A batch axis that the argument does not have is summed over.
     """
     cotangent = match_value(cotangent, value)
     while np.ndim(cotangent) > np.ndim(value):

@@ -1,10 +1,11 @@
-"""Constants of a tape: what the backward pass needs of the caller's arrays, as they were at the call.
+"""Constants of a tape: copies of the arrays that are not traced, for the backward pass.
 
-A pullback runs later than its call, and the caller may have written into an array in between (`work[:] = c` in a
-loop). So every array in a node of a tape that is not traced is replaced by a read-only copy.
+A pullback runs later than the call that it belongs to, and the caller may have written into an array in between
+(`work[:] = c` in a loop). So each array in a node of a tape that is not traced is replaced by a read-only copy.
 
-A large array that many nodes use is copied once: the last copy of such a view is kept in a table and compared with the
-array bit by bit. That takes as long as a copy and saves the memory. Copies live as long as the tapes that hold them.
+If many nodes use the same large array, it is copied only once: a table holds the last copy of the array, which is
+compared with the array bit by bit. The comparison takes as long as a copy, but saves memory. The table holds weak
+references, so that a copy is freed together with the tapes that use it.
 """
 
 from __future__ import annotations
@@ -22,19 +23,20 @@ if TYPE_CHECKING:
 
 __all__ = ["FIXED", "constant", "constant_args", "frozen", "is_fixed", "sparing"]
 
-SMALL = 2**16  # bytes up to which a copy takes less time than a comparison with an earlier one
-CHUNK = 2**15  # entries that are compared at once: two such parts stay in the cache of a core
-LONGEST = 8  # bytes of the longest integer, as which bits are compared
+SMALL = 2**16  # smaller arrays (bytes) are copied at once, because a comparison with an earlier copy takes longer
+CHUNK = 2**15  # number of entries that are compared at a time, so that both parts fit into the cache of a core
+LONGEST = 8  # bytes of the longest integer type; bits are compared as integers
 FIXED = {float, int, bool, str, slice, type(None), type(Ellipsis), np.float64}  # types of immutable values
 
-# Functions whose pullbacks need no numbers of their constants, and those that call `constant_args`.
+# Functions whose constant arguments need not be copied: the pullback does not read the values of the constants, or the
+# function itself calls `constant_args`.
 sparing: set[Callable] = set()
-# (id of the owner, shape, strides) of an array -> its last copy
+# (id of the array that owns the memory, shape, strides) -> last copy
 copies: WeakValueDictionary = WeakValueDictionary()
 
 
 def constant_args(args: Sequence, nums: Sequence[int]) -> Any:
-    """Return the arguments of a call, those that are not traced (not at the positions `nums`) as constants."""
+    """Return the arguments of a call with constant copies of those that are not traced (not at positions `nums`)."""
     constants: list | None = None
     for num, arg in enumerate(args):
         if type(arg) in FIXED or num in nums:
@@ -50,9 +52,9 @@ def constant_args(args: Sequence, nums: Sequence[int]) -> Any:
 
 
 def constant(value: Any) -> Any:
-    """Return a value in read-only arrays; also inside tuples, lists, dicts and dataclasses.
+    """Return a copy of a value whose arrays, also inside tuples, lists, dicts and dataclasses, are read-only.
 
-    Immutable arrays are returned as they are. Other objects must not be changed by their owner.
+    Immutable arrays and objects of other types are returned without a copy. The caller must not modify the latter.
 
     Examples
     --------
@@ -72,8 +74,8 @@ def constant(value: Any) -> Any:
     if kind is tuple or kind is list:
         return kind(map(constant, value))
     if isinstance(value, dict):
-        constants = copy(value)  # it may have an order of its own, or a default
-        for name, entry in value.items():  # not by update: that of a Counter adds
+        constants = copy(value)  # keep subclasses such as OrderedDict and defaultdict
+        for name, entry in value.items():  # not `update`, because Counter.update adds the values
             constants[name] = constant(entry)
         return constants
     if isinstance(value, tuple) and hasattr(kind, "_fields"):
@@ -85,7 +87,7 @@ def constant(value: Any) -> Any:
 
 
 def is_fixed(array: np.ndarray) -> bool:
-    """Whether an array is immutable. A read-only view of a writeable array is not."""
+    """Return True if no one can write into an array: the array and all its bases are read-only."""
     owner: Any = array
     while isinstance(owner, np.ndarray):
         if owner.flags.writeable:
@@ -95,7 +97,7 @@ def is_fixed(array: np.ndarray) -> bool:
 
 
 def frozen(value: Any) -> Any:
-    """Return an array as a read-only view; all else as it is."""
+    """Return a read-only view of an array; return other values unchanged."""
     if type(value) is not np.ndarray:
         return value
     view = value.view()
@@ -104,7 +106,7 @@ def frozen(value: Any) -> Any:
 
 
 def _copied(value):
-    """Return a read-only copy of an array, if possible one that exists."""
+    """Return a read-only copy of an array; reuse the last copy if it has the same bits."""
     if value.nbytes <= SMALL or value.dtype.kind not in "biufc" or value.real.itemsize > LONGEST:
         return _frozen_copy(value)
     owner = value if value.base is None else value.base
@@ -123,7 +125,10 @@ def _frozen_copy(value):
 
 
 def _same_bits(earlier, value):
-    """Whether two arrays of one shape hold the same bits: 0.0 and -0.0 have different reciprocals."""
+    """Return True if two arrays of equal shape have the same bits.
+
+    `==` is not enough, because 0.0 == -0.0 and their reciprocals differ.
+    """
     if earlier.dtype != value.dtype or type(earlier) is not type(value):
         return False
     if value.dtype.kind == "c":

@@ -1,4 +1,4 @@
-"""stepper(): a step for time loops from a rate of change and a method; and the largest stable explicit step."""
+"""stepper() builds a time step from a rate of change and a method; largest_step() bounds a stable explicit step."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 __all__ = ["METHODS", "Step", "stepper"]
 
-# The arguments that each method does not use; further options are for the methods of IMPLICIT.
+# The arguments that each method does not use. Only the methods of IMPLICIT take further options.
 UNUSED = {
     **dict.fromkeys(EXPLICIT, ("jacobian", "damping")),
     **dict.fromkeys((*IMPLICIT, "radau"), ("damping",)),
@@ -52,10 +52,10 @@ UNUSED = {
     "leapfrog": ("linear", "source", "timed", "tolerance", "max_step", "breaks", "events", "jacobian"),
 }
 METHODS = tuple(UNUSED)
-KEPT = 2  # set-ups of linear steps
-KEPT_WITH_TOLERANCE = 12  # with error control
-ROUNDING = 1e-12  # a step at the limit may lie beyond it by rounding
-DENSE_UP_TO = 64
+KEPT = 2  # number of cached set-ups of linear solves, one for each step length
+KEPT_WITH_TOLERANCE = 12  # the same with error control, where step lengths vary
+ROUNDING = 1e-12  # relative tolerance of the stability limit, so that a dt equal to it is accepted despite rounding
+DENSE_UP_TO = 64  # eigenvalues of matrices up to this size are computed by a dense solver
 
 
 def stepper(
@@ -79,102 +79,113 @@ def stepper(
     maxiter: int | None = None,
     **options: Any,
 ) -> Step:
-    """Return a step for time loops: the state after a time dt, differentiable in state, params and dt.
+    """Return a time step: a function that advances a state by dt, differentiable in state, params and dt.
 
     Parameters
     ----------
     method : str
         ======================= ===== ==============================================================
-        euler heun ssprk3 rk4   1-4   explicit: cheap where nothing is stiff
-        backward_euler          1     L-stable: any dt, stiff components decay
-        crank_nicolson          2     any dt, but stiff components keep their size and change sign (they ring)
-        tr_bdf2                 2     L-stable, two stages with one factor
+        euler heun ssprk3 rk4   1-4   explicit: the cheapest methods for problems that are not stiff
+        backward_euler          1     L-stable: stable for any dt, and stiff components decay
+        crank_nicolson          2     stable for any dt, but stiff components keep their size and change sign each step
+        tr_bdf2                 2     L-stable, two stages that share one factorisation
         imex                    2     `linear` and source implicit (L-stable), the rate explicit
-        radau                   5     L-stable, full LU: for stiff systems of up to 500 unknowns, best with a tolerance
+        radau                   5     L-stable, dense LU: for stiff systems of up to 500 unknowns, best with a tolerance
         etdrk4                  4     `linear` exact by transforms (separable operators), the rate explicit
-        leapfrog                2     waves: two fields, each moved by the other, half a step apart; reversible
+        leapfrog                2     waves: two staggered fields, the rate of each depends on the other; reversible
         ======================= ===== ==============================================================
     rate : callable or Operator
-        u' = ``rate(u, params)``, or ``rate(u, params, t)``: then the state is the pair (u, t). Written with
-        autograd.numpy, Operators and other rules; u an array or a tree of arrays. An Operator L means
-        u' = c L u, with the number c >= 0 as params (None: 1). Values that change from call to call belong into
-        params: implicit methods run the rate again in the backward pass.
-        leapfrog: a pair of rates, p' = ``f(q, params)`` and q' = ``g(p, params)``, for the state (p, q): p at the
-        times of the steps, q half a step before, on entry and on return.
+        The rate of change of the state: u' = ``rate(u, params)``, or ``rate(u, params, t)`` if it depends on the time;
+        the state is then the pair (u, t). Write it with autograd.numpy, Operators and other rules; u is an array or a
+        tree of arrays. An Operator L stands for u' = c L u, where params is the number c >= 0 (None: c = 1). Pass
+        values that change from call to call in params, because implicit methods evaluate the rate again in the
+        backward pass.
+        leapfrog takes a pair of rates, p' = ``f(q, params)`` and q' = ``g(p, params)``, for the state (p, q). p is
+        given and returned at the times of the steps, q half a step earlier.
     dt : float, traced number, or function of params
-        Length of a step [time], > 0. To differentiate in dt inside a loop write ``lambda params: params["dt"]``.
+        Length of a step [time], > 0. To differentiate with respect to dt inside a loop write
+        ``lambda params: params["dt"]``.
     linear : Operator or (Operator, coefficient), or a tree of these like the state, optional
-        A term c L u beside the rate; `coefficient` is a number >= 0 or a function of params. Each field of a tree has
-        its own, or None (or 0): ``{"u": (L, 0.1), "v": (L, lambda p: p["D"]), "w": None}``. A pair with a number is one
-        term, so for a state of two fields, the second without one, write ``[L, None]``. Also L may be ``-1.0 * L @ L``,
-        a `function` of an operator, or a `diagonal`. Set-ups are shared by fields with the same L and c.
+        A stiff term c L u that is added to the rate; `coefficient` is the number c >= 0 or a function of params that
+        returns it. In a state that is a tree, each field has its own term, or None (or 0) for no term:
+        ``{"u": (L, 0.1), "v": (L, lambda p: p["D"]), "w": None}``. A pair of an Operator and a number is one term. So
+        for a state of two fields, of which the second has no term, write ``[L, None]``. L may also be
+        ``-1.0 * L @ L``, a `matrix_function` of an operator, or a `diagonal`. Fields with the same L and c share the
+        set-up of the solver.
     source : callable, optional
-        ``source(params)`` or ``source(params, t)``: a term that does not depend on u, such as nu D(B(values)) of walls
-        that move, with B a `lift`; implicit methods keep their order with it, imex and etdrk4 too. A problem of
-        operator and source only is linear: one set-up for each c dt serves all stages, steps and adjoint solves.
+        ``source(params)`` or ``source(params, t)``: a term that does not depend on u and is added to the rate, such as
+        nu D(B(values)) for moving walls, where B is a `lift`. All implicit methods, imex and etdrk4 keep their order
+        with it. A problem with only an operator and a source is linear: one set-up of the solver for each value of
+        c dt is used by all stages, steps and adjoint solves.
     timed : bool, optional
-        Whether rate or source takes the time; default: by its number of arguments.
+        Whether rate or source takes the time; default: decided by its number of arguments.
     tolerance : float, optional
-        Error control: dt is an interval, crossed in as many steps as keep the relative error of each below
-        this; `step.taken` lists them. Derivatives are controlled too: right to about this, or refused. Jumps of the
-        rate are looked for; values across them meet the tolerance, and derivatives are refused without `breaks` or
-        `events`.
+        Turns on error control: dt becomes an interval, which is divided into steps whose relative errors stay below the
+        tolerance; `step.taken` lists the steps. The error of a derivative is also estimated: the derivative is correct
+        to about the tolerance, or a DerivativeError is raised. Jumps of the rate are detected; the values of a step
+        across a jump meet the tolerance, but its derivative raises a DerivativeError unless the jump is given by
+        `breaks` or `events`.
     floor : number or tree like u, optional
-        Errors are relative to |u| + floor. Default: a tenth of the largest entry of each array. An array that
-        decays to zero is then resolved at every size, in many steps: give the size below which it no longer
-        matters. Where entries of very different size matter (species of 1 and 1e-5), give one for each. An array that
-        stays 0 until its rate sets in needs a floor, or that time in `breaks`. In a tree
-        entries of dicts are paired by key, and a number or None may stand for a whole branch.
+        Errors are relative to |u| + floor. Default: a tenth of the largest entry of each array. With the default an
+        array that decays to zero is resolved to the same relative error however small it is, which takes many steps;
+        to avoid this give the size below which its values do not matter. If entries of very different size matter
+        (species with values of 1 and 1e-5), give an array with a floor for each. An array that is 0 until its rate
+        becomes nonzero needs a floor, or the time of this change in `breaks`. In a tree, entries of dicts are paired
+        by key, and a number or None may stand for a whole branch.
     max_step : float, optional
-        Longest step that error control may take. Shorten it where something brief (a pulse, a spike of the rate) could
-        fall between two evaluations of the rate.
+        Longest step that error control may take. Reduce it if a short pulse or spike of the rate could lie between two
+        evaluations of the rate and thus be missed.
     breaks : sequence of float, or callable, optional
-        Times at which the rate, or its derivative, jumps; or ``breaks(params)``, which returns such times. Steps end
-        there, and the rate is evaluated at the last time before a break and at the first one after it, so that
-        ``np.where(t < params["off"], 1.0, 0.0)`` has the intended value on both sides. Times returned by a function are
-        differentiated. Any order; times outside of the interval (t, t + dt] and repeated constants are ignored. Needs
-        a tolerance. The state is the pair (u, t).
+        Times at which the rate, or its derivative, jumps; or a function ``breaks(params)`` that returns such times.
+        Steps end at these times. The rate is evaluated at the last floating-point time before a break and at the first
+        one after it, so that ``np.where(t < params["off"], 1.0, 0.0)`` has the intended value on both sides. The state
+        is differentiated with respect to times that a function returns. The times may be in any order; times outside
+        the interval (t, t + dt] and repeated constants are ignored. Needs a tolerance. The state is the pair (u, t).
     events : callable, pair (callable, jump), or list of these, optional
-        Functions ``event(u, params)`` or ``event(u, params, t)`` whose zeros are located, and stop a step. The step
-        then goes on with the state that ``jump(u, params)`` or ``jump(u, params, t)`` returns, and without a jump with
-        the state as it is: for a rate that switches where the event is 0. Two attributes of the function, as of
-        SciPy's `solve_ivp`: ``event.terminal = True`` ends the interval there, so that the time returned beside
-        the state is the time of the event; with ``event.direction`` > 0 (< 0) only zeros from negative to positive
-        (from positive to negative) count. Needs a tolerance. The state is the pair (u, t).
+        Functions ``event(u, params)`` or ``event(u, params, t)``. A zero of such a function in the interval is located,
+        and a step ends there. The integration then continues from the state that ``jump(u, params)`` or
+        ``jump(u, params, t)`` returns. Without a jump it continues from the same state; this is for a rate that has a
+        jump where the event function is 0. As in SciPy's `solve_ivp` the function may have two attributes. With
+        ``event.terminal = True`` the interval ends at the event, and the time returned with the state is the time of
+        the event. With ``event.direction`` > 0 (< 0) only zeros from negative to positive (from positive to negative)
+        are used. Needs a tolerance. The state is the pair (u, t).
     unstable : "raise" or "allow"
-        Explicit steps of an Operator whose spectrum is known, and leapfrog, for which it is estimated once for each
-        content of dt and params: refuse a dt beyond the stable limit, or take it.
+        Whether a dt beyond the stability limit raises an UnstableStepError. The limit is known for explicit steps of an
+        Operator with a known spectrum, and for leapfrog, where it is estimated once for each dt and params.
     jacobian : callable, optional
-        ``jacobian(u, params)`` (or with t): the derivative of the rate in u, for implicit steps of a
-        nonlinear rate. Default: found by colouring; by radau from one tape, for Newton's method alone.
+        ``jacobian(u, params)`` or ``jacobian(u, params, t)``: the derivative of the rate with respect to u, for
+        implicit steps of a nonlinear rate. By default it is computed by automatic differentiation, with a colouring of
+        its sparsity pattern. radau computes it from one tape by default, and uses it only in Newton's method.
     damping : pair, optional
-        Of leapfrog: the rates at which both fields decay [1 / time], such as `sponge` returns; None for none.
+        For leapfrog: the decay rates [1 / time] of the two fields, for example the pair that `sponge` returns. Default:
+        no damping.
     solver, rtol, maxiter, **options
-        `method`, tolerance and options of `inverse` (linear problems) or `implicit` (nonlinear ones).
+        `method`, tolerance and options of `inverse` (linear problems) or `implicit` (nonlinear problems).
 
     Returns
     -------
     Step
-        ``step(state, params=None)``; with an input of `rollout`, ``step(state, params, input)``: the rate gets
-        the pair (params, input) as params. `step.info` holds the records of its solves.
+        ``step(state, params=None)``. In a `rollout` with inputs it is called as ``step(state, params, input)``, and the
+        rate then gets the pair (params, input) as its params. `step.info` holds the records of its solves.
 
     Raises
     ------
     ValueError
         If the method or a setting is unknown, dt <= 0, or a coefficient is negative.
     TypeError
-        If rate, linear or source has another type; on use, if `linear` is not a tree like the state.
+        If rate, linear or source has a wrong type; when the step is called, if `linear` is not a tree like the state.
     NonFiniteError
-        If dt, state or params holds NaN or infinity, or the new state would.
+        If dt, state, params or the new state contains NaN or infinity.
     UnstableStepError
-        On use, if an explicit step is beyond the stable limit of the operator, or one of leapfrog beyond its own; or if
-        the operator of an implicit one makes fields grow faster than the step can follow, as -laplacian does.
+        When the step is called: if dt exceeds the stability limit of an explicit step or of leapfrog, or if the
+        operator of an implicit step makes fields grow too fast for this dt, as -laplacian does.
     ConvergenceError
-        On use, if a solve fails, or no step meets the tolerance, or an event occurs again and again at one time.
+        When the step is called: if a solve does not converge, if no step length meets the tolerance, or if an event
+        occurs again and again at the same time.
     DerivativeError
-        On use of a derivative, if the tolerance is too coarse for it; if the rate jumps where there is neither a break
-        nor an event, or changes faster than the steps resolve; if an event grazes its surface, so that its time
-        has no derivative; if two differentiated breaks coincide.
+        When a derivative is computed: if the tolerance is too coarse for it; if the rate has a jump that is given
+        neither by a break nor by an event, or changes faster than the steps resolve; if the solution only touches the
+        surface of an event, so that the time of the event has no derivative; if two differentiated breaks coincide.
 
     See Also
     --------
@@ -182,7 +193,7 @@ def stepper(
 
     Notes
     -----
-    Arguments by method. One that the method does not use is refused.
+    The table lists which methods accept an argument. Other methods raise a TypeError for it.
 
     ==================================  ===========  ================================================================
     arguments                           default      methods
@@ -193,34 +204,42 @@ def stepper(
     unstable                            "raise"      all; it has an effect on euler, heun, ssprk3, rk4, leapfrog
     jacobian                            None         backward_euler, crank_nicolson, tr_bdf2, radau; no effect on imex
     damping                             None         leapfrog
-    solver                              "auto"       all; radau takes "auto" and "direct" alone
+    solver                              "auto"       all; radau accepts only "auto" and "direct"
     rtol, maxiter                       1e-10, None  all; they have an effect on solves
     options of `inverse` or `implicit`  none         backward_euler, crank_nicolson, tr_bdf2, imex
     ==================================  ===========  ================================================================
 
-    Formula: derivatives are those of the discrete step. A linear stage x of (1 - z L) x = b, z = c dt, has
-    b_bar = y, z_bar = y . L x with (1 - z L)^T y = g; a nonlinear one is a root, see `implicit`.
-    A coefficient of 0 leaves the state as it is, bit for bit, without set-up or solve.
-    With a tolerance each step is extrapolated from two half steps and a whole one (not crank_nicolson), and its length
-    follows fast changes of a continuous rate whose time moves with the params. The rate is also evaluated at the ends
-    and in the middle of each step, and if it takes the time, at about 200 times in an interval at most: a step across a
-    jump or a pulse is shortened. The derivative belongs to these steps; the contribution of the extrapolation to
-    it, relative to the params and to its largest entry, must stay below 6 tolerance^(p / (p + 1)), p the
-    order (crank_nicolson: below 10 tolerance). Derivatives that are small because terms cancel may be refused, too.
-    radau compares with an embedded formula instead (p = 3 in that bound), and has first derivatives only.
+    Derivatives are those of the discrete step. A linear stage solves (1 - z L) x = b with z = c dt. Its cotangents are
+    b_bar = y and z_bar = y . L x, where (1 - z L)^T y = g. A nonlinear stage is a root, see `implicit`.
+    If a coefficient is 0, the stiff term leaves the state unchanged bit for bit, without set-up or solve.
+
+    Error control: each step is extrapolated from two half steps and a whole step (not crank_nicolson). The derivatives
+    of the step lengths take into account that fast changes of a continuous rate occur at times that depend on params.
+    The rate is also evaluated at both ends and in the middle of each step and, if it depends on the time, at about 200
+    more times in an interval at most; steps across a jump or a pulse are shortened. The derivative is that of these
+    steps. The contribution of the extrapolation to it, relative to the params and to its largest entry, must be less
+    than 6 tolerance^(p / (p + 1)) with the order p (crank_nicolson: less than 10 tolerance); otherwise a
+    DerivativeError is raised. This may also happen for a derivative that is small because terms cancel. radau uses an
+    embedded formula instead of the extrapolation (p = 3 in the bound), and has only first derivatives.
+
     Cost: n linear steps and their gradient take one set-up and 2 n solves (tr_bdf2: 4 n). With a tolerance a gradient
-    takes about six times the steps of its value: three times as long as without this check. radau takes three
-    Jacobians for the derivative of a step, those of many steps together, and one rule on the tape for an interval: a
-    gradient takes 1.5 to 3.2 times the time of its value, and 3 to 5 times where the rate is written for vectors.
-    Breaks and events: with f_- and f_+ the rates before and after a break b, du/db = f_- - f_+ there. The time of an
-    event g = 0 has the derivative of the implicit function theorem, -(g_u du + g_p dp + g_t dt) / (g_u f + g_t), of
-    the step that ends there, located by Brent's method to rounding (implicit methods: to `rtol`). All orders, and in
-    rollouts under any memory; radau: first derivatives. Zeros that an event has twice within a step are found where
-    the values at the start, the middle and the end of the step show a dip. After a terminal event the next step of a
-    rollout goes on from the state and time returned. `step.t_events` lists the times of the last interval, constants:
-    a time has a derivative if a terminal event returns it, or a jump writes it into the state.
-    Ranks: fields in blocks too (`distribute`), not by radau and etdrk4; nonlinear implicit steps within the limits of
-    `implicit`: no `sparsity`.
+    takes about six times the steps of its value, and three times the time of a gradient without the error estimate.
+    radau evaluates three Jacobians for the derivative of a step, batches them over many steps, and records one rule on
+    the tape for an interval; a gradient takes 1.5 to 3.2 times the time of its value, and 3 to 5 times if the rate is
+    written for vectors.
+
+    Breaks and events: du/db = f_- - f_+ just after a break b, where f_- and f_+ are the rates before and after it. The
+    derivative of the time of an event g = 0 follows from the implicit function theorem,
+    -(g_u du + g_p dp + g_t dt) / (g_u f + g_t), applied to the step that ends at the event. This step is located by
+    Brent's method to rounding (implicit methods: to `rtol`). Derivatives of all orders are available, also in rollouts
+    with any `memory`; radau has only first derivatives. If an event function has two zeros within one step, they are
+    found if the values at the start, the middle and the end of the step indicate an extremum between them. After a
+    terminal event the next step of a rollout starts from the returned state and time. `step.t_events` lists the times
+    of events in the last interval as constants. To differentiate the time of an event, use the time that a terminal
+    event returns, or write the time into the state by a jump.
+
+    Ranks: all methods except radau and etdrk4 accept distributed fields (see `distribute`). Nonlinear implicit steps
+    then have the limits of `implicit`, for example no `sparsity`.
 
     References
     ----------
@@ -235,7 +254,7 @@ def stepper(
     >>> value_and_grad(lambda nu: step(np.array([3.0, 3.0]), nu)[0])(2.0)
     (1.5, -0.375)
 
-    A source that is switched off at a time; a ball from a height h, and when it lands:
+    Integrate a source that is switched off at a time, and compute the time at which a ball from a height h lands:
 
     >>> import autograd.numpy as anp
     >>> heating = lambda u, off, t: anp.where(t < off, 1.0, 0.0)
@@ -260,7 +279,7 @@ def stepper(
     settings = _solver_settings(solver, rtol, maxiter, arguments["options"])
     unused = [word for word in UNUSED[method] if arguments[word] is not None]
     if method == "radau" and solver not in ("auto", "direct"):
-        unused.append("solver")  # full systems are solved by LU
+        unused.append("solver")  # radau always solves its systems by LU
     if unused:
         raise TypeError(f"{method} does not use {', '.join(unused)}; leave it out")
     _check_interruptions(arguments)
@@ -278,13 +297,13 @@ def stepper(
 
 
 def _solver_settings(solver: str, rtol: float, maxiter: int | None, options: dict) -> SolveSettings:
-    """Return the settings of solves; `implicit` alone takes the option sparsity."""
+    """Return the checked settings of solves; the option `sparsity` is not checked here but by `implicit`."""
     checked = {word: value for word, value in options.items() if word != "sparsity"}
     return replace(check_settings(solver, rtol, maxiter, "raise", checked), options=options)
 
 
 def _check_interruptions(arguments: dict) -> None:
-    """Refuse options of error control without a tolerance, and a longest step that is not positive."""
+    """Raise an error for options of error control without a tolerance, and for a max_step that is not positive."""
     for word in ("max_step", "breaks", "events"):
         if arguments[word] is not None and arguments["tolerance"] is None:
             raise TypeError(f"{word} needs steps with error control; write tolerance=1e-6")
@@ -297,7 +316,7 @@ def _check_interruptions(arguments: dict) -> None:
 
 
 def _is_floor(leaf: Any) -> bool:
-    """Whether a leaf of the floor is None, the default, or holds finite numbers >= 0."""
+    """Return True if a leaf of the floor is None (the default) or contains finite numbers >= 0 only."""
     if leaf is None:
         return True
     value = np.asarray(leaf)
@@ -305,13 +324,13 @@ def _is_floor(leaf: Any) -> bool:
 
 
 def _rebuilt(arguments: dict) -> Step:
-    """Return the step of the arguments of `stepper`."""
+    """Construct a step again from the arguments of `stepper`, for copies and pickles."""
     named = {word: value for word, value in arguments.items() if word != "options"}
     return stepper(**named, **arguments["options"])
 
 
 def _scheme(method: str, arguments: dict, settings: SolveSettings) -> Any:
-    """Return the scheme of a method; modules that only some methods need are imported for those alone."""
+    """Return the scheme of a method. Modules that only some methods need are imported here, when they are used."""
     if method == "leapfrog":
         from sparsedp.integrators.leapfrog import Leapfrog
 
@@ -359,7 +378,7 @@ def _fixed_scheme(
 
 
 def _with_interruptions(scheme: Adaptive, arguments: dict) -> Any:
-    """Return a scheme with error control that stops at breaks and events, where there are any."""
+    """Extend a scheme with error control by breaks and events; return it unchanged if there are none."""
     breaks = arguments["breaks"]
     events = arguments["events"]
     if breaks is None and events is None:
@@ -372,7 +391,7 @@ def _with_interruptions(scheme: Adaptive, arguments: dict) -> Any:
 
 
 class Step(Reconstructible):
-    """A time step, as `stepper` returns it: ``step(state, params)`` is the state after a time dt.
+    """A time step, as returned by `stepper`: ``step(state, params)`` returns the state after a time dt.
 
     Parameters
     ----------
@@ -381,20 +400,20 @@ class Step(Reconstructible):
     scheme : Scheme
         ``scheme(u, params, t, h)``: the state after a step h.
     limits : list of pairs
-        A term c L, and the largest stable h c of an explicit step.
+        Terms c L, each with the largest stable value of h c for an explicit step of length h.
     arguments : dict
-        Of `stepper`.
+        The arguments of `stepper`.
 
     Attributes
     ----------
     order : int
-        Of accuracy in time.
+        Order of accuracy in time.
     info : SolveLog or None
         Records of the last solves and set-up.
     taken : list of float
-        With error control: the accepted lengths of the last interval, as shares of it.
+        With error control: the lengths of the accepted steps in the last interval, as fractions of the interval.
     t_events : list of arrays
-        With events: for each one its times in the last interval, without a derivative.
+        With events: for each event its times in the last interval, without a derivative.
     """
 
     def __init__(self, method: str, dt: Any, scheme: Any, limits: Sequence, arguments: dict) -> None:
@@ -412,7 +431,7 @@ class Step(Reconstructible):
 
     @property
     def taken(self) -> list[float]:
-        """Return the accepted lengths of the last interval, as shares of it."""
+        """Return the lengths of the accepted steps in the last interval, as fractions of the interval."""
         return getattr(self.scheme, "taken", [1.0])
 
     @property
@@ -426,15 +445,15 @@ class Step(Reconstructible):
 
         Parameters
         ----------
-        state : array or tree u, or the pair (u, t) where the rate takes a time
+        state : array or tree u, or the pair (u, t) if the rate takes the time
         params : tree
         *inputs : tree, optional
-            Of this step; the rate then gets the pair (params, input) as its params.
+            An input for this step; the rate then gets the pair (params, input) as its params.
 
         Returns
         -------
         tree
-            The new state, in the form of the old one.
+            The new state, with the structure, shapes and dtypes of the old one.
         """
         first_params = params
         if inputs:
@@ -444,7 +463,7 @@ class Step(Reconstructible):
         check_leaves(f"params of {self.name}", params, containers=False)
         h = self._length(params)
         if self.problem.stiff:
-            self.problem.terms(u)  # refuses another tree before anything is solved
+            self.problem.terms(u)  # raise an error for a state of another structure before anything is solved
         for term, largest in self.limits:
             self._check_stable(float(plain(h)), float(plain(term.coefficient(params))), term.op.name, largest)
         end = None
@@ -453,9 +472,9 @@ class Step(Reconstructible):
             if self.is_interrupted:
                 new, end = new
             new = like(new, u)
-        except NonFiniteError as error:  # perhaps from a solver: name the argument
+        except NonFiniteError as error:  # a solver may have raised it: name an argument of the step that is not finite
             self._refuse_nonfinite(state, params)
-            # The argument of a solve is a rate or a stage of this step: the state of the step itself is finite.
+            # State and params are finite, so that a rate or a stage of this step has overflowed.
             if str(error).startswith(f"{self.name} takes finite numbers"):
                 raise NonFiniteError(self._overflow(h)) from error
             raise
@@ -472,12 +491,14 @@ class Step(Reconstructible):
         return new, end if self.is_interrupted else t + h
 
     def back(self, state: Any, params: Any = None, *inputs: Any) -> Any:
-        """Return the state before a step of leapfrog without damping, to rounding.
+        """Reverse a step of leapfrog without damping: return the state before it, up to rounding.
 
         Parameters
         ----------
-        state, params, *inputs
-            As for the step itself; `state` is what it returned.
+        state : pair
+            The state that the step returned.
+        params, *inputs
+            The other arguments of the step.
         """
         self.check_reversible()
         if inputs:
@@ -496,13 +517,13 @@ class Step(Reconstructible):
         return self.dt
 
     def check_reversible(self) -> None:
-        """Refuse a step that `back` cannot reverse."""
+        """Raise ValueError if `back` cannot reverse the step."""
         if self.method != "leapfrog":
             raise ValueError(f"{self.name} cannot be reversed; write 'leapfrog'")
         self.scheme.check_reversible()
 
     def _check_stable(self, h: float, c: float, name: str, largest: float) -> None:
-        """Refuse a step that would grow without bound."""
+        """Raise UnstableStepError if repeated steps of length h would grow without bound."""
         if h * c > largest * (1 + ROUNDING):
             most = rounded_down(largest / c)
             shown = number_beside(h, float(most), digits=12)
@@ -512,13 +533,13 @@ class Step(Reconstructible):
             )
 
     def _parts(self, state: Any) -> Any:
-        """Return u and the time t, which is None where nothing depends on it."""
+        """Return u and the time t, which is None if rate and source do not depend on it."""
         if not self.problem.timed:
             return state, None
         return check_pair(f"the state of {self.name}, whose rate takes a time,", state, "(u, t)")
 
     def _refuse_nonfinite(self, state: Any, params: Any) -> None:
-        """Refuse arguments that are not finite."""
+        """Raise NonFiniteError for a leaf of state or params that is not finite."""
         for what, tree in (("state", state), ("params", params)):
             for place, leaf in zip(labels(tree, what), leaves(tree), strict=True):
                 if is_variable(leaf):
@@ -533,10 +554,10 @@ class Step(Reconstructible):
 
 
 def largest_step(op: Any, reach: float) -> float:
-    """Return the largest stable h c of an explicit step for u' = c L u.
+    """Return the largest stable value of h c for an explicit step of length h of u' = c L u.
 
-    It comes from the eigenvalues of a sum of 1-D factors, else, where L has symmetric entries, from its least
-    eigenvalue. Of other operators nothing is known, and any step is allowed.
+    It is computed from the most negative eigenvalue of L, for separable operators and for symmetric matrices. For other
+    operators the limit is not known; infinity is returned, so that every step is allowed.
 
     Parameters
     ----------
@@ -552,7 +573,7 @@ def largest_step(op: Any, reach: float) -> float:
 
 
 def least_eigenvalue(op: Any) -> float | None:
-    """Return the most negative eigenvalue of an operator with real ones, or None if it is not known."""
+    """Return the most negative eigenvalue of an operator with real eigenvalues; None if it is not known."""
     if op.dtype.kind == "c":
         return None
     if op.separable:
@@ -567,7 +588,7 @@ def least_eigenvalue(op: Any) -> float | None:
         return None
     if n <= DENSE_UP_TO:
         return float(np.min(np.linalg.eigvalsh(matrix.toarray()), initial=0.0))
-    start = np.random.default_rng(0).standard_normal(n)  # the same bits in every run
+    start = np.random.default_rng(0).standard_normal(n)  # a fixed seed, so that every run gives the same bits
     try:
         return float(eigsh(matrix, 1, which="SA", v0=start, tol=1e-3, return_eigenvectors=False)[0])
     except ArpackError:
