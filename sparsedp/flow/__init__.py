@@ -1,1 +1,1 @@
-"""Incompressible flow on faces: the projection, viscosity, and what carries momentum."""
+"""Incompressible flow with velocities on faces (projection, viscosity, convection), and conservation laws."""

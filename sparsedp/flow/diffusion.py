@@ -1,7 +1,8 @@
-"""Diffusive terms of a flow step, explicit or by the trapezoidal rule, and the growth of waves in a step.
+"""Diffusive terms of a flow step, explicit or by the trapezoidal rule, and the amplification of waves by a step.
 
-Adams-Bashforth is stable for an explicit term nu L u if dt nu |lambda| <= 1 for all eigenvalues of L. A wave that moves
-by the Courant number c in a step and is damped by d = dt nu k^2 grows in that step by the largest root |z| of
+The second-order Adams-Bashforth method is stable for an explicit term nu L u if dt nu |lambda| <= 1 for all eigenvalues
+lambda of L. For a wave with the Courant number c and the damping d = dt nu k^2 in a step, the amplification factor of
+the step is the largest absolute value |z| of the roots of
 
     z^2 - z = (3/2 z - 1/2) (i c - d),      or, with implicit damping,  (z^2 - z) + d z (z + 1) / 2 = (3/2 z - 1/2) i c.
 """
@@ -25,16 +26,16 @@ if TYPE_CHECKING:
 
 __all__ = ["Diffusion", "wave_growth"]
 
-ROUNDING = 1e-12  # a step at the stability limit may lie beyond it by rounding
+ROUNDING = 1e-12  # tolerance: a step exactly at the stability limit may exceed it by a rounding error
 
 
 class Diffusion:
-    """A term nu (L u + wall part) of a flow step; for nu = 0 nothing is built.
+    """A term nu (L u + contribution of walls) of a flow step. For nu = 0 no operator is built.
 
     Parameters
     ----------
     name : str
-        Name of nu in messages.
+        Name of nu in error messages.
     coefficient : float or callable
         nu, or ``nu(params)``.
     build_operator : callable
@@ -44,11 +45,11 @@ class Diffusion:
     Attributes
     ----------
     op : Operator or None
-        L.
+        L; None if nu is 0.
     solve : Operator or None
-        The inverse of I - dt nu L / 2, if the term is implicit.
+        The inverse of I - dt nu L / 2 if the term is implicit, else None.
     damping : float
-        dt nu |L|; 0 if nu is a function.
+        dt nu |L|, with the largest absolute row sum as |L|; 0 if nu is a function.
     """
 
     op: Any
@@ -82,15 +83,15 @@ class Diffusion:
             self._check_stable(coefficient)
 
     def add_explicit(self, rate: Any, u: Any, params: Any, wall_part: Callable[[], Any]) -> Any:
-        """Return a rate plus this term if it is explicit.
+        """Return the rate plus this term if the term is explicit; return the rate itself if it is implicit.
 
         Parameters
         ----------
         rate, u : array
         params : tree
-            For a coefficient that is a function.
+            Argument of a coefficient that is a function.
         wall_part : callable
-            ``wall_part()`` returns what walls add to L u, or None for 0.
+            ``wall_part()`` returns the contribution of walls to L u, or None if it is 0.
         """
         if self.op is None or self.solve is not None:
             return rate
@@ -102,16 +103,16 @@ class Diffusion:
         return rate + coefficient * self._laplacian(u, wall_part())
 
     def step_implicit(self, explicit: Any, u: Any, wall_part: Any) -> Any:
-        """Return the new field of the trapezoidal rule.
+        """Return the field at the end of the step, by the trapezoidal rule.
 
         Parameters
         ----------
         explicit : array
-            The field after all other terms.
+            The field after the step with all terms except this one.
         u : array
             The field at the beginning of the step.
         wall_part : array or None
-            What walls add to L u at the beginning of the step plus what they add at its end.
+            Contribution of walls to L u at the beginning of the step, plus their contribution at its end.
         """
         half_step = 0.5 * self.settings.dt * self.coefficient
         return self.solve(explicit + half_step * self._laplacian(u, wall_part))
@@ -139,7 +140,7 @@ class Diffusion:
 
 
 def wave_growth(courant: float, damping: float, implicit: bool) -> float:
-    """Return the largest growth of a wave in one step; see the head of this module.
+    """Return the largest amplification factor of a wave in one step, by the equations of the module docstring.
 
     Parameters
     ----------
@@ -153,7 +154,7 @@ def wave_growth(courant: float, damping: float, implicit: bool) -> float:
     angle = np.linspace(0.0, np.pi, 65)
     advance = 1j * courant * np.sin(angle)
     decay = damping * np.sin(angle / 2) ** 2
-    # The quadratic equation a z^2 - b z + e = 0.
+    # Coefficients of the quadratic equation a z^2 - b z + e = 0 for z.
     if implicit:
         a: Any = 1 + decay / 2
         b = 1 - decay / 2 + 1.5 * advance

@@ -4,24 +4,27 @@ Along an axis with cells of widths h, for each field,
 
     du_i/dt = (F_i - F_(i+1)) / h_i + S_i.
 
-At face i the two cells around it give two values: u_lower = u_(i-1) + ahead and u_upper = u_i - behind, with the
-limited slopes of a scheme of `dp.transport`. The flux between them is the flux of Harten, Lax and van Leer: with the
-slowest and the fastest wave, a = min(0, slow) and b = max(0, fast) over both values,
+At face i there are two reconstructed values: u_lower = u_(i-1) + ahead, from the cell below, and u_upper = u_i -
+behind, from the cell above. `ahead` and `behind` are the slope-limited corrections of a scheme of `dp.transport`. The
+numerical flux is that of Harten, Lax and van Leer. With a = min(0, slowest wave speed) and b = max(0, fastest wave
+speed), taken over both values,
 
     F = (b F(u_lower) - a F(u_upper) + a b (u_upper - u_lower)) / (b - a).
 
 With one speed s for both directions, a = -s and b = s, it is Rusanov's flux.
 
-There are two ghost cells beyond each end of an axis. They wrap on a periodic axis, repeat the last cell (outflow),
-mirror the cells with the opposite momentum across the wall (free_slip), or have the given values (inflow).
+There are two ghost cells beyond each end of an axis. On a periodic axis they hold the cells of the other end; at an
+outflow they repeat the last cell; at a wall (free_slip) they mirror the cells, with the sign of the normal momentum
+reversed; at an inflow they hold the given state.
 
-Steady states: with an equilibrium e the slopes are those of u - e, and the rate that the same formulas give for e is
-subtracted. Then e is preserved to the last bit: a lake at rest over any ground, a gas at rest under gravity. Beyond a
-side of inflow e continues with its last cell. An inflow that differs from it acts on the field; an inflow that equals
-it, such as that of a moving steady state, preserves e.
+Steady states: if an equilibrium e is given, the slopes of u - e are limited instead of those of u, and the rate of e
+(by the same formulas) is subtracted from the rate of u. For u = e both rates are equal bit for bit, so that e is
+preserved exactly: for example a lake at rest over uneven ground, or a gas at rest under gravity. The ghost cells of e
+at an inflow boundary repeat its last cell. Therefore e is preserved if the inflow equals this last cell, as for a
+moving steady state; any other inflow changes the field.
 
-Everything except the limiter is arithmetic on the tape: its derivatives of every order are those of autograd and of the
-user's flux, speed and source. The limiter is one rule with first derivatives.
+All operations except the limiter are recorded by autograd, so that derivatives of every order exist where the user's
+flux, speed and source have them. The limiter is one differentiation rule with first derivatives only.
 """
 
 from __future__ import annotations
@@ -64,8 +67,8 @@ if TYPE_CHECKING:
 __all__ = ["ConservationLaw", "conservation_law"]
 
 NO_WAVES = "; has the state left where it has waves (a density or a depth below 0)? Take a smaller dt"
-GHOSTS = 2  # cells beyond each end: the slope in the first of them needs the second
-# How np.pad repeats cells beyond a side; None: the axis is periodic.
+GHOSTS = 2  # ghost cells beyond each end: the slope in the nearer one needs the value of the farther one
+# The mode of np.pad that fills the ghost cells, by boundary condition; None stands for a periodic axis.
 PAD_MODES: dict[Any, Any] = {None: "wrap", free_slip: "symmetric", outflow: "edge", inflow_side: "edge"}
 
 
@@ -88,28 +91,30 @@ def conservation_law(
     grid : Grid
     flux : callable
         ``flux(u, params, axis)`` returns the flux along an axis (0 is x) [unit length / time], an array of the shape of
-        u. u holds values at faces, first those below all faces, then those above: it is longer along the axis than the
-        state. Write coefficients that depend on the position as further fields of the state with a flux of 0.
+        u. Here u holds values at faces: along the axis, first the values on the lower sides of all faces, then the
+        values on their upper sides. It is therefore longer along the axis than the state. Write coefficients that
+        depend on the position as additional fields of the state with a flux of 0.
     speed : callable
-        ``speed(u, params, axis)`` returns the speed of the fastest wave along an axis [length / time], one number for
-        each point, without the axis of the fields (Rusanov's flux); or a pair, the slowest and the fastest wave with
-        their signs (the flux of Harten, Lax and van Leer, which is less diffusive).
+        ``speed(u, params, axis)`` returns wave speeds along an axis [length / time], in the shape of u without the axis
+        of the fields. Either one array, the speed >= 0 of the fastest wave (Rusanov's flux), or a tuple, the signed
+        speeds of the slowest and of the fastest wave (flux of Harten, Lax and van Leer, which is less diffusive).
     scheme : str
-        The values at faces: "van_leer" (limited slopes, second order) or "upwind" (first order), the Eulerian schemes
-        of `dp.transport`.
+        How the values at faces are reconstructed: "van_leer" (limited slopes, second order) or "upwind" (first order),
+        the Eulerian schemes of `dp.transport`.
     boundary : condition, or dict of conditions
-        outflow: waves leave. free_slip: a wall, needs `momentum`. inflow: the state beyond the side is `inflow`.
+        outflow: waves leave the domain. free_slip: a wall, which requires `momentum`. inflow: the state outside the
+        boundary is given by `inflow`.
     momentum : int or tuple of int, optional
-        The field that is the momentum along each axis; it changes its sign at walls. In 2-D, (1, 2) means that u[1] and
-        u[2] are the momenta along x and y.
+        Index of the field that is the momentum along each axis; its sign is reversed at walls. In 2-D, (1, 2) means
+        that u[1] and u[2] are the momenta along x and y.
     inflow : number, array, or callable, optional
-        The state beyond sides of inflow, in a shape that broadcasts to the state; or ``inflow(params, axis, side)``,
-        side 0 (lower) or 1 (upper).
+        The state outside inflow boundaries: an array that broadcasts to the state, or one number for each field; or
+        ``inflow(params, axis, side)`` that returns one, with side 0 (lower) or 1 (upper).
     source : callable, optional
         ``source(u, params)`` returns S(u) in the cells [unit / time], an array of the shape of u.
     equilibrium : array or callable, optional
-        A state, or ``equilibrium(params)``, to preserve exactly, at rest or moving. At a side of inflow it is preserved
-        if its last cell there holds the state that flows in; another inflow disturbs it.
+        A steady state, at rest or moving, that is preserved exactly; or ``equilibrium(params)`` that returns one. At an
+        inflow boundary it is preserved only if the inflow equals the equilibrium in the cell next to the boundary.
 
     Returns
     -------
@@ -120,14 +125,14 @@ def conservation_law(
     Raises
     ------
     ValueError
-        If scheme, boundary or momentum is not one of the above, or `inflow` is missing. On use, if a speed is
-        negative, or a function changes its argument in place.
+        If scheme, boundary or momentum is not one of the above, or if `inflow` does not go together with an inflow
+        boundary. On use, if a speed is negative, or a function changes its argument in place.
     ShapeError
         If the state, or the result of a function, has the wrong shape, or the state has no field for a momentum.
     NonFiniteError
-        If a speed is NaN or infinite, often because a density or a depth has become negative, or if the rate is.
+        If a speed or the rate is NaN or infinite, often because a density or a depth has become negative.
     TypeError
-        If flux, speed or source is not a function, or a function or the state does not hold real numbers.
+        If flux, speed or source is not a function, or if the state or the result of a function is not real.
 
     See Also
     --------
@@ -136,9 +141,10 @@ def conservation_law(
     Notes
     -----
     Order: 2 where the solution is smooth and has no extremum (van_leer), 1 at shocks.
-    Time steps: "ssprk3" of `stepper` with a dt of `law.time_step` preserves the properties of an Euler step; dt is not
-    checked otherwise.
-    Derivatives: limiters, shocks and the larger of two speeds have kinks, where `check.gradient` returns
+    Time steps: use "ssprk3" of `stepper` with a dt from `law.time_step`. This method is strong stability preserving:
+    bounds that hold for an Euler step of size dt, such as the absence of new extrema, hold for its step too. The law
+    itself does not check dt.
+    Derivatives: limiters, shocks and the maximum of two speeds have kinks, where `check.gradient` returns
     "inconclusive".
 
     References
@@ -204,7 +210,7 @@ def _momentum_fields(grid: Grid, momentum: Any) -> tuple[int, ...]:
 
 
 class ConservationLaw(Reconstructible):
-    """The rate of change of a conservation law, ``law(u, params=None)``, built by `conservation_law`.
+    """The rate of change of a conservation law, ``law(u, params=None)``, as `conservation_law` returns it.
 
     Parameters
     ----------
@@ -213,7 +219,7 @@ class ConservationLaw(Reconstructible):
     sides : tuple
         The conditions as `resolve` returns them.
     momentum : tuple of int or None
-        For each axis the field that is the momentum along it.
+        For each axis, the index of the field that is the momentum along this axis.
 
     Attributes
     ----------
@@ -301,7 +307,7 @@ class ConservationLaw(Reconstructible):
         return cast(rate, dtype_of(u))
 
     def _checked_state(self, u: Any) -> Any:
-        """Return a state as floating-point numbers; raise for a wrong shape or kind of numbers."""
+        """Return the state as a floating-point array; raise if its shape or dtype is wrong."""
         values = field_array(self, plain(u), batch=True)
         fields = values.shape[: values.ndim - self.grid.dim]
         if len(fields) > 1:
@@ -320,7 +326,10 @@ class ConservationLaw(Reconstructible):
         return frozen(u if isbox(u) else values)
 
     def _rate(self, u: Any, equilibrium: Any, params: Any, with_inflow: bool = True) -> Any:
-        """Return the rate of a state; `equilibrium` affects the slopes only. See `AxisFluxes.padded`."""
+        """Return the rate of a state; `equilibrium` affects the slopes only.
+
+        For `with_inflow` see `AxisFluxes.padded`.
+        """
         if self.source is None:
             total = np.zeros(u.shape)
         else:
@@ -346,7 +355,7 @@ class ConservationLaw(Reconstructible):
         slowest, fastest = self._wave_speeds(axis.number, both, params)
         a = anp.minimum(anp.minimum(*axis.halves(slowest)), 0.0)
         b = anp.maximum(anp.maximum(*axis.halves(fastest)), 0.0)
-        no_waves = plain(a) == plain(b)  # both are 0: the flux is the mean
+        no_waves = plain(a) == plain(b)  # a = b = 0: the flux is the mean of both fluxes
         width = b - a + no_waves
         share = (b + 0.5 * no_waves) / width
         return share * f_lower + (1.0 - share) * f_upper + a * b / width * (upper - lower)
@@ -368,12 +377,12 @@ class ConservationLaw(Reconstructible):
         return speeds
 
     def time_step(self, u: Any, params: Any = None, cfl: float = 0.4) -> float:
-        """Return a stable dt: `cfl` over the largest sum over the axes of speed / width.
+        """Return a stable dt: `cfl` divided by the largest sum over the axes of speed / width in a cell.
 
         Parameters
         ----------
         u : array
-            As for the call. The values in the cells count, and the inflow at sides of inflow.
+            The state, as for the call. The speeds are taken in the cells and, at inflow boundaries, of the inflow.
         params : tree, optional
         cfl : float
             Up to 0.5 for limited slopes, up to 1 for "upwind".
@@ -392,7 +401,7 @@ class ConservationLaw(Reconstructible):
         return np.inf
 
     def _fastest_waves(self, axis: AxisFluxes, u: NDArray, params: Any) -> NDArray:
-        """Return the speed of the fastest wave along an axis in each cell, including waves that enter at a side."""
+        """Return the speed of the fastest wave along an axis in each cell, including waves of the inflow."""
         speeds = np.max(np.abs(self._wave_speeds(axis.number, u, params)), axis=0)
         for side, edge in ((0, slice(0, 1)), (1, slice(-1, None))):
             if axis.sides[side] == inflow_side:
@@ -407,7 +416,7 @@ class ConservationLaw(Reconstructible):
 
 
 def _checked_result(name: str, value: Any, u: Any) -> Any:
-    """Return the result of a function of the user; raise unless it has the shape of u and real numbers."""
+    """Return the result of a user-supplied function; raise unless it is real and has the shape of u."""
     check_shape(f"the {name} of a conservation_law", value, np.shape(u))
     check_kind(f"the {name} of a conservation_law", dtype_of(value), "real numbers", "; write its .real")
     return value
@@ -420,10 +429,10 @@ class AxisFluxes:
     ----------
     grid : Grid
     number : int
-        Number of the axis.
-    sides : pair of FlowCondition, or of None where the axis is periodic
+        Index of the axis.
+    sides : pair of FlowCondition, or (None, None) if the axis is periodic
     momentum : int or None
-        The field that changes its sign at walls.
+        Index of the field whose sign is reversed at walls.
     inflow : array, number or callable
         As `conservation_law` takes it.
     scheme : Scheme
@@ -433,7 +442,7 @@ class AxisFluxes:
         self, grid: Grid, number: int, sides: tuple, momentum: int | None, inflow: Any, scheme: Scheme
     ) -> None:
         self.number = number
-        self.place = number - grid.dim  # axis of arrays, counted from the last one
+        self.place = number - grid.dim  # index of this axis in an array of fields, counted from the end
         self.dim = grid.dim
         self.sides = sides
         self.momentum = momentum
@@ -442,18 +451,18 @@ class AxisFluxes:
         cells = np.arange(grid.shape[number])
         repeated_lower = np.pad(cells, GHOSTS, PAD_MODES[sides[0]])
         repeated_upper = np.pad(cells, GHOSTS, PAD_MODES[sides[1]])
-        self.ghosts = repeated_lower[:GHOSTS], repeated_upper[-GHOSTS:]  # the cells that ghost cells repeat
+        self.ghosts = repeated_lower[:GHOSTS], repeated_upper[-GHOSTS:]  # indices of the repeated cells
         self.widths = self._along(widths)
         padded_widths = np.concatenate([widths[repeated_lower[:-GHOSTS]], widths[repeated_upper[-GHOSTS:]]])
         gaps = padded_widths[1:] + padded_widths[:-1]
         self.distances = [self._along(gap / padded_widths[1:-1]) for gap in (gaps[:-1], gaps[1:])]
-        self.limiters = []  # for the upper and the lower end of each cell; one if they are the same
+        self.limiters = []  # for the upper and the lower end of each cell; a single one if both slopes are equal
         if scheme.limiter is not None:
             ends = [0] if scheme.symmetric else [0, 1]
             self.limiters = [self._limiter(scheme.limiter, end) for end in ends]
 
     def _along(self, line: NDArray) -> Any:
-        """Return numbers along this axis in a shape that broadcasts to fields; one number if all are equal."""
+        """Return the values along this axis in a shape that broadcasts to fields; a scalar if all are equal."""
         if np.all(line == line[0]):
             return line[0]
         return line.reshape(-1, *[1] * (-1 - self.place))
@@ -463,28 +472,28 @@ class AxisFluxes:
         return x[self.at(slice(start, stop))]
 
     def at(self, places: Any) -> tuple:
-        """Return an index of entries along this axis."""
+        """Return the index expression that selects `places` along this axis."""
         return (Ellipsis, places, *[slice(None)] * (-1 - self.place))
 
     def halves(self, x: Any) -> tuple[Any, Any]:
-        """Return the values below and above faces that stand one after the other along this axis."""
+        """Split an array along this axis: into the values below all faces and the values above all faces."""
         n = x.shape[self.place] // 2
         return self.part(x, 0, n), self.part(x, n)
 
     def padded(self, u: Any, params: Any, with_inflow: bool = True) -> Any:
         """Return a state with its ghost cells.
 
-        Beyond an inflow they hold the state that flows in or, without `with_inflow`, the last cell.
+        At an inflow boundary they hold the inflow or, if `with_inflow` is False, repeat the last cell.
         """
         lower = self.ghost_values(u, params, 0, with_inflow)
         upper = self.ghost_values(u, params, 1, with_inflow)
         return anp.concatenate([lower, u, upper], self.place)
 
     def ghost_values(self, u: Any, params: Any, upper: int, with_inflow: bool = True) -> Any:
-        """Return the values of the ghost cells beyond an end."""
+        """Return the values of the ghost cells beyond the lower (0) or the upper (1) end."""
         ghosts = u[self.at(self.ghosts[upper])]
         side = self.sides[upper]
-        if side == free_slip:  # the momentum changes its sign
+        if side == free_slip:  # the normal momentum changes its sign
             if u.ndim == self.dim:
                 return -ghosts
             signs = 1.0 - 2.0 * (np.arange(len(u)) == self.momentum)
@@ -499,7 +508,7 @@ class AxisFluxes:
         return _checked_result("inflow", value + 0.0 * plain(ghosts), ghosts)
 
     def _per_field(self, numbers: Any) -> Any:
-        """Return one number for each field in a shape that broadcasts to fields."""
+        """Reshape an array with one number for each field, so that it broadcasts to the fields."""
         return anp.reshape(numbers, (-1,) + (1,) * self.dim)
 
     def face_means(self, padded: Any) -> Any:
@@ -519,9 +528,10 @@ class AxisFluxes:
         return lower + self.part(slopes[0], 0, -1), upper - self.part(slopes[-1], 1)
 
     def _limiter(self, limiter: Callable, end: int) -> Any:
-        """Return the rule from the differences to the cells below and above to the slope at an end (0 upper, 1 lower).
+        """Return the differentiation rule of the limited slope at an end of each cell (0 upper, 1 lower).
 
-        The derivatives stand behind the two slopes in the result of the limiter.
+        Its arguments are the differences to the cells below and above. The limiter returns the two slopes, followed by
+        their derivatives.
         """
 
         def slope(a, b):

@@ -1,27 +1,30 @@
-"""flow_step: a step of incompressible flow of second order in time, which builds only what the scene needs.
+"""flow_step: a time step of incompressible flow, second-order accurate; only the operators it needs are built.
 
     v* = v + dt (3/2 a(v) - 1/2 a(v_previous) - G p) + dt nu (L (v + v*) / 2 + B)
     q  = pressure(v*),    v_next = v* + G q,    p_next = p - q / dt
 
-with a(v) = force(v) - div(v v), and + nu (L v + B) in a(v) in place of the last term where viscosity is explicit. The
-explicit part is by Adams-Bashforth, an implicit viscosity by the trapezoidal rule. The pressure is corrected in each
-step (incremental pressure correction). B is the contribution of the tangential velocities of walls.
+with a(v) = force(v) - div(v v). This is the form for implicit viscosity. If viscosity is explicit, a(v) also contains
+nu (L v + B), and the last term of the first line is omitted. Explicit terms are advanced by the second-order
+Adams-Bashforth method, implicit viscosity by the trapezoidal rule. The pressure is corrected in each step (incremental
+pressure correction). B is the contribution of the tangential velocities of walls.
 
-A friction f >= 0, such as that of an obstacle, is implicit, face by face: v* gets the further term
+A friction f >= 0, such as that of an obstacle, is implicit and acts on each face separately. It adds to v* the term
 
-    -dt f (v* - (v - v_previous) / 2)
+    -dt f (v* - (v - v_previous) / 2),
 
-of second order, as its bracket is the velocity at half the step. Without other terms the step multiplies v by a root of
-(1 + m) z^2 - (1 + m / 2) z + m / 2 = 0, m = dt f. It is stable for every m, and |z| = 0.71 for large m, where the
-trapezoidal rule would only change the sign. With f v in a, which brings in v_previous, it is
-(1 + dt f) v* = v - dt f v + dt (3/2 a - 1/2 a_previous - G p).
+which is second-order accurate, because the bracket approximates the velocity at half the step. Without other terms the
+step multiplies v by a root z of (1 + m) z^2 - (1 + m / 2) z + m / 2 = 0 with m = dt f. It is stable for every m, and
+|z| tends to 0.71 for large m, whereas |z| of the trapezoidal rule tends to 1. In the code a also contains f v, so that
+a_previous supplies the term with v_previous:
 
-Scalars are advanced with the velocity of the same time; see `scalars`. Convection is explicit; see `diffusion` for the
-growth of waves.
+    (1 + dt f) v* = v - dt f v + dt (3/2 a - 1/2 a_previous - G p).
+
+Scalars are advanced with the velocity at the beginning of the step; see `scalars`. Convection is explicit; see
+`diffusion` for the amplification of waves.
 
 References
 ----------
-J. van Kan, SIAM J. Sci. Stat. Comput. 7 (1986): pressure correction of second order.
+J. van Kan, SIAM J. Sci. Stat. Comput. 7 (1986) (second-order pressure correction).
 """
 
 from __future__ import annotations
@@ -71,8 +74,9 @@ if TYPE_CHECKING:
 __all__ = ["FlowStep", "flow_step"]
 
 SCALAR_ENTRIES = ("diffusivity", "boundary", "values", "source")
-MAX_GROWTH = 1.02  # of a wave in a step: Adams-Bashforth without damping always has a little
-SAFE_COURANT = 0.5  # Courant number up to which no wave grows by more
+# Largest accepted amplification of a wave in a step. Without damping, Adams-Bashforth always amplifies waves slightly.
+MAX_GROWTH = 1.02
+SAFE_COURANT = 0.5  # Courant number up to which the amplification stays below MAX_GROWTH
 
 
 def flow_step(
@@ -91,7 +95,7 @@ def flow_step(
     friction: Any = None,
     inflow: Any = None,
 ) -> FlowStep:
-    """Return ``step(state, params)`` of incompressible flow, of order 2 in space and time.
+    """Return the time step ``step(state, params)`` of incompressible flow, of order 2 in space and time.
 
     Parameters
     ----------
@@ -99,36 +103,41 @@ def flow_step(
     dt : float
         Time step > 0 [time].
     viscosity : float or callable
-        >= 0 [length^2 / time]. For 0 no Laplacian is built. ``viscosity(params)`` is differentiable, and explicit.
+        >= 0 [length^2 / time]. A function ``viscosity(params)`` is differentiable in params and requires explicit
+        viscosity.
     force : callable, optional
         ``force(v, params)`` returns an array on faces [velocity / time], or a number.
     boundary, solid, solid_boundary
         As in `projection` and `face_laplacian`.
     implicit : bool
-        Whether viscosity is implicit: any dt nu / h^2, for one more solve.
+        Whether viscosity and the diffusion of scalars are implicit. They are then stable for every dt, at the cost of
+        one additional solve each per step.
     convective : bool
-        False: Stokes flow, without div(v v).
+        Whether to include convection, div(v v). False gives (unsteady) Stokes flow.
     walls : callable or array, optional
-        Tangential velocities of moving walls and of flow that enters at an angle. ``walls(params)`` returns the
+        Tangential velocities of moving walls, and of flow that enters at an angle. ``walls(params)`` returns the
         velocities at the end of a step, one flat array on ``face_lift(grid, boundary).domain`` [velocity];
         differentiable. Constant velocities may be given as the array ``face_lift(grid, boundary)(velocities)``.
         Default: 0.
     scalars : dict, optional
-        Cell fields that the flow carries: ``{"heat": {"diffusivity": 0.1, "boundary": {"x": dp.dirichlet},
-        "values": values, "source": lambda s, params: ...}}``. All four entries are optional: a number >= 0
-        [length^2 / time], a condition or dict (default neumann), wall values as `lift` takes them, and a function that
-        returns a rate [scalar / time] from the dict of all scalars. Wall values for x-lower, x-upper, y-lower and
-        y-upper: ``dp.lift(grid, {"x": dp.dirichlet}).domain.join(1.0, 0.0, 0.0, 0.0)``. The force is then
+        Cell fields that the flow carries, such as ``{"heat": {"diffusivity": 0.1, "boundary": {"x": dp.dirichlet},
+        "values": values, "source": lambda s, params: ...}}``. All four entries are optional. "diffusivity": a number
+        >= 0 [length^2 / time]. "boundary": a condition or a dict (default neumann). "values": wall values as `lift`
+        takes them, here for x-lower, x-upper, y-lower and y-upper
+        ``dp.lift(grid, {"x": dp.dirichlet}).domain.join(1.0, 0.0, 0.0, 0.0)``. "source": a function that returns the
+        rate [scalar / time] from the dict of all scalars. With scalars, the force is called as
         ``force(v, s, params)``.
     unstable : "raise" or "allow"
-        What to do if a step is so long that waves would grow.
+        Whether to raise UnstableStepError if dt is too large for stability.
     friction : array or callable, optional
-        Array on faces >= 0 [1 / time], or ``friction(params)`` that returns one: the term -friction * v, implicit, for
-        any size of it; viscosity is explicit then. With ``drag = dp.brinkman(grid)`` an obstacle of any shape is
-        ``lambda radius: viscosity * drag(distance - radius)``. Differentiable. No effect on walls and inflows.
+        Array on faces >= 0 [1 / time], or ``friction(params)`` that returns one; differentiable. It adds the term
+        -friction * v, which is implicit and stable for every size; viscosity must then be explicit. With
+        ``drag = dp.brinkman(grid)``, the friction ``lambda radius: viscosity * drag(distance - radius)`` represents an
+        obstacle of any shape. It has no effect on the faces of walls and inflows.
     inflow : callable or array, optional
-        ``inflow(params)`` returns an array on faces [velocity], whose values on sides of inflow are the normal velocity
-        there at the end of a step; differentiable. Default: the velocity of the first state there, for all times.
+        ``inflow(params)`` returns an array on faces [velocity]; differentiable. Its values on inflow boundaries are the
+        normal velocity there at the end of a step; all other values are ignored. Default: the normal velocity keeps the
+        values of the first state.
 
     Returns
     -------
@@ -136,22 +145,22 @@ def flow_step(
         ``step.start(v, params=None)`` returns the first state, a dict of the velocity "v" [velocity], the pressure "p"
         [velocity^2] and the previous acceleration "a". ``step(state, params)`` returns the next state, for `rollout`.
         The params are passed to force, friction, viscosity, walls and inflow. With scalars,
-        ``step.start(v, params, s)`` takes a dict of fields: the state holds them as "s" and their previous rates as
-        "r". With a function as walls the state holds the wall velocities as "walls".
+        ``step.start(v, params, s)`` takes a dict of cell fields. The state then also holds these as "s" and their
+        previous rates as "r". If `walls` is a function, the state also holds the wall velocities as "walls".
 
     Raises
     ------
     ValueError
-        If dt or the viscosity is out of range, a scalar has another entry than those four, a friction is given with
-        implicit viscosity, inflow is given without a side of inflow, or an array as walls does not determine the
-        velocity of a flow that enters. On use, if a friction is < 0 or complex.
+        If dt or the viscosity is out of range, a scalar has an entry other than those four, a friction is given with
+        implicit viscosity, `inflow` is given without an inflow boundary, or an array as `walls` does not determine the
+        tangential velocity at an inflow boundary. On use, if a friction is < 0 or complex.
     ShapeError
-        If an array as walls is not on the faces. On use, if the state is not one that ``step.start`` returns, or a
-        force, friction, source, inflow or wall velocity does not fit its space.
+        If `walls` is an array of another shape than the faces. On use, if the state does not have the entries that
+        ``step.start`` returns, or a force, friction, source, inflow or wall velocity has the wrong shape.
     TypeError
         If scalars is not a dict, or a force or source does not take the right number of arguments.
     DerivativeError
-        If dt or the viscosity is traced.
+        If dt or a viscosity given as a number is traced.
     NonFiniteError
         If dt or the viscosity is NaN or infinite. On use, if the velocity or a friction is.
     UnstableStepError
@@ -164,12 +173,13 @@ def flow_step(
 
     Notes
     -----
-    A step of explicit viscosity is stable for dt nu / h^2 <= 1/8 in 2-D (Adams-Bashforth); a longer one raises.
-    Convection is explicit: with c, dt times the largest sum over the axes of |v| / h in a cell, a step raises if waves
-    would grow by more than 2 % in it. Without viscosity that is c > 0.53; viscosity allows more.
-    The force of a friction in a step is the sum of volumes * friction * (v* - (v - v_previous) / 2), with v* = v_next +
-    dt G (p_next - p), as in benchmarks/cylinder.py. The bracket equals v_next at a steady state only.
-    Cost: one pressure solve, and one solve for implicit viscosity; the same again in the backward pass.
+    Explicit viscosity is stable for dt nu / h^2 <= 1/8 in 2-D (Adams-Bashforth); a larger dt raises an error.
+    Convection is explicit. A step raises an error if it would amplify waves by more than 2 %. Let the Courant number c
+    be dt times the largest sum over the axes of |v| / h in a cell: without viscosity the limit is c = 0.53, and
+    viscosity increases it.
+    The force that a friction exerts in a step is the sum of volumes * friction * (v* - (v - v_previous) / 2), where
+    v* = v_next + dt G (p_next - p), as in benchmarks/cylinder.py. The bracket equals v_next only at a steady state.
+    Cost: one pressure solve per step, and one more solve for implicit viscosity; as many in the backward pass.
 
     References
     ----------
@@ -183,7 +193,7 @@ def flow_step(
     >>> bool(np.allclose(state["v"], 1.0))
     True
 
-    A wind (1, 0.3) enters through the lower side of each axis, at an angle, and leaves through the upper one.
+    A wind (1, 0.3) enters through the lower side of each axis, at an angle, and leaves through the upper side.
 
     >>> from sparsedp import face_lift
     >>> from sparsedp import inflow as enters
@@ -211,13 +221,13 @@ def flow_step(
         friction=friction,
         inflow=inflow,
     )
-    settings = FlowSettings(**copied(arguments))  # the caller may change them
+    settings = FlowSettings(**copied(arguments))  # copies: the caller may change the originals
     _check(settings)
     return FlowStep(settings)
 
 
 def _check(settings: FlowSettings) -> None:
-    """Raise for arguments of `flow_step` that are out of range or do not fit together."""
+    """Raise an error if arguments of `flow_step` are out of range or contradict each other."""
     check_grid("flow_step", settings.grid)
     _check_constant("dt", settings.dt, "> 0")
     if not callable(settings.viscosity):
@@ -252,7 +262,7 @@ def _check(settings: FlowSettings) -> None:
 
 
 def _check_constant(name: str, number: Any, range_: str) -> None:
-    """Raise unless an argument is a constant finite number in a range."""
+    """Raise unless an argument is a finite number in the given range that is not traced."""
     if isbox(number):
         raise DerivativeError(
             f"flow_step needs a constant {name}, got a traced one; a derivative in the viscosity takes "
@@ -266,7 +276,7 @@ def _rebuild(arguments: dict[str, Any]) -> FlowStep:
 
 
 class FlowStep(Reconstructible):
-    """A step of incompressible flow, built by `flow_step`. Operators that the scene does not need are None.
+    """A time step of incompressible flow, as `flow_step` returns it.
 
     Parameters
     ----------
@@ -278,10 +288,10 @@ class FlowStep(Reconstructible):
     dt : float
     project : Projection
     pressure : Operator
-        From faces to the potential of `project`.
+        From a face field to the pressure potential of `project`.
     divergence, pressure_gradient : Operator
     convect : callable or None
-        See `convection`.
+        The function that `convection` returns; None without convection.
     viscous : Diffusion
     walls : WallsAtRest
         Tangential velocities of walls.
@@ -311,7 +321,7 @@ class FlowStep(Reconstructible):
             for name, entries in (settings.scalars or {}).items()
         }
         self._open_faces = mask(grid.faces, setup.open)
-        # Forces act on free faces only: an implicit viscosity would carry other values into the fluid.
+        # Forces are set to 0 on all other faces, because an implicit viscosity would spread them into the fluid.
         self._free_faces = mask(grid.faces, free_faces(grid, setup.sides, settings.solid))
         self._total_flow = Operator(self.divergence.structure.absolute, grid.faces, grid.cells, "total flow")
         self._inflow_faces: Any = None
@@ -432,7 +442,7 @@ class FlowStep(Reconstructible):
     def acceleration(
         self, v: Any, params: Any, s: dict[str, Any] | None = None, friction: Any = None, walls: Any = None
     ) -> Any:
-        """Return a(v): the explicit terms that the scene has, and friction * v; see the head of this module."""
+        """Return a(v), the sum of the explicit terms, plus friction * v; see the module docstring."""
         if self.convect is None:
             a = 0.0 * v
         else:
@@ -444,7 +454,7 @@ class FlowStep(Reconstructible):
         return self.viscous.add_explicit(a, v, params, partial(self.walls.laplacian_part, walls))
 
     def _force(self, v: Any, params: Any, s: dict[str, Any] | None) -> Any:
-        """Return the force on faces; a number applies to all faces."""
+        """Return the force as an array on faces; a force that is one number applies to all faces."""
         fields = [v, s] if self.scalars else [v]
         force = self.settings.force(*mapped(frozen, fields), params)
         if np.shape(plain(force)) == ():
@@ -453,7 +463,7 @@ class FlowStep(Reconstructible):
         return force
 
     def _friction(self, params: Any) -> Any:
-        """Return the friction, 0 on faces that are not free; None if there is none."""
+        """Return the friction, set to 0 on faces that are not free; None if there is no friction."""
         friction = self.settings.friction
         if friction is None:
             return None
@@ -462,12 +472,12 @@ class FlowStep(Reconstructible):
         check_on("flow_step, as friction,", friction, self.grid.faces, "; write one number for each face")
         values = plain(friction)
         check_finite("flow_step", values, "takes a finite friction")
-        if np.any(values != np.abs(values)):  # complex numbers too
+        if np.any(values != np.abs(values)):  # also raises for complex values
             raise ValueError(f"flow_step takes a friction >= 0, got {np.min(values)}; write abs(friction)")
         return self._free_faces(friction)
 
     def _set_inflow(self, v: Any, params: Any) -> Any:
-        """Return a velocity with the given values at sides of inflow."""
+        """Return the velocity with the values of `inflow` on the faces of inflow boundaries."""
         inflow = self.settings.inflow
         if inflow is None:
             return v
@@ -480,8 +490,8 @@ class FlowStep(Reconstructible):
         return {name: scalar.rate(v, s, params) for name, scalar in self.scalars.items()}
 
     def _check_convection(self, v: Any) -> None:
-        """Raise UnstableStepError if a wave that the flow carries would grow."""
-        total_flow = self._total_flow.apply(np.abs(plain(v)).astype(float))  # twice the mean |v| / h
+        """Raise UnstableStepError if convection would amplify a wave by more than MAX_GROWTH."""
+        total_flow = self._total_flow.apply(np.abs(plain(v)).astype(float))  # in each cell, 2 * sum of |v| / h
         fastest = 0.5 * float(np.max(total_flow, initial=0.0))
         courant = self.dt * fastest
         if not SAFE_COURANT < courant < np.inf:

@@ -1,13 +1,13 @@
 """Momentum: viscosity (face_laplacian, face_lift) and convection of a velocity on faces.
 
-Every component lives on its own faces. Along its own axis it is a field on nodes, and the wall faces hold the wall
-values. Along the other axes it is a field between walls half a cell away, with the condition that `FlowCondition.along`
-states for the velocity along a wall.
+Each velocity component is defined on the faces across its own axis. Along this axis its points include the walls, so
+that the faces on a wall hold the wall values themselves. Along the other axes the nearest wall is half a cell away from
+the outermost points; the boundary condition there is `FlowCondition.along`.
 
-The velocity of a wall therefore has two parts. Its normal component stands on the faces of the wall. Its tangential
-components are the wall velocities, a flat array on ``face_lift(grid, boundary).domain``: the velocities of moving walls
-and of a flow that enters at an angle. Viscosity takes them through `face_lift`, convection through its argument
-`walls`.
+The velocity of a wall is therefore given in two places. Its normal component is part of the face field. Its tangential
+components, of moving walls and of a flow that enters at an angle, are a separate flat array on
+``face_lift(grid, boundary).domain``, called the wall velocities. They enter viscosity through `face_lift`, and
+convection through its argument `walls`.
 """
 
 from __future__ import annotations
@@ -74,12 +74,12 @@ def face_laplacian(
     ----------
     grid : Grid
     boundary : flow condition or dict
-        no_slip, free_slip, inflow or outflow, for all bounded sides or as {"x": (lower, upper), ...}. The velocity of
-        moving walls is added with `face_lift`.
+        no_slip, free_slip, inflow or outflow, for all bounded sides or as {"x": (lower, upper), ...}. Walls are at rest
+        here; add the contribution of moving walls with `face_lift`.
     solid : bool array, shape `grid.shape`, optional
         Obstacles.
     solid_boundary : no_slip or free_slip
-        Condition along the obstacles.
+        Condition for the tangential velocity at obstacles.
 
     Returns
     -------
@@ -118,22 +118,22 @@ def face_laplacian(
 
 
 def face_lift(grid: Grid, boundary: Any = no_slip, solid: ArrayLike | None = None) -> Operator:
-    """Return the operator B from tangential wall velocities to their part of the Laplacian, L(v) + B(velocities).
+    """Return the operator B from tangential wall velocities to their contribution: the Laplacian is L(v) + B(walls).
 
     Parameters
     ----------
     grid : Grid
     boundary : flow condition or dict
-        As for `face_laplacian`. Walls with no_slip and inflows have a tangential velocity; sides of free_slip and
-        outflow have none, and no entry in the domain.
+        As for `face_laplacian`. Only no_slip and inflow boundaries have a tangential velocity; the domain has no
+        entries for free_slip and outflow boundaries.
     solid : bool array, shape `grid.shape`, optional
-        As for `face_laplacian`: faces that touch an obstacle get 0.
+        As for `face_laplacian`. The result is 0 on faces that touch an obstacle.
 
     Returns
     -------
     Operator
-        in: one flat array [velocity], wall after wall (x-lower, x-upper, y-lower, ...), for each the
-        components along it; ``op.domain.join(...)`` builds it from one number or array for each.
+        in: one flat array [velocity], ordered by wall (x-lower, x-upper, y-lower, ...) and for each wall by tangential
+        component; ``op.domain.join(...)`` builds it from one number or array for each of these components.
         out: faces [velocity / length^2].
 
     Raises
@@ -164,10 +164,12 @@ def face_lift(grid: Grid, boundary: Any = no_slip, solid: ArrayLike | None = Non
 def convection(grid: Grid, boundary: Any = no_slip, solid: ArrayLike | None = None) -> Callable[..., Any]:
     """Return ``convect(v, w, walls=None)``: the convection div(w v) of v by w on faces, by central differences.
 
-    Each component of v, and the velocity w that carries it, are averaged to the sides of its control volume. The flux
-    form conserves momentum and, where w has no divergence, energy.
+    Each component of v, and the convecting velocity w, are averaged to the sides of the control volumes of this
+    component. The flux form conserves momentum; if w is free of divergence, it also conserves energy.
 
         N(v, w) = C ((A v + E walls) (B w))
+
+    A and B are these averages, E inserts the wall velocities, and C is the divergence over the control volumes.
 
     Parameters
     ----------
@@ -181,8 +183,8 @@ def convection(grid: Grid, boundary: Any = no_slip, solid: ArrayLike | None = No
     callable
         ``convect(v, w)`` takes two face fields [velocity] and returns a face field [velocity^2 / length], 0 on faces
         that are not free; differentiable in all arguments, to every order. Order 2.
-        ``convect(v, w, walls)`` also takes the tangential velocity of v at walls and inflows, one flat array on
-        ``face_lift(grid, boundary).domain`` [velocity]. Default: 0, so that flow enters at right angles.
+        ``convect(v, w, walls)`` also takes the tangential velocity of v at walls and inflow boundaries, one flat array
+        on ``face_lift(grid, boundary).domain`` [velocity]. Default: 0, so that flow enters at a right angle.
 
     Raises
     ------
@@ -225,7 +227,7 @@ def convection(grid: Grid, boundary: Any = no_slip, solid: ArrayLike | None = No
     C = Operator(compose(free, gain.structure), gain.domain, grid.faces, "gain")
 
     def convect(v, w, walls=None):
-        # On walls where the carrying velocity w needs a wall velocity, the faces are not free: C drops the flux.
+        # w needs no wall velocities: they would matter only in fluxes to faces that are not free, which C sets to 0.
         return C(fluxes.carried(v, walls) * fluxes.carrier(w))
 
     return ReconstructibleFunction(convect, convection, *copied((grid, boundary, solid)))
@@ -235,9 +237,9 @@ def convection(grid: Grid, boundary: Any = no_slip, solid: ArrayLike | None = No
 
 
 def stresses(grid: Grid, sides: tuple, solid: ArrayLike | None, solid_boundary: Any) -> Structure:
-    """Return the Laplacian of each component: the stresses on the sides of a control volume, over its size.
+    """Return the Laplacian of each component: the net stress on the sides of a control volume, divided by its size.
 
-    With obstacles it includes the faces that they close, where it is the friction on the obstacle.
+    It is not set to 0 on faces that an obstacle closes: there it is the viscous force on the obstacle.
     """
     if solid_boundary not in (no_slip, free_slip):
         raise TypeError(f"solid_boundary needs dp.no_slip or dp.free_slip, got {solid_boundary!r}")
@@ -255,7 +257,7 @@ def stresses(grid: Grid, sides: tuple, solid: ArrayLike | None, solid_boundary: 
 
 
 class MomentumFluxes:
-    """The parts of div(w v) = gain(carried(v) * carrier(w)), on all faces, as in `convection`.
+    """The factors of div(w v) = gain(carried(v) * carrier(w)) on all faces, closed ones included.
 
     Parameters
     ----------
@@ -266,7 +268,7 @@ class MomentumFluxes:
     Attributes
     ----------
     gain : Operator
-        From the fluxes through the sides of control volumes to faces.
+        From the fluxes through the sides of control volumes to their divergence on faces.
     """
 
     def __init__(self, grid: Grid, sides: tuple) -> None:
@@ -275,7 +277,7 @@ class MomentumFluxes:
         carrier: dict = {}
         gain: dict = {}
         sites = []
-        # At walls: the tangential velocity is the value on the side itself.
+        # Sides that lie on a wall: the value there is the tangential velocity of the wall itself, not an average.
         wall_carried: dict = {}
         wall_carrier: dict = {}
         numbers = {pair: number for number, pair in enumerate(product(range(grid.dim), repeat=2))}
@@ -312,14 +314,14 @@ class MomentumFluxes:
         return kronecker_operator(self._walls, self._fluxes, self._wall_carrier_blocks, "carrier at walls")
 
     def carried(self, v: Any, walls: Any = None) -> Any:
-        """Return the velocity that is carried, at the sides of the control volumes of its components."""
+        """Return the convected velocity v, averaged to the sides of the control volumes of its components."""
         if walls is None:
             return self._carried(v)
         check_walls("convection", walls, self._walls)
         return self._carried(v) + self._wall_carried(walls)
 
     def carrier(self, w: Any, walls: Any = None) -> Any:
-        """Return the velocity that carries, at the same sides."""
+        """Return the convecting velocity w, averaged to the same sides."""
         if walls is None:
             return self._carrier(w)
         check_walls("convection", walls, self._walls)
@@ -330,15 +332,15 @@ class MomentumFluxes:
 
 
 class WallSide(NamedTuple):
-    """A wall with a tangential velocity, and a component of that velocity."""
+    """One tangential velocity component of one wall."""
 
-    axis: int  # across which the wall lies
+    axis: int  # axis to which the wall is perpendicular
     side: int  # 0 lower, 1 upper
-    component: int
+    component: int  # velocity component
 
 
 def wall_sides(grid: Grid, sides: tuple) -> list[WallSide]:
-    """Return one entry for each tangential component of each wall that has a tangential velocity."""
+    """Return one entry for each tangential component of each no_slip or inflow boundary."""
     return [
         WallSide(axis, side, component)
         for axis in range(grid.dim)
@@ -357,13 +359,13 @@ def wall_velocities(grid: Grid, sides: tuple) -> Space:
 
 
 def check_walls(name: str, walls: Any, space: Space) -> None:
-    """Raise unless wall velocities, one array or a batch of them, have the shape of their space."""
+    """Raise unless an array of wall velocities, or a batch of such arrays, has the shape of their space."""
     if np.shape(walls)[-1:] != space.shape:
         check_on(f"{name}, as walls,", walls, space, "; write face_lift(grid, boundary).domain.join(...)")
 
 
 def wall_stresses(grid: Grid, sides: tuple) -> Kronecker:
-    """Return the structure from tangential wall velocities to their part of the Laplacian, on all faces."""
+    """Return the map from tangential wall velocities to their contribution to the Laplacian on all faces."""
     blocks: dict = {}
     for part, (axis, side, component) in enumerate(wall_sides(grid, sides)):
         factor = differences(grid, axis) @ wall_slopes(grid, axis, side, dirichlet)
@@ -372,7 +374,7 @@ def wall_stresses(grid: Grid, sides: tuple) -> Kronecker:
 
 
 def free_faces(grid: Grid, sides: tuple, solid: ArrayLike | None) -> NDArray[np.bool_]:
-    """Return the mask of the faces whose velocity is unknown: not on closed walls, inflows and obstacles."""
+    """Return the mask of the faces whose velocity is unknown: all except those on walls, inflows and obstacles."""
     return faces_that(grid, sides, solid, lambda condition: condition == outflow)
 
 
@@ -380,7 +382,7 @@ def free_faces(grid: Grid, sides: tuple, solid: ArrayLike | None) -> NDArray[np.
 
 
 def _conditions_along(pair: tuple | None) -> tuple | None:
-    """Return the conditions of a velocity along both walls of an axis; None if it is periodic."""
+    """Return the conditions of the tangential velocity at both walls of an axis; None if the axis is periodic."""
     if pair is None:
         return None
     return tuple(condition.along for condition in pair)
@@ -396,7 +398,7 @@ def _second_differences(grid: Grid, component: int, axis: int, sides: tuple) -> 
 def _laplacian_around(grid: Grid, c: int, sides: tuple, closed: NDArray, condition: Any) -> sp.csr_array:
     """Return the Laplacian of component c with faces `closed` by obstacles.
 
-    The faces of the component are the cells of an auxiliary grid, on which the obstacles are solid cells.
+    The faces of the component are taken as the cells of an auxiliary grid, on which the obstacles are solid cells.
     """
     spacing = [np.ones(n) if a == c else grid.widths[a] for a, n in enumerate(grid.face_shape(c))]
     lattice = Grid(grid.face_shape(c), spacing=spacing, periodic=grid.periodic)
@@ -404,14 +406,14 @@ def _laplacian_around(grid: Grid, c: int, sides: tuple, closed: NDArray, conditi
     across = Mask(lattice.join(*(a != c for a in range(grid.dim))))
     slope = gradient(lattice, conditions, closed, condition).structure
     laplacian_across = compose(divergence(lattice).structure, compose(across, slope))
-    # Along its own axis a closed face holds the velocity of the obstacle itself.
+    # Along the component's own axis no condition is needed, because the closed faces hold the obstacle's velocity.
     blocks = {(0, 0): along(c, grid.dim, _second_differences(grid, c, c, sides))}
     laplacian_along = Kronecker(lattice.cells.parts, lattice.cells.parts, blocks)
     return total(laplacian_across, laplacian_along).explicit()
 
 
 def _wall_to_faces(grid: Grid, axis: int, side: int) -> Factor:
-    """Return the factor from the value at a wall to the faces across an axis."""
+    """Return the 1-D matrix that puts the value at a wall on the wall's face, among the faces across an axis."""
     nodes = grid.node_count(axis)
     wall = np.full(min(nodes, 1), side * (nodes - 1))
     return Factor.from_diagonals((nodes, 1), (wall, np.zeros_like(wall), np.ones(wall.size)))
@@ -420,7 +422,8 @@ def _wall_to_faces(grid: Grid, axis: int, side: int) -> Factor:
 def _nodes_to_centres(grid: Grid, c: int) -> Factor:
     """Return the means from nodes to cells.
 
-    On a bounded axis the wall values are added before and after them, for the half control volume of an open side.
+    On a bounded axis the two wall values are prepended and appended: they are the outer sides of the half control
+    volumes at the walls.
     """
     inner = mean_of_faces(grid, c)
     if grid.periodic[c]:
@@ -429,7 +432,7 @@ def _nodes_to_centres(grid: Grid, c: int) -> Factor:
 
 
 def _centres_to_nodes(grid: Grid, c: int) -> Factor:
-    """Return the differences of fluxes at cells (and walls) to nodes: (F[i] - F[i - 1]) / d[i]."""
+    """Return the differences (F[i] - F[i - 1]) / d[i] on nodes, of fluxes F at cell centres (and walls)."""
     if grid.periodic[c]:
         return slopes(grid, c, None)
     lower = wall_slopes(grid, c, 0, dirichlet).matrix

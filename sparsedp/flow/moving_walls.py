@@ -5,8 +5,8 @@ They are given in one of two forms:
 - a function ``walls(params)``, whose result holds the velocities themselves, one flat array on the domain of
   `face_lift` (`ChangingWalls`);
 - an array on faces, ``face_lift(grid, boundary)(velocities)``: the contribution of constant velocities to the
-  Laplacian of the flow (`ConstantWalls`). Viscosity takes it as it is. Convection needs the velocities at inflows,
-  which `velocities_from_lift` recovers.
+  Laplacian of the flow (`ConstantWalls`). Viscosity uses this array directly. Convection needs the velocities at inflow
+  boundaries, which `velocities_from_lift` recovers from the array.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ __all__ = ["ChangingWalls", "ConstantWalls", "WallsAtRest", "moving_walls", "vel
 
 
 def moving_walls(settings: FlowSettings, sides: tuple) -> WallsAtRest:
-    """Return the wall velocities of a flow step in the form in which they are given.
+    """Return the object that represents the wall velocities of a flow step, by the form in which they are given.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class WallsAtRest:
     Attributes
     ----------
     changes : bool
-        Whether the velocities depend on params; the state of a flow step then holds them.
+        Whether the velocities depend on params. If they do, the state of a flow step contains them.
     constant : array or None
         Constant velocities on the domain of `face_lift`, as convection needs them; None where they are 0.
     """
@@ -64,15 +64,15 @@ class WallsAtRest:
     constant: Any = None
 
     def velocities(self, params: Any, dtype: np.dtype) -> Any:
-        """Return the velocities for params on the domain of `face_lift`; None where convection needs none."""
+        """Return the velocities for params on the domain of `face_lift`; None if convection does not need them."""
         return self.constant
 
     def laplacian_part(self, velocities: Any) -> Any:
-        """Return what wall velocities add to the Laplacian of the flow; None for 0."""
+        """Return the contribution of wall velocities to the Laplacian of the flow; None stands for 0."""
         return None
 
     def laplacian_part_sum(self, before: Any, after: Any) -> Any:
-        """Return the sum of `laplacian_part` for the velocities at both ends of a step; None for 0."""
+        """Return the sum of `laplacian_part` for the velocities before and after a step; None stands for 0."""
         return None
 
 
@@ -81,7 +81,7 @@ class ConstantWalls(WallsAtRest):
 
     def __init__(self, settings: FlowSettings, sides: tuple) -> None:
         grid = settings.grid
-        # An implicit viscosity would carry values on faces that are not free into the fluid.
+        # Set to 0 on faces that are not free, because an implicit viscosity would spread these values into the fluid.
         self._lifted = mask(grid.faces, free_faces(grid, sides, settings.solid))(settings.walls)
         has_inflow = any(condition == inflow for pair in sides for condition in pair or ())
         if settings.convective and has_inflow:
@@ -124,7 +124,7 @@ class ChangingWalls(WallsAtRest):
 
 
 def velocities_from_lift(lifted: Any, grid: Grid, sides: tuple) -> Any:
-    """Return the wall velocities at inflows that `face_lift` mapped to an array on faces, and 0 at other walls.
+    """Recover the wall velocities at inflow boundaries from the result of `face_lift`; other walls get 0.
 
     Parameters
     ----------
@@ -141,12 +141,13 @@ def velocities_from_lift(lifted: Any, grid: Grid, sides: tuple) -> Any:
     Raises
     ------
     ValueError
-        If a face at an inflow touches a second wall: the array holds only the sum of both parts.
+        If a face at an inflow boundary also touches another wall with a velocity. The array then holds only the sum of
+        both contributions, from which they cannot be separated.
     """
     lift = compose(Mask(free_faces(grid, sides, None)), wall_stresses(grid, sides)).explicit().tocsr()
     walls = wall_velocities(grid, sides)
     is_inflow = np.array([sides[axis][side] == inflow for axis, side, _ in wall_sides(grid, sides)], bool)
-    wanted = np.repeat(is_inflow, np.diff(walls.offsets))  # wall velocities at inflows
+    wanted = np.repeat(is_inflow, np.diff(walls.offsets))  # mask of the wall velocities at inflow boundaries
     wall_count = np.diff(lift.indptr)  # number of wall velocities that each face depends on
     at_inflow = abs(lift) @ wanted > 0
     if np.any(gathered(plain(lifted))[at_inflow & (wall_count > 1)]):
@@ -154,7 +155,7 @@ def velocities_from_lift(lifted: Any, grid: Grid, sides: tuple) -> Any:
             "walls of flow_step got an array in which the velocities of walls that meet at an inflow are summed; write "
             "walls=lambda params: values, with values on face_lift(grid, boundary).domain"
         )
-    # Where a face depends on a single wall velocity, the velocity is the value on the face over the coefficient.
+    # If a face depends on a single wall velocity, this velocity is the value on the face divided by the coefficient.
     face, wall = lift.nonzero()
     invertible = (wall_count[face] == 1) & wanted[wall]
     coefficients = 1.0 / lift.data[invertible]

@@ -1,18 +1,21 @@
 """forces: drag, lift and torque on obstacles, from the momentum balance on the staggered grid.
 
-On every face the momentum equation is dv/dt = nu L v - div(v v) - G p. On a face that an obstacle closes, v remains 0
-although the right-hand side does not vanish: its sum, times the volumes of the faces, is the force on the obstacle.
-Fluxes cancel between neighbouring faces, so the sum over all faces equals the momentum that passes through the sides of
-the domain, to rounding. The sum over any other set of faces is the force on its content: the momentum that enters it.
+On every face the momentum equation is dv/dt = nu L v - div(v v) - G p. On the faces that an obstacle closes v remains 0
+although the right-hand side does not vanish. The sum over these faces of the right-hand side times the volume of the
+face is therefore the force on the obstacle. Fluxes between neighbouring faces cancel in such a sum: over all faces it
+equals the momentum that enters through the sides of the domain, up to rounding, and over any other set of faces it is
+the momentum that enters this set, which is the force on its content.
 
-brinkman: a friction nu k v that represents an obstacle of any shape. Next to a wall at rest the velocity grows with the
-distance s to the wall. With U(s) = log(1 + exp(b s)) / b, which is about s in the fluid and 0 in the obstacle, and
+brinkman: a friction nu k v that represents an obstacle of any shape. Next to a wall at rest the velocity is
+proportional to the distance s to the wall. With the smooth ramp U(s) = log(1 + exp(b s)) / b, which is about s in the
+fluid and about 0 in the obstacle, and
 
     k = sum over axes of (U(s + d) - 2 U(s) + U(s - d)) / (h^2 U(s)),     d: change of s over the cell width h,
 
-U solves nu (L U - k U) = 0 on the grid itself, wherever the wall lies between two faces and whatever its slope; the
-error is of order h^2. The second difference is log(1 + (cosh(b d) - 1) / (1 + cosh(b s))) / b. s and d are computed
-from any level set, in units of its change over a cell.
+U solves the discrete equation nu (L U - k U) = 0, for every position of the wall between two faces and every direction
+of its normal; the error is of order h^2. The second difference of U is
+log(1 + (cosh(b d) - 1) / (1 + cosh(b s))) / b. s and d are computed from any level set, by dividing it by its change
+over a cell.
 """
 
 from __future__ import annotations
@@ -57,11 +60,12 @@ if TYPE_CHECKING:
 
 __all__ = ["Forces", "brinkman", "forces"]
 
-SHARPNESS = 8.0  # b, per cell. Drag of a cylinder of 20 cells: error 0.29 %; with 6 and 12 it is 0.43 and 0.23 %
-# b s beyond which k is constant:
+# b, in units of 1 / cell. For the drag of a cylinder of 20 cells the error is 0.29 %; for b = 6 and 12: 0.43, 0.23 %.
+SHARPNESS = 8.0
+# Limits of b s, beyond which k is constant:
 DEEPEST = -24.0  # deep in the obstacle
-FARTHEST = 100.0  # far away, where k is below rounding
-FLAT = 1e-10  # change over a cell, relative to the largest level, that counts as 0
+FARTHEST = 100.0  # far from the obstacle, where k is smaller than rounding errors
+FLAT = 1e-10  # keeps the quotient by the change over a cell finite where the level, scaled to at most 1, is constant
 
 
 def forces(
@@ -72,7 +76,7 @@ def forces(
     cells: Any = None,
     about: float | ArrayLike = 0.0,
 ) -> Forces:
-    """Return ``on(v, p, viscosity)``: force and torque on an obstacle, or on the content of a set of cells.
+    """Return ``on(v, p, viscosity)``: the force and torque on an obstacle, or on the content of a set of cells.
 
     Parameters
     ----------
@@ -80,33 +84,36 @@ def forces(
     solid, boundary, solid_boundary
         As in `flow_step`.
     cells : slices or bool array, optional
-        The cells whose faces are summed, as in `flux`. Default: those of `solid`. For one obstacle among others, or a
-        box around an obstacle that is represented by a friction, such as `brinkman`.
+        The cells whose content the force acts on, as in `flux`: the sum is over their faces. Default: the cells of
+        `solid`. Use it to select one of several obstacles, or a box around an obstacle that is represented by a
+        friction, such as `brinkman`.
     about : float or one per axis [length]
         Reference point of the torque.
 
     Returns
     -------
     Forces
-        ``on(v, p, viscosity)`` takes faces [velocity], cells [velocity^2] and a number [length^2 / time], and returns
-        an array of shape (1,), (3,) or (6,): the force along x, y, z [velocity^2 length^(dim - 1)], then its torque
-        [times length], one number in 2-D; for a fluid of density 1. Differentiable. ``on.viscous`` (for viscosity 1)
-        and ``on.pressure`` are its linear parts, Operators; ``on.total`` sums any acceleration given on faces.
+        ``on(v, p, viscosity)`` takes a face field [velocity], a cell field [velocity^2] and a number [length^2 / time].
+        It returns an array of shape (1,) in 1-D, (3,) in 2-D or (6,) in 3-D: the components of the force
+        [velocity^2 length^(dim - 1)], then those of the torque [velocity^2 length^dim] (none in 1-D, one in 2-D). The
+        density is 1. Differentiable. The Operators ``on.viscous`` (for viscosity 1) and ``on.pressure`` are its linear
+        terms; the Operator ``on.total`` integrates any acceleration on faces to its force and torque.
         ``on(v, p, viscosity, walls)`` also takes tangential wall velocities, one flat array on
-        ``face_lift(grid, boundary).domain``. They matter where the cells touch a moving wall, or an inflow at an
-        angle. Default: 0.
+        ``face_lift(grid, boundary).domain``. They matter only if the cells touch a moving wall, or an inflow boundary
+        where the flow enters at an angle. Default: 0.
 
     Raises
     ------
     ShapeError
         If `solid` or `cells` has another shape than the grid.
     TypeError
-        If they are not boolean, or a condition is not a flow condition. On use, if the viscosity is not a number.
+        If `solid` or `cells` is not boolean, or a condition is not a flow condition. On use, if the viscosity is not a
+        number.
     ValueError
         If neither `solid` nor `cells` is given, or `about` is not finite. On use, if the viscosity is < 0.
     NonFiniteError
-        On use, if the viscosity is infinite, or if the result is not finite: NaN or too large numbers around the
-        obstacle.
+        On use, if the viscosity is infinite, or if the result is not finite because v or p holds NaN, infinity or
+        too large values around the obstacle.
 
     See Also
     --------
@@ -115,13 +122,13 @@ def forces(
     Notes
     -----
     Exact balance: at a steady state the force equals the momentum that enters through the sides of any box around the
-    obstacle. Fluid inside the cells contributes its change of momentum.
+    obstacle. If the cells contain fluid, the result includes the rate of change of the momentum of this fluid.
 
     Examples
     --------
     >>> from sparsedp import Grid
     >>> on = forces(Grid((3, 1), periodic=(False, True)), np.array([[False], [True], [False]]))
-    >>> on(np.zeros(7), np.array([[3.0], [9.0], [1.0]]), 0.1)  # pressure 3 before it, 1 behind it
+    >>> on(np.zeros(7), np.array([[3.0], [9.0], [1.0]]), 0.1)  # pressure 3 upstream, 1 downstream of it
     array([ 2.,  0., -1.])
     """
     check_grid("forces", grid)
@@ -135,7 +142,7 @@ def forces(
 def brinkman(grid: Grid) -> Callable[[Any], Any]:
     """Return ``friction(level)``: a friction that represents obstacles of any shape, differentiable in the shape.
 
-    Instead of a mask of solid cells, the momentum equation gets the term -viscosity * friction(level) * v. Order 2.
+    The term -viscosity * friction(level) * v in the momentum equation replaces a mask of solid cells. Order 2.
 
     Parameters
     ----------
@@ -144,17 +151,18 @@ def brinkman(grid: Grid) -> Callable[[Any], Any]:
     Returns
     -------
     callable
-        in: level on faces, a level set: 0 on the surface and < 0 in the obstacle, ideally the distance [any unit];
-        out: faces [1 / length^2], >= 0, and 0 away from the obstacle. Differentiable, to every order.
+        in: the values of a level set on faces [any unit]: 0 on the surface, < 0 in the obstacle and > 0 in the fluid,
+        ideally the signed distance to the surface; out: faces [1 / length^2], >= 0, and 0 away from the obstacle.
+        Differentiable, to every order.
 
     Raises
     ------
     ShapeError
-        On use, if the level has another shape.
+        On use, if the level has another shape than the faces.
     TypeError
-        On use, if it is not an array of real numbers.
+        On use, if the level is not an array of real numbers.
     NonFiniteError
-        On use, if it is NaN or infinite.
+        On use, if the level holds NaN or infinity.
 
     See Also
     --------
@@ -162,33 +170,35 @@ def brinkman(grid: Grid) -> Callable[[Any], Any]:
 
     Notes
     -----
-    The obstacle is at rest, and the cells around it should have about the same width. The fluid fills the obstacle,
-    where it hardly moves, and its pressure continues there: read the surface pressure a cell or two outside. Obstacles
-    thinner than a cell leak. If f is the solid fraction of a cell around each face, 0.5 - f is a (coarse) level set.
+    The obstacle is at rest, and the cells around it should have about the same width. The computed flow extends into
+    the obstacle, with almost no velocity but with a pressure: read the surface pressure one or two cells outside. Fluid
+    passes through obstacles that are thinner than a cell. If f is the solid fraction of the control volume of each
+    face, 0.5 - f is a (coarse) level set.
     The force on the obstacle is the sum of ``grid.faces.volumes * viscosity * friction(level) * v``. At a steady state
     it equals the result of `forces` for any set of cells that extends at least two cells beyond the obstacle.
 
     References
     ----------
     P. Angot, C.-H. Bruneau, P. Fabrie, Numer. Math. 81 (1999) 497-520.
-    E. W. Hester, G. M. Vasil, K. J. Burns, J. Comput. Phys. 430 (2021) 110043 (where such a wall is effective).
+    E. W. Hester, G. M. Vasil, K. J. Burns, J. Comput. Phys. 430 (2021) 110043 (effective position of such a wall).
 
     Examples
     --------
     >>> from sparsedp import Grid
     >>> friction = brinkman(Grid(4))
-    >>> np.round(friction(np.array([2.0, 1.0, 0.0, -1.0, -2.0])), 1)  # the wall stands on the third face
+    >>> np.round(friction(np.array([2.0, 1.0, 0.0, -1.0, -2.0])), 1)  # the wall is at the third face
     array([0.00000e+00, 1.00000e-01, 9.50000e+00, 2.06460e+03, 1.19138e+04])
     """
     check_grid("brinkman", grid)
-    face_laplacian(grid)  # raises for cells whose squared widths leave the range of floats
+    face_laplacian(grid)  # raises if the square of a cell width overflows or underflows
     differences = [
         (_difference(grid, axis, back=False), _difference(grid, axis, back=True)) for axis in range(grid.dim)
     ]
     meshes = [np.meshgrid(*grid.control_lengths("faces", c), indexing="ij", sparse=True) for c in range(grid.dim)]
     widths = [grid.join(*(mesh[axis] for mesh in meshes)) for axis in range(grid.dim)]
     inverse_squares = [np.divide(1, h, out=np.zeros_like(h), where=h > 0) ** 2 for h in widths]  # 0: no cells
-    in_obstacle = 2 * (np.cosh(SHARPNESS) - 1) * reduce(add, inverse_squares)  # where the level may be flat
+    # k deep in the obstacle, where the level may be constant:
+    in_obstacle = 2 * (np.cosh(SHARPNESS) - 1) * reduce(add, inverse_squares)
     domain_operator = differences[0][0]
 
     def friction(level):
@@ -210,9 +220,9 @@ def brinkman(grid: Grid) -> Callable[[Any], Any]:
 
 
 def _difference(grid: Grid, axis: int, back: bool) -> Operator:
-    """Return the difference of a face field to the next value along an axis, or (`back`) from the previous one.
+    """Return the forward difference of a face field along an axis or, if `back`, the backward difference.
 
-    At an end it is the only difference there is.
+    At an end of a bounded axis, where one of the two does not exist, both are the other one.
     """
     blocks = {}
     for component, part in enumerate(grid.faces.parts):
@@ -229,7 +239,7 @@ def _difference(grid: Grid, axis: int, back: bool) -> Operator:
 
 
 class Forces(Reconstructible):
-    """Force and torque on an obstacle, built by `forces`.
+    """Force and torque on an obstacle, as `forces` returns it.
 
     Parameters
     ----------
@@ -239,9 +249,9 @@ class Forces(Reconstructible):
     Attributes
     ----------
     total : Operator
-        From an acceleration on faces to its sum over the faces of the cells, and its torque.
+        From an acceleration on faces to its integral over the faces of the cells, and the torque of this force.
     viscous, pressure : Operator
-        The linear parts of the force, for viscosity 1.
+        The viscous force for viscosity 1, and the pressure force.
     """
 
     def __init__(
@@ -270,14 +280,14 @@ class Forces(Reconstructible):
 
     @cached_property
     def wall_friction(self) -> Operator:
-        """Operator from tangential wall velocities to their part of the viscous force, for viscosity 1."""
+        """Operator from tangential wall velocities to their contribution to the viscous force, for viscosity 1."""
         grid = self.total.domain.grid
         walls = wall_velocities(grid, self._sides)
         return self.total @ Operator(wall_stresses(grid, self._sides), walls, grid.faces, "wall stresses")
 
     @public("dp.forces(grid, solid)")
     def __call__(self, v: Any, p: Any, viscosity: Any, walls: Any = None) -> Any:
-        """Return the force and its torque; see `forces`."""
+        """Return the force and the torque; see `forces`."""
         check_number("the viscosity of forces", plain(viscosity), ">= 0")  # an array would broadcast over the torque
         stress = viscosity * self.viscous(v) + self.pressure(p)
         momentum = self._gain(self._fluxes.carried(v, walls) * self._fluxes.carrier(v, walls))

@@ -1,12 +1,12 @@
 """projection: the divergence-free part of a face field, as one Operator.
 
-With K, D, G and A = -D G as in projection_setup.py,
+With the mask K of open faces, the divergence D, the pressure gradient G and A = -D G, as in projection_setup.py,
 
     P v = K v + G p,          A p = D K v,          so that D P v = D K v - A p = 0,
     P^T g = K (g + D^T q),    A^T q = G^T g,        so that G^T P^T g = 0.
 
-On uniform grids without openings G = -K D^T: P is an orthogonal projection, and both lines are the same arithmetic. On
-stretched grids W P is symmetric, with W the volumes of the faces.
+On uniform grids without inflow or outflow G = -K D^T. Then P is an orthogonal projection, and both lines are the same
+computation. On stretched grids W P is symmetric, where W is the diagonal matrix of the volumes of the faces.
 
 References
 ----------
@@ -52,19 +52,19 @@ def projection(
     ----------
     grid : Grid
     solid : bool array, shape `grid.shape`, optional
-        Obstacles. Faces that touch one get 0.
+        Obstacles. The result is 0 on faces that touch an obstacle.
     boundary : flow condition or dict
-        no_slip, free_slip (both closed here), inflow (keeps the given velocity) or outflow (pressure 0), for all
-        bounded sides or as {"x": (lower, upper), ...}; axes that are not named are no_slip. The velocity at an inflow
-        is the value that the faces of that side already have.
+        no_slip, free_slip (here equivalent: the normal velocity is 0), inflow (the normal velocity is kept) or outflow
+        (pressure 0), for all bounded sides or as {"x": (lower, upper), ...}; axes that are not named are no_slip.
     method, rtol, maxiter, **options
-        Of the pressure solve, as in `inverse`.
+        Arguments of the pressure solve, as in `inverse`.
 
     Returns
     -------
     Projection
-        in: faces [velocity]; out: faces [velocity], with a divergence of 0 to `rtol`. ``P.pressure(v)`` is the
-        potential p [velocity length] with P(v) = v + G(p) in the interior; ``P.info`` holds the records of the solves.
+        in: faces [velocity]; out: faces [velocity], with a divergence that is 0 to the relative tolerance `rtol`.
+        ``P.pressure(v)`` returns the potential p [velocity length] with P(v) = v + G(p) on free faces; ``P.info``
+        records the solves.
 
     Raises
     ------
@@ -75,7 +75,7 @@ def projection(
     TypeError
         If `boundary` is not a flow condition.
     NonFiniteError
-        On use, if the velocity holds NaN or infinity anywhere, walls included.
+        On use, if the velocity holds NaN or infinity on any face, faces on walls included.
     ConvergenceError
         On use, if the solve does not meet `rtol`.
 
@@ -85,9 +85,9 @@ def projection(
 
     Notes
     -----
-    Null space: the pressure of a closed region is determined up to a constant, which is removed for each region.
-    Transpose: ``P.T(g)`` equals ``P(g)`` bit for bit on uniform grids without openings.
-    Cost: one pressure solve, forward and backward; one node on the tape.
+    Null space: in a region without an outflow the pressure is determined only up to a constant, which is removed.
+    Transpose: ``P.T(g)`` equals ``P(g)`` bit for bit on uniform grids without inflow or outflow.
+    Cost: one pressure solve for each application, forward or transposed; one node on the tape.
 
     References
     ----------
@@ -112,7 +112,7 @@ def projection(
 
 
 class Projection(Operator):
-    """The operator that `projection` returns, with its pressure and its records.
+    """The operator that `projection` returns, with its pressure and the records of its solves.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ class Projection(Operator):
 
     @property
     def method(self) -> str:
-        """Name of the method of the pressure solve."""
+        """Name of the solution method for the pressure."""
         return self.setup.inverse.method
 
     @cached_property

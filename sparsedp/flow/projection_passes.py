@@ -1,8 +1,9 @@
 """The two passes of a projection: b = D K x, the net flow out of the cells, and out = K (x + G p).
 
-K closes faces. Along each axis D and G are 1-D matrices with two entries in a row. The transposed projection has the
-same form, with G^T in place of D and D^T in place of G. `OperatorPasses` are products with the operators themselves;
-`CompiledPasses` do the same on separable grids, where each pass reads its fields once.
+K is the mask that sets closed faces to 0. Along each axis D and G are 1-D matrices with two entries in each row. The
+transposed projection has the same form, with G^T in place of D and D^T in place of G. `OperatorPasses` computes both
+passes as products with the operators themselves. `CompiledPasses` computes the same on separable grids by compiled
+loops, which are faster because each pass reads its fields only once.
 """
 
 from __future__ import annotations
@@ -33,9 +34,9 @@ class OperatorPasses:
     Parameters
     ----------
     first, second : Structure
-        From faces to cells (D), and back (G).
+        The operators from faces to cells (D) and from cells to faces (G).
     kept : array
-        K: 0 on closed faces, else 1.
+        The diagonal of K: 0 on closed faces, else 1.
     """
 
     def __init__(self, first: Structure, second: Structure, kept: NDArray) -> None:
@@ -63,8 +64,9 @@ class CompiledPasses:
     ----------
     grid : Grid
     lines : sequence of (kept, entries), one for each axis
-        Along the axis: which faces are not closed; and four rows of entries of each face: of G for the cells below and
-        above it, of D for the cells below and above it, all 0 if it is closed.
+        Arrays along the axis. `kept` is 1 for open and 0 for closed faces. `entries` has four rows with one entry for
+        each face: of G for the cell below and for the cell above the face, then of D for these two cells. The entries
+        of closed faces are 0.
     loops : module
         `sparsedp.kernels.projection`, which needs numba.
     """
@@ -80,7 +82,7 @@ class CompiledPasses:
             span = slice(*grid.faces.offsets[axis : axis + 2])
             self.parts.append((span, (1,) * missing + grid.face_shape(axis)))
             from_below, from_above, to_below, to_above = entries
-            # Of each cell, for its lower and its upper face.
+            # Entries of D for each cell: for its lower face and for its upper face.
             self.cell_entries.append(np.stack([to_above[:-1], to_below[1:]]))
             self.face_entries.append(np.stack([kept, from_below[: kept.size], from_above[: kept.size]]))
 
@@ -102,7 +104,7 @@ class CompiledPasses:
 
 
 def compiled_passes(grid: Grid, products: OperatorPasses) -> CompiledPasses | None:
-    """Return compiled loops that do the same; None without numba, or where an axis has entries of another kind."""
+    """Return the same passes as compiled loops; None without numba, or if D or G does not suit these loops."""
     if not kernels.compiled():
         return None
     from sparsedp.kernels import projection
@@ -110,7 +112,7 @@ def compiled_passes(grid: Grid, products: OperatorPasses) -> CompiledPasses | No
     lines = []
     for axis, faces in enumerate(grid.faces.split(products.kept)):
         n = grid.shape[axis]
-        kept = np.moveaxis(faces, axis, -1).reshape(-1, faces.shape[axis])[0]  # without obstacles all lines are equal
+        kept = np.moveaxis(faces, axis, -1).reshape(-1, faces.shape[axis])[0]  # all lines are equal without obstacles
         entries = face_entries(products.first, products.second, axis, n)
         if entries is None:
             return None

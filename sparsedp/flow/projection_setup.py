@@ -6,8 +6,8 @@ and on faces with a given velocity), and A = -D G,
     A p   = D K x,      w = K x + G p,
     A^T q = G^T g,      z = K (g + D^T q).
 
-The second line is the transpose of the map from x to w. The transpose of the map from x to p has a source s on cells
-instead of G^T g, and g = 0.
+The second line is the transpose of the map from x to w. For the transpose of the map from x to p, replace G^T g by the
+cotangent s of p, which is a cell field, and set g = 0.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ if TYPE_CHECKING:
 
 __all__ = ["ProjectionSetup", "faces_that", "pressure_conditions"]
 
-FEW_CELLS = 1024  # below, transforms are tried even where `inverse` would factor
+FEW_CELLS = 1024  # on grids with fewer cells, transforms are tried first, where `inverse` would factor the matrix
 
 
 class ProjectionSetup(Reconstructible):
     """The closed faces, D, G and the inverse of A = -D G of a projection.
 
-    The operators belong to a grid with lengths near 1: P does not depend on the unit of length, but squares of lengths
-    may leave the range of floats.
+    The operators are built on a copy of the grid whose lengths are scaled to about 1, so that squares of lengths do not
+    overflow or underflow. This does not change P, which is independent of the unit of length.
 
     Parameters
     ----------
@@ -56,22 +56,22 @@ class ProjectionSetup(Reconstructible):
     solid, boundary
         As `projection` takes them.
     settings : SolveSettings
-        Of the pressure solve.
+        Settings of the pressure solve.
 
     Attributes
     ----------
     sides : tuple
         The flow conditions as `resolve` returns them.
     open : bool array on faces
-        K.
+        The mask K of the faces that are not closed.
     exponent : int
-        Lengths of `grid` are 2**exponent times those of the grid of the operators.
+        The lengths of `grid` are 2**exponent times the lengths of the scaled grid.
     inverse : Inverse
         The inverse of A.
     products : tuple of two OperatorPasses
         The passes of the forward and of the transposed projection.
     passes : tuple
-        The passes that are used: compiled loops, or `products`.
+        The passes that are used: compiled loops if available, else `products`.
     """
 
     passes: tuple[OperatorPasses | CompiledPasses, ...]
@@ -100,11 +100,12 @@ class ProjectionSetup(Reconstructible):
     def _pressure_inverse(self, op: Operator) -> Any:
         """Return the inverse of A.
 
-        Transforms are preferred on small grids too, because the compiled passes need them.
+        On small grids too, transforms are preferred to a factorization, because only with transforms the compiled
+        passes can be used.
         """
         settings = self.settings
         if settings.method == "auto" and op.domain.size < FEW_CELLS and op.separable:
-            with suppress(ValueError):  # an axis that cannot be diagonalised accurately
+            with suppress(ValueError):  # raised if an axis cannot be diagonalised accurately
                 return build(op, replace(settings, method="separable"), "pressure solve")
         return build(op, settings, "pressure solve")
 
@@ -149,7 +150,7 @@ class ProjectionSetup(Reconstructible):
         return self.inverse.method == "separable" and self.grid.cells.size > 0
 
     def split(self, x: NDArray, out: NDArray, transposed: bool = False) -> NDArray:
-        """Set `out` to w (transposed: z) for a flat face field, and return p (q)."""
+        """Set `out` to w for a flat face field x, and return p; if `transposed`, set it to z and return q."""
         p = self._split(x, out, transposed)
         if self.nothing_flows:
             out[:] = 0.0
@@ -176,7 +177,7 @@ class ProjectionSetup(Reconstructible):
                 passes.net_flow(x, b)
         else:
             largest_entry = largest(x)
-            if 0 < largest_entry < np.inf and not in_range(largest_entry):  # squares would leave the range of floats
+            if 0 < largest_entry < np.inf and not in_range(largest_entry):  # squares would overflow or underflow
                 exponent = exponent_of(largest_entry)
                 p = self._split(shifted(x, -exponent), out, transposed)
                 out[:] = shifted(out, exponent)
@@ -194,12 +195,12 @@ class ProjectionSetup(Reconstructible):
         return p
 
     def pressure_transpose(self, source: NDArray, out: NDArray) -> None:
-        """Set `out` to z = K D^T q with A^T q = s: the transposed map to the pressure, for a flat source s."""
+        """Apply the transpose of the map from x to p: set `out` to z = K D^T q, where A^T q = s for the source s."""
         q = self.inverse.solver.solve(source, True, checked=False)
         self.passes[True].push(np.zeros(out.size), q, out)
 
     def _check_faces(self, x: NDArray, transposed: bool) -> None:
-        """Raise NonFiniteError with the first face whose velocity, or cotangent, is not finite."""
+        """Raise NonFiniteError that names the first face with a velocity, or cotangent, that is not finite."""
         space = self.grid.faces
 
         def place_of_face(index):
@@ -214,13 +215,13 @@ class ProjectionSetup(Reconstructible):
 
     @cached_property
     def nothing_flows(self) -> bool:
-        """Whether no flow is free of divergence: a closed line of cells. P is then 0, except for rounding errors."""
+        """Whether 0 is the only divergence-free flow: a line of cells with closed ends. P is then 0 up to rounding."""
         closed = all(pair and all(condition.closed for condition in pair) for pair in self.sides)
         return closed and sum(n > 1 for n in self.grid.shape) <= 1
 
     @cached_property
     def symmetric(self) -> bool:
-        """Whether P is its own transpose."""
+        """Whether P equals its transpose."""
         return all(self.grid.uniform) and all(condition.closed for pair in self.sides for condition in pair or ())
 
     def _check_inflow_can_leave(self) -> None:
@@ -242,7 +243,7 @@ class ProjectionSetup(Reconstructible):
 
 
 class ProjectionStructure(Turning):
-    """P or P^T on flat face fields, for a `ProjectionSetup`; solved in double precision and rounded once."""
+    """P or P^T on flat face fields, for a `ProjectionSetup`; computed in float64 and rounded once to the dtype of x."""
 
     def act(self, x: NDArray, out: NDArray) -> None:
         """Set `out` to the projection of x."""
@@ -250,9 +251,9 @@ class ProjectionStructure(Turning):
 
 
 class PressureStructure(Turning):
-    """The map from a face field to the p with P v = v + G p, or its transpose.
+    """The map from a face field v to the p with P v = v + G p, or its transpose.
 
-    Where only the slope of p is determined, its average is 0.
+    In a region where p is determined only up to a constant, its average is set to 0.
     """
 
     def act(self, x: NDArray, out: NDArray) -> None:
@@ -267,7 +268,7 @@ class PressureStructure(Turning):
 
 
 def pressure_conditions(grid: Grid, sides: tuple) -> dict[str, tuple]:
-    """Return the conditions of the pressure as `gradient` takes them: 0 at an outflow, elsewhere no slope."""
+    """Return the pressure conditions as `gradient` takes them: p = 0 at outflows, a slope of 0 on all other sides."""
     pairs = zip(grid.axes, sides, strict=True)
     return {axis: tuple(condition.pressure for condition in pair) for axis, pair in pairs if pair}
 
@@ -275,9 +276,9 @@ def pressure_conditions(grid: Grid, sides: tuple) -> dict[str, tuple]:
 def faces_that(
     grid: Grid, sides: tuple, solid: ArrayLike | None, open_side: Callable[[Any], bool]
 ) -> NDArray[np.bool_]:
-    """Return the flat mask of the faces in the interior and on the sides whose condition is open.
+    """Return the flat mask of the faces in the interior and on the sides with a condition that `open_side` accepts.
 
-    Faces that touch an obstacle are not in the mask.
+    Faces that touch an obstacle are False.
 
     Parameters
     ----------
@@ -286,12 +287,12 @@ def faces_that(
         The flow conditions as `resolve` returns them.
     solid : bool array or None
     open_side : callable
-        ``open_side(condition)``.
+        ``open_side(condition)`` returns whether faces on a side with this condition are True.
     """
     flat = np.ones(grid.faces.size, dtype=bool)
     for axis, (pair, part) in enumerate(zip(sides, grid.split(flat), strict=True)):
         for side, condition in zip((0, -1), pair or (), strict=False):
-            np.moveaxis(part, axis, 0)[side] = open_side(condition)  # a view of the flat mask
+            np.moveaxis(part, axis, 0)[side] = open_side(condition)  # a view: this sets `flat`
     if solid is None:
         return flat
     return flat & ~np.logical_or(*solid_faces(grid, check_solid(grid, solid)))

@@ -2,8 +2,9 @@
 
     s_next = s + dt (3/2 r(s, v) - 1/2 r_previous) + dt k (L (s + s_next) / 2 + D B),    r = source - D(v (A s + W)),
 
-with + k (L s + D B) in r where diffusion is explicit. B and W are the contributions of wall values to slopes and to the
-values on faces.
+for implicit diffusion. If diffusion is explicit, r also contains k (L s + D B), and the third term is omitted. D is the
+divergence, A the average from cells to faces, and k the diffusivity. B and W are the contributions of the wall values
+to the slopes and to the values on faces.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ class Scalar:
         self._divergence = divergence
         self._average = average(grid, boundary)
         self._wall_values: Any = 0.0  # on faces
-        self._wall_part: Any = None  # what wall values add to the Laplacian
+        self._wall_part: Any = None  # contribution of wall values to the Laplacian
         if values is not None:
             slopes = lift(grid, boundary)(values)
             self._wall_part = divergence(slopes)
@@ -76,7 +77,7 @@ class Scalar:
         self.diffusion = Diffusion(f"diffusivity of {name!r}", float(diffusivity), build_laplacian, settings)
 
     def rate(self, v: Any, scalars: dict[str, Any], params: Any) -> Any:
-        """Return the explicit part of the rate of change."""
+        """Return the explicit part r of the rate of change; see the module docstring."""
         u = scalars[self.name]
         rate = -self._divergence(v * (self._average(u) + self._wall_values))
         if self.source is not None:

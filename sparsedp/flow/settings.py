@@ -13,7 +13,7 @@ __all__ = ["FlowSettings"]
 
 @dataclass(frozen=True, eq=False)
 class FlowSettings:
-    """The arguments of `flow_step`; see there."""
+    """The arguments of `flow_step`, which documents them."""
 
     grid: Grid
     dt: float
@@ -32,10 +32,10 @@ class FlowSettings:
 
     @property
     def strict(self) -> bool:
-        """Whether a step that is too long for stability raises."""
+        """Whether an error is raised if dt is too large for stability."""
         return self.unstable == "raise"
 
     @property
     def may_be_implicit(self) -> bool:
-        """Whether `implicit` could be True: viscosity a number, and no friction."""
+        """Whether `implicit=True` is allowed: the viscosity is a number, and there is no friction."""
         return self.friction is None and not callable(self.viscosity)
