@@ -1,4 +1,4 @@
-"""Optimization over any nesting of arrays: minimize() and its methods."""
+"""Optimization of losses whose argument is an array or a nested structure (pytree) of arrays."""
 
 from sparsedp._utils.calls import describe_module
 

@@ -18,22 +18,23 @@ from sparsedp.optimize.result import Minimum, Record
 
 __all__ = ["ADMM"]
 
-IMBALANCE = 10.0  # ratio of the residuals beyond which the penalty changes
-PENALTY_FACTOR = 2.0  # by which it changes
-ADAPTIVE_ROUNDS = 50  # after these the penalty is constant
-INNER_TOLERANCE = 1e-6  # of the minimization in one round
+IMBALANCE = 10.0  # the penalty rho changes when one residual is more than this many times the other
+PENALTY_FACTOR = 2.0  # factor by which rho is multiplied or divided
+ADAPTIVE_ROUNDS = 50  # rho is constant after this number of iterations, which the convergence theory requires
+INNER_TOLERANCE = 1e-6  # tolerance of the minimization over x in each iteration
 
 
 class Round(NamedTuple):
-    """The result of one round.
+    """The result of one ADMM iteration.
 
     Attributes
     ----------
     x : tree
     image : array
-        K x.
+        The product K x.
     primal, dual : float
-        The residuals K x - z and rho K^T (z - z_before), each relative to its terms.
+        Norms of the primal residual K x - z and of the dual residual rho K^T (z - z_before). The primal norm is divided
+        by max(|K x|, |z|), the dual norm by |rho K^T w|.
     """
 
     x: Any
@@ -44,31 +45,34 @@ class Round(NamedTuple):
 
 @dataclass
 class ADMM:
-    """The method "admm" of `minimize`: the loss plus a sparsity term, by alternating directions.
+    """The method "admm" of `minimize`: minimize loss(x) + weight |K x|_1 by ADMM.
 
     Parameters
     ----------
     weight : float
-        Of the sum of absolute entries, not of an integral; required.
+        Factor of the 1-norm, which is the plain sum of absolute entries (not an integral over the grid). Required.
     operator : callable, optional
-        K, a linear map from x to an array. Default: x itself, which then is one array.
+        The linear map K from x to an array. Default: the identity; x must then be a single array.
     rho : float, optional
-        The first penalty. Default: chosen so that the threshold is the mean absolute entry of K x at the start.
+        Initial penalty parameter. Default: weight divided by the mean absolute entry of K x at the start, so that the
+        first threshold equals that mean.
     inner : int or callable
-        Iterations of lbfgs in a round; or ``inner(target, rho, x)``, which returns the x that minimizes loss(x) plus
-        rho / 2 times the sum of (K x - target)^2.
+        Number of L-BFGS iterations for the minimization over x in each ADMM iteration. Or a function
+        ``inner(target, rho, x)`` that returns the minimizer of loss(x) plus rho / 2 times the sum of (K x - target)^2.
     prox : callable, optional
-        ``prox(v, t)`` in place of the soft threshold. Then the values are those of the loss alone.
+        Proximal map ``prox(v, t)`` that replaces the soft threshold. The reported values then contain the loss only,
+        because the penalty that belongs to this map is unknown.
 
     Notes
     -----
-    With z = K x and a scaled multiplier w, each round takes
+    With the auxiliary variable z for K x and the scaled multiplier w, each iteration computes
 
         x = argmin loss(x) + rho / 2 |K x - z + w|^2,    z = prox(K x + w, weight / rho),    w = w + K x - z,
 
-    where prox is the soft threshold sign(v) max(|v| - t, 0), the proximal map of the 1-norm. rho is balanced so that
-    both residuals, K x - z and rho K^T (z - z_before), fall alike, each relative to its terms; so the units of the loss
-    do not matter. Converged when both are below the tolerance.
+    where prox is the soft threshold sign(v) max(|v| - t, 0), the proximal map of the 1-norm. The primal residual
+    K x - z and the dual residual rho K^T (z - z_before) are measured relative to the terms that they consist of, so
+    that the units of the loss do not matter. rho is adapted during the first iterations so that both residuals decrease
+    at a similar rate. The run has converged when both are at most the tolerance.
 
     References
     ----------
@@ -114,7 +118,7 @@ class ADMM:
         loss, start, maxiter, tolerance, callback, bounds
             As for `minimize`.
         minimize_smooth : callable
-            The function `minimize`, which solves the smooth problem of a round.
+            The function `minimize`, which solves the smooth problem for x in each iteration.
 
         Returns
         -------
@@ -166,7 +170,7 @@ class _Run:
         if options.prox is None:
             self._prox = soft_threshold
         else:
-            self._penalized = 0.0  # the penalty of another proximal map is not known
+            self._penalized = 0.0  # the function that belongs to the user's proximal map is unknown
         self._start_time = time.perf_counter()
         self._start_solves = thread.solves
         self.history: list[Record] = []
@@ -189,7 +193,7 @@ class _Run:
         return record
 
     def advance(self, number):
-        """Take round `number` and return its result."""
+        """Perform iteration `number` and return its result."""
         if self._rho is None:
             self._rho = self._first_rho()
         rho = self._rho
@@ -210,7 +214,7 @@ class _Run:
         self._largest = max(self._largest, norm(image))
         if np.any(self.z):
             size = max(norm(image), norm(self.z))
-        else:  # K x goes to 0: the sizes of the earlier terms and of the multiplier are the measure
+        else:  # z is 0, and K x may converge to 0 too: compare with an earlier K x or with the multiplier instead
             size = min(self._largest, norm(self._w))
         primal = norm(image - self.z) / (size or 1.0)
         dual = norm(pull(np.conj(self.z - z_before))) / (norm(pull(np.conj(self._w))) or 1.0)
@@ -219,12 +223,12 @@ class _Run:
         return Round(self.x, image, primal, dual)
 
     def _first_rho(self):
-        """Return the penalty for which the threshold is the mean absolute entry of K x at the start, 1 if all are 0."""
-        with np.errstate(over="ignore"):  # an infinite penalty is refused
+        """Return the initial rho, weight / mean |K x| at the start; the mean is replaced by 1 if it is 0."""
+        with np.errstate(over="ignore"):  # `advance` raises ValueError for an infinite rho
             return float(self._weight / np.float64(np.mean(np.abs(self.z)) or 1.0))
 
     def _balance(self, number, primal, dual):
-        """Change the penalty for the next round if one residual is much larger than the other."""
+        """Change rho for the next iteration if one residual is much larger than the other."""
         if number >= ADAPTIVE_ROUNDS or max(primal, dual) <= IMBALANCE * min(primal, dual):
             return
         factor = PENALTY_FACTOR if primal > dual else 1 / PENALTY_FACTOR
@@ -232,7 +236,7 @@ class _Run:
         self._w = self._w / factor
 
     def _minimized_by_lbfgs(self, target, rho):
-        """Return the x of a round, starting from the previous one, and the evaluations of the loss."""
+        """Minimize over x, starting from the previous x. Return the new x and the number of loss evaluations."""
         root = np.sqrt(rho)
 
         def augmented_loss(x):
@@ -247,18 +251,18 @@ class _Run:
         return best.x, best.evaluations
 
     def _minimized_by_user(self, target, rho):
-        """Return the x of a round from the user's function, with the entries of dicts in the order of the start."""
+        """Return the new x computed by the user's function, with dict entries in the same order as in the start."""
         x = self._inner(target, rho, self.x)
         entries = paired(x, self._start, "inner(target, rho, x)", advice="; return a tree like start")
         return flatten(self._start)[1](entries)
 
 
 def soft_threshold(v: Any, t: float) -> Any:
-    """Return the minimum over z of t |z| + |z - v|^2 / 2, real or complex."""
+    """Return, elementwise, the minimizer over z of t |z| + |z - v|^2 / 2. Real or complex."""
     size = np.abs(v)
     return v / np.where(size > 0, size, 1.0) * np.maximum(size - t, 0.0)
 
 
 def _identity(x):
-    """Return x as an array, also if it is a traced number."""
+    """Return x as an array; a scalar that autograd traces keeps its derivative."""
     return 1.0 * x

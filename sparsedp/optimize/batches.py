@@ -1,4 +1,4 @@
-"""The batch that the loss of an iteration is given."""
+"""Selection of the batch of data for each iteration of `minimize`."""
 
 from __future__ import annotations
 
@@ -8,28 +8,29 @@ from typing import Any
 
 __all__ = ["Batches"]
 
-PERIOD_OF_FUNCTION = 10  # a function does not say how many batches there are
+PERIOD_OF_FUNCTION = 10  # iterations used in the convergence test if `batches` is a function of unknown period
 
 
 class Batches:
-    """Batches by number of iteration, so that a resumed run gets the same ones.
+    """Batches of data, selected by the number of the iteration, so that a resumed run uses the same batches.
 
     Parameters
     ----------
     batches : None, sequence or callable
-        A sequence is used cyclically. A callable ``batches(iteration)`` is called once for each iteration.
+        A sequence is used cyclically. A function ``batches(iteration)`` returns the batch of an iteration.
 
     Attributes
     ----------
     varied : bool
-        Whether two iterations may have two losses.
+        Whether batches are used, so that the loss may differ from one iteration to the next.
     period : int
-        Number of iterations in which the gradient must be small: the length of a sequence, 10 for a function.
+        Number of successive iterations in which the gradient must be small for convergence: the length of a sequence,
+        or 10 for a function.
 
     Raises
     ------
     TypeError
-        If `batches` is neither.
+        If `batches` is not None, a sequence or callable.
     ValueError
         If the sequence is empty.
     """
@@ -57,7 +58,7 @@ class Batches:
         return batches[iteration % len(batches)]
 
     def at(self, iteration: int) -> tuple[Any, ...]:
-        """Return the arguments of the loss after x in an iteration: one batch, or none."""
+        """Return the arguments that follow x in a call of the loss: a tuple of one batch, empty without batches."""
         if not self.varied:
             return ()
         return (self._batch_of(iteration),)

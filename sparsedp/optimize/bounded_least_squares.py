@@ -19,22 +19,23 @@ if TYPE_CHECKING:
 
 __all__ = ["BoundedLeastSquares"]
 
-MOST_ROUNDS = 40  # solves with one set of free unknowns
-FULL_EXCHANGES = 3  # rounds without progress in which all unknowns on the wrong side are still exchanged
-TOLERANCE = 1e-12  # share of the largest entry of the gradient below which a multiplier is taken for 0
-FREE, AT_LOWER, AT_UPPER = 0, -1, 1  # where an unknown is
+MOST_ROUNDS = 40  # maximum number of pivoting iterations, each with one least-squares solve
+FULL_EXCHANGES = 3  # iterations without progress after which unknowns are exchanged one at a time
+TOLERANCE = 1e-12  # multipliers below this fraction of the largest gradient entry count as 0
+FREE, AT_LOWER, AT_UPPER = 0, -1, 1  # state of an unknown
 
 
 class BoundedLeastSquares:
-    """Minimize |J d + r|^2 + damping |unit d|^2 with lower <= x + d <= upper.
+    """Minimize |J d + r|^2 + damping |unit d|^2 over d, subject to lower <= x + d <= upper.
 
     Parameters
     ----------
     current : Evaluation
-        The point x.
+        The point x and its gradient.
     linearization : Linearization
-        r and J.
+        The residuals r and their Jacobian J at x.
     box : Box
+        The bounds on x.
     damping, unit : float
 
     Attributes
@@ -42,14 +43,15 @@ class BoundedLeastSquares:
     lower, upper : (n,) array
         Bounds on d.
     fixed : (n,) bool array
-        Unknowns with equal bounds.
+        True for unknowns whose lower and upper bounds are equal.
 
     Notes
     -----
-    Each unknown is free or at one of its bounds. The free ones are solved for. Then those that leave the box are set on
-    their bound, and those on a bound whose multiplier has the wrong sign are freed, until no unknown is on the wrong
-    side. Exchanging all of them at once takes few rounds; where their number stops falling, one at a time is exchanged.
-    The result has no larger model value than the projected gradient step, so that it is a direction of descent.
+    Each unknown is either free or at one of its bounds. Each iteration solves for the free unknowns. Free unknowns that
+    violate a bound are then set to that bound, and unknowns at a bound whose multiplier has the wrong sign become free.
+    The iteration ends when no unknown has to be exchanged. Exchanging all of them at once usually takes few iterations
+    but can cycle; if their number stops decreasing, only one is exchanged per iteration, which cannot cycle. If the
+    limit of iterations is reached, the better of the clipped step and the projected gradient step is returned.
 
     References
     ----------
@@ -73,14 +75,15 @@ class BoundedLeastSquares:
         solve: Callable[[Linearization, NDArray[np.float64]], NDArray[np.float64]],
         free: NDArray[np.bool_],
     ) -> NDArray[np.float64]:
-        """Return the minimum d.
+        """Return the minimizer d.
 
         Parameters
         ----------
         solve : callable
-            ``solve(linearization, r)``, the minimum without bounds; columns of J that are 0 give entries of 0.
+            ``solve(linearization, r)`` returns the minimizer without bounds. Its entries must be 0 where the columns of
+            J are 0.
         free : (n,) bool array
-            The unknowns that are free at first; the others are at the bound to which the negative gradient points.
+            The unknowns that are free initially. The others start at the bound to which the negative gradient points.
         """
         bound = np.where(self._gradient > 0, AT_LOWER, AT_UPPER)
         side = np.where(free & ~self.fixed, FREE, bound)
@@ -97,7 +100,7 @@ class BoundedLeastSquares:
                 full_exchanges = FULL_EXCHANGES
             elif full_exchanges > 0:
                 full_exchanges -= 1
-            else:  # exchange the last one alone: this rule does not cycle
+            else:  # exchange only the unknown with the largest index: this rule cannot cycle
                 wrong[: np.flatnonzero(wrong)[-1]] = False
             below = wrong & (side == FREE) & (step < self.lower)
             above = wrong & (side == FREE) & (step > self.upper)
@@ -107,7 +110,7 @@ class BoundedLeastSquares:
         return min((self._clipped(step), self.gradient_step()), key=self._model)
 
     def gradient_step(self) -> NDArray[np.float64]:
-        """Return the minimum of the model along the projected gradient."""
+        """Return the minimizer of |J d + r|^2 along the projected negative gradient, clipped to the bounds."""
         gradient = self._gradient
         held = ((self.lower == 0) & (gradient > 0)) | ((self.upper == 0) & (gradient < 0))
         direction = -np.where(held, 0.0, gradient)
@@ -123,14 +126,14 @@ class BoundedLeastSquares:
         return step * min(1.0, decrease / curvature)
 
     def _model(self, step):
-        """Return half of what is minimized, without its value at d = 0."""
+        """Return half of the minimized function at d = step, minus half of its value at d = 0."""
         image = self._linearization.jvp(step)
         damped = self._unit * step
         change = float(np.dot(image, self._linearization.flat + 0.5 * image))
         return change + 0.5 * self._damping * float(damped @ damped)
 
     def _minimum_over_free(self, solve, side):
-        """Return the minimum over the free unknowns, the others at their bounds, and J times it."""
+        """Return the step d that is optimal in the free unknowns while the others stay at their bounds, and J d."""
         free = side == FREE
         held = np.where(side == AT_LOWER, self.lower, np.where(side == AT_UPPER, self.upper, 0.0))
         r = self._linearization.flat
@@ -142,7 +145,7 @@ class BoundedLeastSquares:
         return step, self._linearization.jvp(step)
 
     def _on_wrong_side(self, side, step, image):
-        """Return which free unknowns are outside of the box and which others have a multiplier of the wrong sign."""
+        """Return True for free unknowns that violate a bound and for bound unknowns with a multiplier of wrong sign."""
         outside = (side == FREE) & ((step < self.lower) | (step > self.upper))
         held = (side != FREE) & ~self.fixed
         if not held.any():
@@ -153,5 +156,5 @@ class BoundedLeastSquares:
         return outside | (held & (side * multipliers > least))
 
     def _clipped(self, step):
-        """Return the nearest step inside the bounds."""
+        """Return the step with each entry clipped to its bounds."""
         return np.clip(step, self.lower, self.upper)

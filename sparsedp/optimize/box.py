@@ -19,29 +19,30 @@ if TYPE_CHECKING:
 
 __all__ = ["Box"]
 
-RELATIVE_ROUNDING = 4 * float(EPS)  # a step that ends on a bound may miss it by this share of x
+RELATIVE_ROUNDING = 4 * float(EPS)  # x + (bound - x) may differ from the bound by this multiple of |x|
 
 
 class Box:
-    """Lower and upper bounds of a flat vector; without bounds it changes nothing.
+    """Lower and upper bounds of the flat vector of unknowns; infinite if no bounds are given.
 
     Parameters
     ----------
     bounds : (lower, upper) or None
         As for `minimize`.
     packing : Packing, optional
-        Of the start; needed with bounds.
+        The map between trees like the start and flat vectors. Required if bounds are given.
 
     Attributes
     ----------
-    lower, upper : (n,) array, or a number without bounds
+    lower, upper : (n,) array, or float
+        -inf and inf if no bounds are given.
 
     Raises
     ------
     ValueError
         If bounds is not a pair, is NaN, or a lower bound is above an upper bound.
     ShapeError
-        If a side has another structure than start, or a bound another shape than its array.
+        If `lower` or `upper` has another tree structure than start, or a bound has another shape than its array.
     """
 
     def __init__(self, bounds: Any = None, packing: Packing | None = None):
@@ -70,18 +71,18 @@ class Box:
         return bool(np.any(self.lower > -np.inf) or np.any(self.upper < np.inf))
 
     def nearest(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the nearest point of the box."""
+        """Return the vector clipped to the bounds."""
         return np.clip(vector, self.lower, self.upper)
 
     def moved(self, vector: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the point of the box nearest to vector + step; entries within rounding of a bound are set to it."""
+        """Return vector + step, clipped to the bounds. Entries within rounding of a bound are set exactly to it."""
         point = self.nearest(vector + step)
         rounding = RELATIVE_ROUNDING * np.abs(vector)
         point = np.where(point - self.lower <= rounding, self.lower, point)
         return np.where(self.upper - point <= rounding, self.upper, point)
 
     def free(self, vector: NDArray[np.float64], gradient: ArrayLike) -> NDArray[np.bool_]:
-        """Return which entries can follow the negative gradient: not those that it pushes against a bound."""
+        """Return False for entries that are at a bound and that a step along the negative gradient would move out."""
         rounding = RELATIVE_ROUNDING * np.abs(vector)
         at_lower = (vector - rounding <= self.lower) & (np.asarray(gradient) > 0)
         at_upper = (vector + rounding >= self.upper) & (np.asarray(gradient) < 0)
@@ -89,7 +90,10 @@ class Box:
 
 
 def _flat_side(side, without_bound, packing, name):
-    """Return one side of the bounds as a flat vector; a number or None may stand for a whole branch of start."""
+    """Return the lower or the upper bounds as a flat vector.
+
+    A number or None in `side` may replace a subtree of start; it then applies to all entries of that subtree.
+    """
     bounds = packing.variables(side, name, advice="; write one number, None, or a tree like start", prefix=is_uniform)
     arrays = []
     for bound, x, bound_name, x_name in zip(bounds, packing.values, packing.names_under(name), packing.names):
@@ -100,7 +104,7 @@ def _flat_side(side, without_bound, packing, name):
 
 
 def _filled(x, bound, bound_name, x_name):
-    """Return a bound for every entry of x; a real one bounds both parts of a complex entry."""
+    """Return a bound for every entry of x; a real bound applies to the real and imaginary parts of complex entries."""
     dtype = np.asarray(bound).dtype
     if dtype.kind not in "biufc":
         raise TypeError(f"{bound_name}: expected numbers, got dtype {dtype}; write -np.inf or np.inf for none")

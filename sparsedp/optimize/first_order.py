@@ -34,12 +34,12 @@ class DescentState(NamedTuple):
     velocity : (n,) array
         The last step.
     rate : float
-        For the next step, per gradient divided by `gradient_unit`.
+        Learning rate of the next step, which multiplies gradient / gradient_unit.
     share : float
-        Of the next step, which is tried first.
+        Fraction of the next step that is tried first.
     gradient_unit : float
-        A power of two where the rate is searched for, so that the quotient of a length and a gradient is a float at any
-        scale of x and the loss; 1 where the rate is given.
+        A power of two near the norm of the first gradient, so that the rate neither overflows nor underflows at any
+        scale of x and the loss; 1 if the user gave the rate.
     """
 
     current: Evaluation
@@ -56,15 +56,16 @@ class GradientDescent(Method):
     Parameters
     ----------
     rate : float, optional
-        Step per gradient. Default: found by backtracking.
+        Learning rate. Default: found by backtracking.
     momentum : float
-        Share of the last step that is added, from 0 to below 1.
+        Factor of the previous step that is added to the new one, 0 <= momentum < 1.
     line_search : None or "backtracking"
-        "backtracking": halve the step until the loss falls sufficiently (Armijo), and try twice the length next time.
+        "backtracking": halve the step until the loss decreases sufficiently (Armijo condition). If the first trial is
+        accepted, the rate is doubled for the next iteration.
 
     Notes
     -----
-    v <- momentum v - rate g,  x <- x + v, with the gradient g of the loss at x.
+    Each iteration computes v <- momentum v - rate g and x <- x + v, where g is the gradient of the loss at x.
 
     References
     ----------
@@ -86,7 +87,7 @@ class GradientDescent(Method):
 
     @property
     def compares_losses(self) -> bool:
-        """Whether the step is halved until the loss falls."""
+        """Whether the step is halved until the loss decreases."""
         return self.line_search is not None or self.rate is None
 
     def begin(self, first: Evaluation) -> DescentState:
@@ -106,7 +107,7 @@ class GradientDescent(Method):
             evaluation, share, next_share = admissible(state.current.point, step, state.share, objective)
             return state._replace(current=evaluation, velocity=share * step, share=next_share)
         if np.dot(step, gradient) >= 0:
-            step = -state.rate * gradient  # momentum that goes uphill is dropped
+            step = -state.rate * gradient  # momentum made this an ascent direction: restart without it
         direction = "the projected gradient" if objective.box.bounded else "the gradient"
         evaluation, share, _ = backtracked(state.current, step, objective, direction)
         factor = share if share < 1 else 2.0
@@ -114,9 +115,9 @@ class GradientDescent(Method):
 
 
 def first_length(first: Evaluation) -> float:
-    """Return the length of a first step: |f| / |g|, which brings a linear loss to 0, but at most |x|.
+    """Return the length of the first step: the smaller of |f| / |g|, with which a linear loss becomes 0, and |x|.
 
-    A length that is 0 or infinite is ignored; 1 if both are.
+    A length that is 0 or infinite is ignored. If neither can be used, return 1.
     """
     gradient_norm = norm(first.gradient)
     lengths = [norm(first.point)]
@@ -132,7 +133,7 @@ def backtracked(
     direction: str,
     most: int = HALVINGS,
 ) -> tuple[Evaluation, float, float]:
-    """Halve a step until the loss falls sufficiently.
+    """Halve a step until the loss decreases sufficiently (Armijo condition).
 
     Parameters
     ----------
@@ -140,22 +141,24 @@ def backtracked(
     step : (n,) array
     objective : Objective
     direction : str
-        Name of the step in the message.
+        Name of the step in the error message.
     most : int
-        Number of lengths that are tried.
+        Maximum number of trial points.
 
     Returns
     -------
     evaluation : Evaluation
+        The accepted point.
     share : float
-        Of the step that was taken.
+        The fraction of the step that was accepted.
     share_of_decrease : float
-        Of the decrease that the gradient predicted; 1/2 at the minimum of a parabola.
+        The actual decrease of the loss divided by the decrease that the gradient predicts; 1/2 at the minimum of a
+        parabola.
 
     Raises
     ------
     NoStepFound
-        If no length gives a lower point.
+        If no trial point decreases the loss sufficiently.
     """
 
     def candidates() -> Iterator[tuple[NDArray[np.float64], float, float]]:
@@ -173,28 +176,29 @@ def backtracked(
 def admissible(
     point: NDArray[np.float64], step: NDArray[np.float64], share: float, objective: Objective
 ) -> tuple[Evaluation, float, float]:
-    """Halve a step until the loss has a value, without comparing losses.
+    """Halve a step until the loss is finite and raises no error; losses are not compared.
 
     Parameters
     ----------
     point, step : (n,) array
     share : float
-        Of the step, which is tried first.
+        The fraction of the step that is tried first.
     objective : Objective
 
     Returns
     -------
     evaluation : Evaluation
+        The accepted point.
     share : float
-        Of the step that was taken.
+        The fraction of the step that was accepted.
     next_share : float
-        To try first in the next iteration: twice as much, at most 1. So a region without a value does not cost all
-        halvings every time.
+        The fraction to try first in the next iteration: min(1, 2 share). Starting from the last accepted fraction
+        avoids repeating all halvings near a region in which the loss cannot be evaluated.
 
     Raises
     ------
     NoStepFound
-        If the loss has no value at any of the points.
+        If the loss cannot be evaluated at any of the trial points.
     """
     for _ in range(HALVINGS):
         evaluation = objective(objective.box.nearest(point + share * step))
@@ -211,12 +215,13 @@ class AdamState(NamedTuple):
     ----------
     current : Evaluation
     mean, mean_square : (n,) array
-        Running means of the gradient and of its square, in units of `gradient_unit`.
+        Running means of gradient / gradient_unit and of its square.
     steps : int
+        Number of iterations so far.
     gradient_unit : float
-        A power of two near the largest entry of the first gradient.
+        A power of two near the largest absolute entry of the first gradient.
     share : float
-        Of the next step, which is tried first.
+        Fraction of the next step that is tried first.
     """
 
     current: Evaluation
@@ -229,22 +234,23 @@ class AdamState(NamedTuple):
 
 @dataclass
 class Adam(Method):
-    """Adam: steps of about `rate` in every entry.
+    """Adam: gradient descent with a step of about `rate` in every entry of x.
 
     Parameters
     ----------
     rate : float
-        Size of a step in every entry.
+        Learning rate, the typical size of a step in every entry.
     betas : (float, float)
-        Memory of the running means of the gradient and of its square, each from 0 to below 1.
+        Decay rates b1 and b2 of the running means of the gradient and of its square, each in [0, 1).
     epsilon : float
-        Smallest root mean square that divides, relative to the first gradient. So a loss times 1e-12 takes the same
-        steps.
+        Added to the root mean square of the gradient in the denominator. It is relative to the first gradient, so that
+        the steps do not change when the loss is multiplied by a small number such as 1e-12.
 
     Notes
     -----
-    m <- b1 m + (1 - b1) g,  q <- b2 q + (1 - b2) g^2,  x <- x - rate m' / (sqrt(q') + epsilon) with
-    m' = m / (1 - b1^k) and q' = q / (1 - b2^k) in iteration k. A step to a refused point is halved.
+    Iteration k computes m <- b1 m + (1 - b1) g,  q <- b2 q + (1 - b2) g^2,  x <- x - rate m' / (sqrt(q') + epsilon)
+    with m' = m / (1 - b1^k) and q' = q / (1 - b2^k). Here g is the gradient divided by a power of two near the largest
+    entry of the first gradient. If the loss cannot be evaluated at the new point, the step is halved.
 
     References
     ----------
@@ -264,7 +270,7 @@ class Adam(Method):
 
     @property
     def compares_losses(self) -> bool:
-        """Never: every admissible step is taken."""
+        """False: every step to a point with a finite loss is accepted."""
         return False
 
     def begin(self, first: Evaluation) -> AdamState:

@@ -1,4 +1,4 @@
-"""L-BFGS that steps past refused points and inside bounds."""
+"""L-BFGS with bounds, and with a line search that avoids points at which the loss cannot be evaluated."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["LBFGS", "LBFGSState", "quasi_newton_step"]
 
-LEAST_CURVATURE = 1e-12  # a pair of step s and change y is used where s.y is more than this share of |s| |y|
+LEAST_CURVATURE = 1e-12  # a step s with gradient change y is used only if s.y exceeds this multiple of |s| |y|
 NO_LOWER_POINT = "the line search found no lower point"
 
 
@@ -34,9 +34,10 @@ class LBFGSState(NamedTuple):
     ----------
     current : Evaluation
     steps, changes : (k, n) array
-        The last k steps and changes of the gradient, oldest first; the changes in units of `gradient_unit`.
+        The last k steps and the corresponding changes of the gradient divided by `gradient_unit`, oldest first.
     gradient_unit : float
-        A power of two set at the start, so that no product of two changes leaves the range of floating-point numbers.
+        A power of two near the norm of the first gradient, so that products of two changes do not overflow or
+        underflow.
     """
 
     current: Evaluation
@@ -45,7 +46,7 @@ class LBFGSState(NamedTuple):
     gradient_unit: float
 
     def without_memory(self) -> LBFGSState:
-        """Return the state with no steps to take the curvature from."""
+        """Return the state with empty memory, so that the next step follows the negative gradient."""
         return self._replace(steps=self.steps[:0], changes=self.changes[:0])
 
 
@@ -56,18 +57,19 @@ class LBFGS(Method):
     Parameters
     ----------
     memory : int
-        Number of steps that the curvature is taken from.
+        Number of past steps that define the Hessian approximation.
     line_search : int
-        Most trial points in one line search.
+        Maximum number of trial points in one line search.
 
     Notes
     -----
-    x <- x - t H g, with H from the two-loop recursion of Nocedal over the last steps. The first step is |f| / |g| long,
-    which brings a linear loss to 0, but not longer than x. Nothing is absolute: a loss or an x times a power of two
-    takes the same steps.
+    Each iteration computes x <- x - t H g, where H is the inverse Hessian approximation by Nocedal's two-loop recursion
+    over the last steps. The length of the first step is the smaller of |f| / |g|, with which a linear loss becomes 0,
+    and |x|. No threshold is absolute: if the loss or x is multiplied by a power of two, the run takes the same steps.
 
-    An entry that the gradient presses against a bound stays; the step of the others is computed from their part of the
-    memory alone, and the line search follows the bounds.
+    An entry that is at a bound, and that the negative gradient would move out of it, is held fixed. The step of the
+    other entries uses only their components of the memory, and trial points of the line search are clipped to the
+    bounds.
 
     References
     ----------
@@ -89,12 +91,12 @@ class LBFGS(Method):
         return LBFGSState(first, no_steps, no_steps, power_of_two(norm(first.gradient)))
 
     def advance(self, state: LBFGSState, objective: Objective) -> LBFGSState:
-        """Return the state after one iteration; a line search that fails is repeated without the memory.
+        """Return the state after one iteration. A failed line search is repeated along the negative gradient.
 
         Raises
         ------
         NoStepFound
-            If there is no lower point along the gradient either.
+            If this second line search fails too.
         """
         following, lost_in_rounding = self._searched(state, objective)
         if following is None and len(state.steps):
@@ -106,7 +108,7 @@ class LBFGS(Method):
         raise NoStepFound(NO_LOWER_POINT)
 
     def _searched(self, state, objective):
-        """Return the state after a line search, or None, and whether the predicted decrease is lost in rounding."""
+        """Return the state after a line search, None if it failed; and whether rounding hides the expected decrease."""
         current = state.current
         step = _step_inside(state, objective.box)
         predicted = -float(np.dot(current.gradient, step))
@@ -119,7 +121,7 @@ class LBFGS(Method):
         return self._remembering(state, evaluation), lost_in_rounding
 
     def _remembering(self, state, evaluation):
-        """Return the state at a new point, with the last step and change of the gradient appended to the memory."""
+        """Return the state at a new point; the last step and its change of the gradient are appended to the memory."""
         step = evaluation.point - state.current.point
         change = evaluation.gradient / state.gradient_unit - state.current.gradient / state.gradient_unit
         steps = np.vstack([state.steps, step])[-self.memory :]
@@ -128,7 +130,7 @@ class LBFGS(Method):
 
 
 def _step_inside(state, box):
-    """Return the quasi-Newton step in the entries that the bounds leave free, 0 in the others."""
+    """Return the quasi-Newton step of the free entries; entries held at a bound get 0."""
     current = state.current
     free = box.free(current.point, current.gradient)
     if free.all():
@@ -143,15 +145,15 @@ def _step_inside(state, box):
 def quasi_newton_step(
     gradient: NDArray[np.float64], steps: NDArray[np.float64], changes: NDArray[np.float64], initial_scale: float
 ) -> NDArray[np.float64]:
-    """Return -H g with the inverse Hessian H of L-BFGS.
+    """Return -H g, where H is the L-BFGS approximation of the inverse Hessian.
 
     Parameters
     ----------
     gradient : (n,) array
     steps, changes : (k, n) array
-        The memory, oldest first. Pairs with too little curvature are ignored.
+        The past steps and changes of the gradient, oldest first. Pairs with too little curvature are ignored.
     initial_scale : float
-        H without a memory is this number times the identity.
+        If no pair is usable, H is this number times the identity.
 
     Returns
     -------

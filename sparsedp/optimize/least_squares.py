@@ -1,6 +1,6 @@
 """Gauss-Newton, Levenberg-Marquardt and half-inverse gradients.
 
-The loss is half the sum of squares of residuals r(x); J is their Jacobian.
+All of them minimize half the sum of squares of residuals r(x), whose Jacobian is J.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ if TYPE_CHECKING:
 
 __all__ = ["GaussNewton", "HalfInverse", "LevenbergMarquardt", "SquaresState"]
 
-RANK_TOLERANCE = 1e-12  # singular values below this share of the largest are taken for 0
-UNDAMPED_LENGTHS = 2  # of an undamped step that are tried: all of it and half of it
-POOR = 0.1  # share of the decrease predicted by the gradient, 1/2 for a parabola, below which the next step is damped
-FIRST_DAMPING = 1e-3  # of Gauss-Newton, relative to the largest diagonal entry of J^T J
-LEAST_DAMPING = 1e-6  # below which its steps are undamped again
-LSMR_ACCURACY = 1e-10  # relative
-LSMR_CONDITION = 1e14  # at which LSMR stops
-CHOLESKY_DAMPING = 1e-9  # relative to |J|^2: above it the Gram matrix, with rounding 1e-16, gives 6 digits of the step
+RANK_TOLERANCE = 1e-12  # singular values below this multiple of the largest count as 0
+UNDAMPED_LENGTHS = 2  # trial points along an undamped Gauss-Newton step: the full step and half of it
+POOR = 0.1  # next step is damped if actual / gradient-predicted decrease is below this (1/2 if r is linear)
+FIRST_DAMPING = 1e-3  # initial damping of Gauss-Newton, relative to the largest diagonal entry of J^T J
+LEAST_DAMPING = 1e-6  # relative damping below which Gauss-Newton returns to undamped steps
+LSMR_ACCURACY = 1e-10  # relative tolerances atol and btol of LSMR
+LSMR_CONDITION = 1e14  # LSMR stops when its estimate of the condition number exceeds this
+CHOLESKY_DAMPING = 1e-9  # damping / |J|^2 above which Cholesky of the Gram matrix gives 6 digits of the step
 
 
 class SquaresState(NamedTuple):
@@ -48,11 +48,12 @@ class SquaresState(NamedTuple):
     ----------
     current : Evaluation
     damping : float
-        Of the Jacobian divided by `unit`.
+        Damping parameter of the problem with the scaled Jacobian J / unit.
     share : float
-        Of the next step, which is tried first.
+        Fraction of the next step that is tried first.
     unit : float
-        A power of two for which the squares of J / unit are floats; 0 while it is unknown.
+        A power of two for which the squares of the entries of J / unit do not overflow or underflow; 0 until it is
+        known.
     """
 
     current: Evaluation
@@ -62,16 +63,16 @@ class SquaresState(NamedTuple):
 
 
 class LeastSquaresMethod(Method):
-    """What the least-squares methods share: their options, and steps of the linearized problem inside the bounds.
+    """Base class of the least-squares methods, with their common options.
 
     Attributes
     ----------
     apart : bool
-        Residuals along axis 0 are samples that depend on x independently.
+        True if the residuals along axis 0 belong to independent samples.
     absolute_sigma : bool
-        Whether the residuals are divided by their standard deviations.
+        True if the user divided the residuals by their standard deviations.
     forms_jacobian : bool or None
-        Whether J is formed; None: if it is small.
+        Whether the matrix J is computed. None: it is computed if it is small.
     """
 
     uses_residuals: ClassVar[bool] = True
@@ -84,7 +85,7 @@ class LeastSquaresMethod(Method):
         return SquaresState(first)
 
     def _check_common_options(self):
-        """Validate the options that all methods have."""
+        """Validate the options that all least-squares methods have."""
         check_choice("absolute_sigma", self.absolute_sigma, (True, False), "; the default is False")
         self.apart = bool(self.apart)
         self.absolute_sigma = bool(self.absolute_sigma)
@@ -93,7 +94,7 @@ class LeastSquaresMethod(Method):
 def _damped_step(
     current: Evaluation, linearization: Linearization, objective: Objective, damping: float, unit: float
 ) -> NDArray[np.float64]:
-    """Return the minimum d of |J d + r|^2 + damping |unit d|^2 for which the current point + d is inside the box."""
+    """Return the minimizer d of |J d + r|^2 + damping |unit d|^2, subject to the bounds on the current point + d."""
     if not objective.box.bounded:
         return _unbounded_step(linearization, linearization.flat, damping, unit)
     problem = BoundedLeastSquares(current, linearization, objective.box, damping, unit)
@@ -105,7 +106,7 @@ def _damped_step(
 
 
 def _unbounded_step(linearization, r, damping, unit):
-    """Return the minimum d of |J d + r|^2 + damping |unit d|^2."""
+    """Return the minimizer d of |J d + r|^2 + damping |unit d|^2, without bounds."""
     if linearization.dense:
         jacobian = linearization.jacobian()
         if unit != 1:
@@ -122,9 +123,10 @@ def _unbounded_step(linearization, r, damping, unit):
 
 
 def _negated_dense_step(jacobian, r, damping):
-    """Return -d for the minimum d of |J d + r|^2 + damping |d|^2.
+    """Return -d, where d minimizes |J d + r|^2 + damping |d|^2.
 
-    Where that is exact, by Cholesky of J J^T + damping or J^T J + damping: far faster than by singular values.
+    If the damping is large enough for an accurate result, a Cholesky factorization of J J^T + damping I or
+    J^T J + damping I is used, which is much faster than the singular values that are needed otherwise.
     """
     if damping <= CHOLESKY_DAMPING * np.linalg.norm(jacobian) ** 2:
         return DirectionFamily(1.0, damping, RANK_TOLERANCE).dense(jacobian, r).step
@@ -145,18 +147,18 @@ def _negated_dense_step(jacobian, r, damping):
 def _advance_damped(
     state: SquaresState, linearization: Linearization, objective: Objective, failure: str
 ) -> SquaresState:
-    """Return the state after a step with as much damping as it takes to lower the loss.
+    """Return the state after a damped step; the damping is increased until the step decreases the loss.
 
     Raises
     ------
     NoStepFound
-        With the message `failure`, if no damping is large enough.
+        With the message `failure`, if no trial value of the damping decreases the loss.
     """
     current = state.current
     unit = state.unit
 
     def candidates() -> Iterator[tuple[NDArray[np.float64], float, float]]:
-        """Yield points with ever more damping."""
+        """Yield trial points with increasing damping."""
         damping = state.damping
         growth = 2.0
         for _ in range(HALVINGS):
@@ -179,7 +181,7 @@ def _advance_damped(
 def _check_rounding(
     error: NoStepFound, current: Evaluation, linearization: Linearization, objective: Objective
 ) -> None:
-    """Raise a RoundingReached of a search again, unless a gradient step promises a visible decrease."""
+    """Re-raise a RoundingReached, unless a gradient step predicts a decrease that clearly exceeds rounding."""
     if isinstance(error, RoundingReached):
         gradient_step = BoundedLeastSquares(current, linearization, objective.box, 0.0, 1.0).gradient_step()
         if not objective.decrease_is_visible(current, gradient_step):
@@ -187,7 +189,7 @@ def _check_rounding(
 
 
 def _largest_column_norm(linearization: Linearization) -> float:
-    """Return the norm of the largest column of J; where J is not formed, its norm along the gradient."""
+    """Return the largest column norm of J. If J is not formed, return |J g| / |g| instead, with the gradient g."""
     if linearization.dense:
         jacobian = linearization.jacobian()
         unit = power_of_two(largest(jacobian))
@@ -198,22 +200,25 @@ def _largest_column_norm(linearization: Linearization) -> float:
 
 @dataclass
 class GaussNewton(LeastSquaresMethod):
-    """Gauss-Newton: the step that solves the linearized problem inside the bounds.
+    """Gauss-Newton: each step minimizes the linearized problem, subject to the bounds.
 
     Parameters
     ----------
     apart : bool
-        Residuals along axis 0 are samples that depend on x independently: a few products give J.
+        True if the residuals along axis 0 belong to independent samples. J is then computed by one product for each
+        residual of a sample; see `minimize`.
     dense : bool, optional
-        Whether J is formed, by products forward or in reverse, whichever are fewer. Default: if it has at most 3e7
-        entries and 4000 rows or columns. Otherwise LSMR with products of J and J^T.
+        True: compute the matrix J, by Jacobian-vector or vector-Jacobian products, whichever are fewer. False: solve
+        the linearized problem by LSMR, with products of J and J^T only. Default: True if J has at most 3e7 entries and
+        its shorter side is at most 4000.
     absolute_sigma : bool
-        Whether the residuals are divided by their standard deviations, so that the covariance is (J^T J)^(-1).
+        True if the residuals were divided by their standard deviations; the covariance is then (J^T J)^(-1).
 
     Notes
     -----
-    d minimizes |J d + r|^2,  x <- x + d. Where neither the step nor half of it lowers the loss, or only by far less
-    than predicted, the next steps are damped as in Levenberg-Marquardt until the linearized problem predicts well.
+    Each iteration computes the minimizer d of |J d + r|^2 and sets x <- x + d. If neither the step nor half of it
+    decreases the loss, or if the decrease is much smaller than predicted, the next steps are damped as in
+    Levenberg-Marquardt, until the linearized problem predicts the decrease well.
 
     References
     ----------
@@ -261,19 +266,20 @@ class GaussNewton(LeastSquaresMethod):
 
 @dataclass
 class LevenbergMarquardt(LeastSquaresMethod):
-    """Levenberg-Marquardt: damping falls where the linearized problem predicts well and grows where it does not.
+    """Levenberg-Marquardt: Gauss-Newton with a damping that adapts to the accuracy of the linearized problem.
 
     Parameters
     ----------
     damping : float
-        At the start, relative to the largest diagonal entry of J^T J.
+        Initial damping, relative to the largest diagonal entry of J^T J.
     apart, dense, absolute_sigma
         As for gauss_newton.
 
     Notes
     -----
-    d minimizes |J d + r|^2 + damping |d|^2,  x <- x + d. With the share s of the predicted decrease that was reached,
-    damping <- damping max(1/3, 1 - (2 s - 1)^3); where the loss does not fall it is multiplied by 2, 4, 8, ...
+    Each iteration computes the minimizer d of |J d + r|^2 + damping |d|^2 and sets x <- x + d. If the loss does not
+    decrease, the step is rejected and the damping is multiplied by 2, then by 4, 8, ... After an accepted step,
+    damping <- damping max(1/3, 1 - (2 s - 1)^3), where s is the actual decrease divided by the predicted one.
 
     References
     ----------
@@ -303,7 +309,7 @@ class LevenbergMarquardt(LeastSquaresMethod):
 
 @dataclass
 class HalfInverse(LeastSquaresMethod):
-    """Half-inverse gradients: each singular value of J to the power -1/2.
+    """Half-inverse gradients: a step between gradient descent and Gauss-Newton, J^T (J J^T)^(-3/4) r by default.
 
     Parameters
     ----------
@@ -312,19 +318,19 @@ class HalfInverse(LeastSquaresMethod):
     truncation : float
         As for dp.update_direction.
     power : float
-        p in the formula below.
+        The exponent p in the formula below.
     rank : int, optional
         As for dp.update_direction.
     apart : bool
         As for gauss_newton.
     form : "auto", "dense" or "krylov"
-        How the direction is computed; "auto" forms J if it is small.
+        "dense" computes the matrix J; "krylov" uses products with J and J^T only. "auto" selects "dense" if J is small.
     absolute_sigma : bool
         As for gauss_newton.
 
     Notes
     -----
-    x <- x - rate J^T (J J^T)^(-p) r. Losses are not compared.
+    Each iteration sets x <- x - rate J^T (J J^T)^(-p) r. Steps are accepted without comparing losses.
 
     References
     ----------
@@ -348,13 +354,13 @@ class HalfInverse(LeastSquaresMethod):
 
     @property
     def compares_losses(self) -> bool:
-        """Never: every admissible step is taken."""
+        """False: every step to a point with a finite loss is accepted."""
         return False
 
     def advance(self, state: SquaresState, objective: Objective) -> SquaresState:
         """Return the state after one iteration, on its batch. Raises NoStepFound if no admissible point is found."""
         linearization = objective.linearization(state.current).restricted(objective.free(state.current))
-        # Residuals and J divided by s give a direction divided by s^(2 - 2 power).
+        # r and J were divided by s, which divides the direction by s^(2 - 2 power): undo this.
         residual_scale: Any = objective.residual_scale
         scale = residual_scale ** (2.0 - 2.0 * self._family.power)
         step = -self.rate * scale * self._family(linearization, linearization.flat).step

@@ -1,4 +1,4 @@
-"""A line search for the weak Wolfe conditions that steps past refused points and along bounds."""
+"""A line search for the weak Wolfe conditions; trial points are clipped to the bounds and may have an infinite loss."""
 
 from __future__ import annotations
 
@@ -16,40 +16,42 @@ if TYPE_CHECKING:
 
 __all__ = ["line_search"]
 
-CURVATURE = 0.9  # the slope at the new point is at most this share of the slope at the start
-INTERIOR = (0.1, 0.9)  # the next point lies in this part of a bracket
-EXPANSION = 4.0  # factor of the step while the loss still falls steeply
+CURVATURE = 0.9  # the (negative) slope at an accepted point is >= this number times the slope at the start
+INTERIOR = (0.1, 0.9)  # the next trial point lies between these fractions of the bracket
+EXPANSION = 4.0  # growth factor of the step length until the minimum is bracketed
 
 
 def line_search(start: Evaluation, step: NDArray[np.float64], objective: Objective, limit: int) -> Evaluation | None:
-    """Return a point along a step that satisfies the weak Wolfe conditions, or the best one that is lower.
+    """Search along a step for a point that satisfies the weak Wolfe conditions.
 
     Parameters
     ----------
     start : Evaluation
     step : (n,) array
-        A direction of descent. The first trial point is start + step; points beyond the bounds are moved onto them.
+        A descent direction. The first trial point is start + step. Trial points are clipped to the bounds.
     objective : Objective
     limit : int
-        Most trial points.
+        Maximum number of trial points.
 
     Returns
     -------
     Evaluation or None
-        The first point that has fallen sufficiently and is flatter than the start; if there is none, the furthest that
-        has fallen sufficiently; None if there is none either.
+        The first trial point that satisfies both the sufficient decrease condition and the curvature condition. If
+        there is none, the one with the longest step that satisfies the sufficient decrease condition. If there is none
+        either, None.
 
     Notes
     -----
-    Bisection with quadratic interpolation. Every accepted step s and change y of the gradient have s.y > 0, which the
-    memory of a quasi-Newton method needs.
+    The method is a bisection with quadratic interpolation. At a point that satisfies both conditions, and where no
+    bound is active, the step s and the change y of the gradient have s.y > 0, which quasi-Newton updates require.
 
     References
     ----------
     A. S. Lewis, M. L. Overton, Nonsmooth optimization via quasi-Newton methods, Math. Program. 141, 2013.
     """
     start_slope = float(np.dot(start.gradient, step))
-    # The end of the bracket that has fallen sufficiently, and the other end, as multiples of the step.
+    # low: the end of the bracket that satisfies sufficient decrease; high: the end that does not. Lengths are multiples
+    # of the step.
     low = start
     low_length = 0.0
     low_slope = start_slope
@@ -57,7 +59,7 @@ def line_search(start: Evaluation, step: NDArray[np.float64], objective: Objecti
     high_length = np.inf
     length = 1.0
     for _ in range(limit):
-        with np.errstate(over="ignore", invalid="ignore"):  # a loss without a lower bound; infinity is refused
+        with np.errstate(over="ignore", invalid="ignore"):  # overflows if the loss has no lower bound
             unbounded = start.point + length * step
         point = objective.box.nearest(unbounded)
         trial = objective(point)
@@ -84,9 +86,10 @@ def line_search(start: Evaluation, step: NDArray[np.float64], objective: Objecti
 
 
 def _interpolated(low_value, predicted, high_value):
-    """Return where a parabola through both ends of a bracket has its minimum, as a share of the bracket.
+    """Return the minimizer of the interpolating parabola, as a fraction of the bracket measured from its low end.
 
-    `predicted` is the change of the loss across the bracket that the slope at the lower end predicts.
+    `predicted` is the slope at the low end times the length of the bracket. If the high end has an infinite value,
+    return 1/2.
     """
     share = 0.5
     if high_value < np.inf:

@@ -1,4 +1,4 @@
-"""minimize(): checks of the arguments, and the loop around the methods."""
+"""The function minimize(): validation of its arguments, and the iteration that calls the selected method."""
 
 from __future__ import annotations
 
@@ -67,117 +67,131 @@ def minimize(
     checkpoint: str | os.PathLike[str] | None = None,
     **options: Any,
 ) -> Minimum:
-    """Minimize a loss of any nesting of arrays; the result has the nesting of the start.
+    """Minimize a loss whose argument is an array or a nested structure (pytree) of arrays.
 
     Parameters
     ----------
     loss : callable
-        ``loss(x)``, a real scalar; with batches ``loss(x, batch)``. For gauss_newton, levenberg_marquardt and
-        half_inverse it returns residuals, an array, and half the sum of their squares is minimized. For
-        physical_gradient it is a function of the end state ``physics(x)``.
+        ``loss(x)``, or ``loss(x, batch)`` if `batches` is given, returns a real scalar. For gauss_newton,
+        levenberg_marquardt and half_inverse it returns an array of residuals, and half the sum of their squares is
+        minimized. For physical_gradient it is called with ``physics(x)`` in place of x.
     start : array, number, or any nesting of them in tuples, lists and dicts
-        Not modified. Leaves that are not floating are kept. Where a leaf is a field on ranks, PETSc's TAO minimizes,
-        by lbfgs, with bounds that are numbers, and without the other options.
+        The initial x. Not modified. Leaves that are not floating-point are constants and stay unchanged. If a leaf is a
+        field distributed over MPI ranks, PETSc/TAO performs the minimization; then only method="lbfgs" is available,
+        bounds must be numbers, and the other options cannot be used.
     method : str
         "lbfgs", "gd", "adam", "newton_cg", "gauss_newton", "levenberg_marquardt", "half_inverse",
-        "physical_gradient"; or "admm", which adds weight |K x|_1 to the loss, for results with few entries or jumps.
+        "physical_gradient", or "admm". The method "admm" adds weight |K x|_1 to the loss; use it for results that are
+        sparse or piecewise constant.
     maxiter : int
-        Most iterations; with 0 the start is evaluated and returned.
+        Maximum number of iterations. With 0 the loss is evaluated at the start, and the start is returned.
     tolerance : float or callable
-        Converged when the Euclidean norm of the gradient has fallen to `tolerance` times its value at the
-        start; nothing in the test is absolute. A callable ``tolerance(record, first_record)`` returns whether the run
-        has converged; `certified` also chooses the accuracy of the solves in the loss.
+        The run has converged when the Euclidean norm of the gradient is at most `tolerance` times its value at the
+        start. There is no absolute tolerance. A function ``tolerance(record, first_record)`` returns True if the run
+        has converged. With `certified` as tolerance, minimize also chooses the accuracy of the linear solves in the
+        loss.
     callback : callable, optional
-        ``callback(record, x)`` is called after every iteration; a true result stops the run.
+        ``callback(record, x)`` is called after every iteration. The run stops if it returns a true value.
     progress : bool or str
-        A progress bar on standard error, a string is its label; needs the extra `plot`.
+        Show a progress bar on standard error; a string is used as its label. Requires the extra `plot`.
     gradient : callable, optional
-        ``gradient(x)``, with the structure of x; entries of dicts are paired by key. Default: reverse mode.
+        ``gradient(x)`` returns the gradient, a tree with the structure of x; entries of dicts are matched by key.
+        Default: reverse-mode differentiation of the loss.
     bounds : (lower, upper), optional
-        Each a number, None for none, or a tree like start, in which a number or None may stand for a whole branch;
-        entries of dicts are paired by key. Points are moved onto the box. half_inverse compares
-        no losses and may converge to another point of the box than the other methods.
+        Each of the two is a number, None (no bound), or a tree like start. In a tree, a number or None may replace a
+        subtree and then applies to all of its entries; entries of dicts are matched by key. Points outside the bounds
+        are clipped. half_inverse does not compare losses, so with bounds it may converge to another point than the
+        other methods.
     project : callable, optional
-        ``project(x)``, a differentiable projection onto a linear or affine space, such as dp.projection(grid): the
-        loss of project(x) is minimized, and the result is project(x). The map is tested at the start and at the
-        result: one that is not affine, such as np.clip, or not idempotent is refused. Not together with bounds.
+        ``project(x)``, a differentiable projection onto a linear or affine space, such as dp.projection(grid).
+        loss(project(x)) is minimized, and the returned x is a projected one. At the start and at the result, test
+        points check that the map is affine and idempotent; otherwise, as for np.clip, ValueError is raised. Cannot be
+        used together with bounds.
     batches : sequence or callable, optional
-        The loss of iteration i is ``loss(x, batches[i % len(batches)])``, or ``loss(x, batches(i))``. For gd with a
-        rate, adam and half_inverse; the result is the last point, not the best one. Converged when the gradient has
-        been small in as many successive iterations as there are batches, 10 for a function.
+        In iteration i the loss is ``loss(x, batches[i % len(batches)])``, or ``loss(x, batches(i))`` for a function.
+        Available for gd with a rate, adam, half_inverse and physical_gradient. The result is the last point, not the
+        best one. The run has converged when the gradient has met the tolerance in len(batches) successive iterations
+        (10 for a function).
     checkpoint : path, optional
-        A folder that keeps the last two states. If the run was killed, interrupted, or stopped by its callback or by
-        maxiter, the same call continues from the last state, to the same bits. A new problem needs a new folder.
+        Folder in which the last two states of the run are stored. If the run was killed, interrupted, or stopped by
+        its callback or by maxiter, the same call continues from the last stored state and gives bitwise the same
+        result as a run without interruption. A new problem needs a new folder.
     **options
-        Of the method, see the table; any other option is refused.
+        Options of the method, listed in the table below. Any other option raises TypeError.
 
         ===================  ==============  ============  =============================================================
         method               option          default       meaning
         ===================  ==============  ============  =============================================================
-        lbfgs                memory          10            steps from which the curvature is estimated
-        lbfgs                line_search     20            most trial points in one line search
-        gd                   rate            None          step per gradient; None: found by backtracking
-        gd                   momentum        0.0           share of the last step that is added, 0 <= momentum < 1
-        gd                   line_search     None          "backtracking": halve the step until the loss falls
-        adam                 rate            1e-3          size of a step in every entry
-        adam                 betas           (0.9, 0.999)  memory of the mean of the gradient and of its square
-        adam                 epsilon         1e-8          least root mean square, relative to the first gradient
-        newton_cg            inner           200           most products with the Hessian in one iteration
-        gauss_newton         apart           False         whether residuals along axis 0 are samples, see below
-        gauss_newton         dense           None          whether the Jacobian is formed; None: if it is small
-        gauss_newton         absolute_sigma  False         whether residuals are in standard deviations, see below
-        levenberg_marquardt  damping         1e-3          at the start, relative to the largest diagonal entry of J^T J
+        lbfgs                memory          10            number of past steps that define the Hessian approximation
+        lbfgs                line_search     20            maximum number of trial points in one line search
+        gd                   rate            None          learning rate; None: found by backtracking
+        gd                   momentum        0.0           factor of the previous step that is added, in [0, 1)
+        gd                   line_search     None          "backtracking": halve the step until the loss decreases
+        adam                 rate            1e-3          learning rate: size of a step in every entry
+        adam                 betas           (0.9, 0.999)  decay rates of the two running means
+        adam                 epsilon         1e-8          added to the denominator, relative to the first gradient
+        newton_cg            inner           200           maximum number of Hessian products in one iteration
+        gauss_newton         apart           False         True: residuals along axis 0 are samples, see below
+        gauss_newton         dense           None          True: form the Jacobian; None: form it if it is small
+        gauss_newton         absolute_sigma  False         True: residuals have unit variance, see below
+        levenberg_marquardt  damping         1e-3          initial damping, relative to the largest entry of diag(J^T J)
         levenberg_marquardt  apart, dense    same          as for gauss_newton
         levenberg_marquardt  absolute_sigma  False         as for gauss_newton
         half_inverse         rate            1.0           factor of the step
-        half_inverse         power           0.75          p of the step J^T (J J^T)^-p r
+        half_inverse         power           0.75          the exponent p in the step J^T (J J^T)^-p r
         half_inverse         truncation      1e-10         see `update_direction`
         half_inverse         rank            None          see `update_direction`
         half_inverse         apart           False         as for gauss_newton
         half_inverse         form            "auto"        "dense", "krylov"; "auto" forms the Jacobian if it is small
         half_inverse         absolute_sigma  False         as for gauss_newton
         physical_gradient    physics         required      the simulator, as for `physical_gradient`
-        physical_gradient    inverse         required      its inverse
+        physical_gradient    inverse         required      the inverse simulator, as for `physical_gradient`
         physical_gradient    rate            1.0           factor of the step
-        admm                 weight          required      of the sum of absolute entries (not of an integral)
-        admm                 operator        None          K, linear, from x to an array; None: x itself, one array
-        admm                 rho             None          first penalty; None: chosen from the data
-        admm                 inner           10            steps of lbfgs in a round, or a function, see below
-        admm                 prox            None          ``prox(v, t)`` in place of the soft threshold
+        admm                 weight          required      factor of the sum of absolute entries of K x
+        admm                 operator        None          the linear map K from x to an array; None: the identity
+        admm                 rho             None          initial penalty parameter; None: chosen from the start
+        admm                 inner           10            L-BFGS iterations in each iteration, or a function, see below
+        admm                 prox            None          proximal map ``prox(v, t)`` that replaces the soft threshold
         ===================  ==============  ============  =============================================================
 
-        apart=True is the fast form for samples: the loss takes every leaf of x with a leading axis of copies, one for
-        each sample, and a few products give the whole Jacobian.
-        absolute_sigma: whether the residuals are divided by their standard deviations; it selects the formula of
-        `covariance`, as in scipy.optimize.curve_fit.
-        weight: for few jumps on a uniform grid write operator=dp.gradient(grid) and a weight times the volume
-        of a cell. inner: ``inner(target, rho, x)`` returns the x that minimizes loss(x) plus rho / 2 times the sum of
-        (K x - target)^2; then without bounds. With prox the values are those of the loss alone. Iterations of admm are
-        rounds, and a tolerance of 1e-4 is usual.
+        apart=True computes the Jacobian faster if the residuals along axis 0 belong to independent samples. The loss
+        must then accept every leaf of x with an additional leading axis, which holds one copy of x for each sample. The
+        number of vector-Jacobian products is the number of residuals of one sample.
+        absolute_sigma=True states that the residuals were divided by their standard deviations. It selects the formula
+        of `covariance`, as in scipy.optimize.curve_fit.
+        weight is not multiplied by cell volumes. For a piecewise constant result on a uniform grid write
+        operator=dp.gradient(grid), and multiply the weight by the volume of a cell.
+        inner may be a function ``inner(target, rho, x)`` that returns the minimizer of loss(x) plus rho / 2 times the
+        sum of (K x - target)^2; bounds cannot be used with it. With prox the reported values contain the loss only.
+        For admm a tolerance of about 1e-4 is usual.
 
     Returns
     -------
     Minimum
-        `.x`, `.value`, `.history` (a record for each iteration), `.message`, `.converged`,
-        `.evaluations`; str() is a table. `.x` is the best point seen. `.covariance` of a least-squares problem:
-        s^2 (J^T J)^(-1) with s^2 = |r|^2 / (m - n), or (J^T J)^(-1) with absolute_sigma=True.
-        Ctrl-C ends the run with the best point so far and the message "interrupted"; a second Ctrl-C stops at once.
+        The result, with the attributes `x` (the best point found), `value`, `history` (one record for each iteration),
+        `message`, `converged` and `evaluations`. For least-squares problems, `covariance` is s^2 (J^T J)^(-1) with
+        s^2 = |r|^2 / (m - n), or (J^T J)^(-1) with absolute_sigma=True. str() of the result is a table of the history.
+        Ctrl-C ends the run; the best point so far is returned, with the message "interrupted". A second Ctrl-C raises
+        KeyboardInterrupt at once.
 
     Raises
     ------
     ShapeError
-        If a side of the bounds, or what `project` returns, has another structure than start; DerivativeError for
-        `gradient`. The message gives the path of the entry.
+        If the lower or upper bounds, or the result of `project`, have another tree structure than start. The message
+        gives the path of the entry.
+    DerivativeError
+        If the result of `gradient` has another tree structure than start.
     ValueError
-        If the method is not known, or maxiter, tolerance, bounds or an option is out of range, or the checkpoint
-        folder holds a run with another method, options, bounds, start (static leaves too), loss or batches.
+        If the method is unknown; if maxiter, tolerance, bounds or an option is out of range; or if the checkpoint
+        folder contains a run with another method, options, bounds, start (constant leaves included), loss or batches.
     KeyboardInterrupt
-        If Ctrl-C comes before the loss is known at the start, or a second time.
+        If Ctrl-C is pressed before the loss has been evaluated at the start, or a second time.
     TypeError
         If the method has no such option, or an argument that must be a number is something else.
     UnstableStepError, ConvergenceError, NonFiniteError
-        If the loss raises one of them, or is NaN or infinite, at the start. At a trial point the same
-        counts as an infinite loss: the method tries a nearer point, and the record of the iteration lists it.
+        If the loss raises one of them at the start, or is NaN or infinite there. At a trial point these cases count as
+        an infinite loss: the method tries a point closer to the current one, and the record of the iteration lists the
+        rejected point.
     ImportError
         If `progress` is given and tqdm is not installed.
 
@@ -188,7 +202,7 @@ def minimize(
 
     Notes
     -----
-    Complex numbers: see docs/guides/complex_numbers.md.
+    For complex unknowns see docs/guides/complex_numbers.md.
 
     Examples
     --------
@@ -262,7 +276,7 @@ def minimize(
 
 
 def _run(method, objective, monitor, checkpoints, first_point, steps):
-    """Begin or resume a run, and iterate until the steps are used up, the monitor stops it or no step is found."""
+    """Start or resume a run. Iterate until maxiter is reached, the monitor ends the run, or no step is found."""
     state = method.begin(objective.evaluate_start(first_point))
     resumed_state = checkpoints.resume(state, objective, monitor)
     if resumed_state is None:
@@ -285,7 +299,7 @@ def _run(method, objective, monitor, checkpoints, first_point, steps):
 
 
 def _method(name, options):
-    """Return the method with its options."""
+    """Return an instance of the named method with the given options; raise if a name is unknown."""
     check_choice("method", name, METHODS)
     method_class: Any = METHODS[name]
     _check_names(name, options, [field.name for field in fields(method_class)])
@@ -293,7 +307,7 @@ def _method(name, options):
 
 
 def _certified(loss, gradient, tolerance, checkpoint):
-    """Return the loss and the gradient with the solves that a tolerance of `certified` chooses."""
+    """Return the loss and the gradient, wrapped so that `certified` sets the accuracy of their linear solves."""
     if checkpoint is not None:
         raise ValueError(
             "checkpoint cannot be used with a tolerance of dp.certified, whose solutions are not saved; leave "
@@ -303,7 +317,7 @@ def _certified(loss, gradient, tolerance, checkpoint):
 
 
 def _batches(batches, name, method):
-    """Return the batches by iteration; refuse them for a method that compares losses."""
+    """Return the batches; raise ValueError if the method compares losses, because those of two batches differ."""
     by_iteration = Batches(batches)
     if by_iteration.varied and method.compares_losses:
         raise ValueError(f"{name} compares losses and cannot use batches; write method='adam', or give gd a rate")
@@ -311,7 +325,7 @@ def _batches(batches, name, method):
 
 
 def _projection(project, box, packing, start):
-    """Return the projection of the unknowns; refuse it together with bounds."""
+    """Return the projection of the unknowns; raise ValueError if there are bounds too."""
     if box.bounded:
         raise ValueError(
             "project and bounds cannot be used together: a projected point may be outside of the bounds; leave one "
@@ -321,14 +335,14 @@ def _projection(project, box, packing, start):
 
 
 def _check_unused(method, arguments):
-    """Refuse arguments that a method does not use."""
+    """Raise TypeError if an argument that the method does not use was given."""
     for name, value in arguments.items():
         if value:
             raise TypeError(f"{method} does not use {name}; leave it out")
 
 
 def _check_names(method, options, names):
-    """Refuse options that a method does not have."""
+    """Raise TypeError for an option that the method does not have, with advice on similar names."""
     parameters = [parameter for parameter in signature(minimize).parameters if parameter != "options"]
     for option in options:
         if option in names:
@@ -342,7 +356,7 @@ def _check_names(method, options, names):
 
 
 def _check_tolerance(tolerance):
-    """Refuse a tolerance that is neither a function nor a number >= 0; infinity accepts any gradient."""
+    """Raise unless the tolerance is a function, a number >= 0, or infinity, which accepts any gradient."""
     infinite = is_number(tolerance) and tolerance == inf
     if not callable(tolerance) and not infinite:
         check_number("tolerance of minimize", tolerance, ">= 0", "; the default is 1e-8")
