@@ -1,12 +1,12 @@
-"""Boundary conditions: one for each side of each bounded axis, of a field or of a flow.
+"""Boundary conditions of fields and flows, one for each end of each bounded axis.
 
-All conditions have one form, a u + b du/dn = value at the wall, with n pointing outwards:
-dirichlet is (1, 0), neumann is (0, 1), robin(a, b) any other. With u_c the value in the cell next
-to the wall and h its width, the wall value and the slope follow from (u_w - u_c) / (h / 2) = du/dn:
+All conditions of fields have the form a u + b du/dn = value at the wall, where n is the outward normal: (a, b) is
+(1, 0) for dirichlet, (0, 1) for neumann, and arbitrary for robin(a, b). Let u_c be the value in the cell next to the
+wall and h the width of that cell. The wall value u_w and the slope then follow from (u_w - u_c) / (h / 2) = du/dn:
 
     du/dn = (value - a u_c) / (a h / 2 + b),        u_w = (b u_c + value h / 2) / (a h / 2 + b).
 
-A FlowCondition is the behaviour of a fluid at a wall: it implies conditions of the tangential velocity and of the
+A FlowCondition describes a fluid at a wall. It consists of a condition for the tangential velocity and one for the
 pressure.
 """
 
@@ -36,11 +36,12 @@ EXAMPLE = "; write for example robin(1.0, 0.5)"
 
 
 class Condition(Value):
-    """A boundary condition of a field: a u + b du/dn = value, n pointing outwards. Frozen, equal by value.
+    """A boundary condition of a field, a u + b du/dn = value, where n is the outward normal.
 
-    dirichlet: u = value. neumann: du/dn = value. robin(a, b): any other. Write one condition for all walls, or a dict
-    whose keys are axes: for each a condition, or a pair (lower, upper). Axes that are not named are neumann, periodic
-    ones have no walls. The value is 0 in an operator; `lift` adds other values.
+    dirichlet stands for u = value, neumann for du/dn = value, and robin(a, b) for all other conditions. An argument
+    `boundary` is either one condition for all walls, or a dict such as {"x": condition} or {"x": (lower, upper)}. Axes
+    that are missing in the dict get neumann. Periodic axes have no walls and must not be named. Operators use the value
+    0; add other values by `lift`. Conditions are immutable, and two conditions with the same a and b are equal.
 
     Parameters
     ----------
@@ -71,7 +72,7 @@ class Condition(Value):
         return self.a, self.b
 
     def __call__(self, value: Any) -> NoReturn:
-        """Refuse a value: those of walls are arguments of `lift`."""
+        """Raise TypeError, because a condition takes no value; boundary values are arguments of `lift`."""
         raise TypeError(f"{self} takes no value here; write G(u) + B(values), B = dp.lift(grid, dp.{self})")
 
     def __repr__(self) -> str:
@@ -87,14 +88,15 @@ dirichlet = Condition(
     0.0,
     """Fix the value of a field at a wall, u = value.
 
-    With u_c in the cell beside the wall, h the width of this cell and n pointing outwards::
+    Let u_c be the value in the cell next to the wall, h the width of this cell, and n the outward normal. Then::
 
         u_wall = value
         du/dn  = (value - u_c) / (h / 2)
 
-    In an operator the value is 0; `lift` adds other values. In `transport` it is the value `inflow`, where the velocity
-    points inwards. An argument ``boundary=`` of `gradient`, `laplacian`, `upwind`, `average`, `lift` and `transport`
-    takes it, alone for all walls or as an entry of a dict; ``solid_boundary=`` takes it for the walls of obstacles.
+    Operators use the value 0; add other values by `lift`. In `transport`, where the velocity points inwards, the value
+    is the argument `inflow`. Use this condition in the argument ``boundary=`` of `gradient`, `laplacian`, `upwind`,
+    `average`, `lift` and `transport`, alone (for all walls) or in a dict, and in ``solid_boundary=`` for the surfaces
+    of obstacles.
 
     See Also
     --------
@@ -118,17 +120,18 @@ dirichlet = Condition(
 neumann = Condition(
     0.0,
     1.0,
-    """Fix the slope of a field at a wall, du/dn = value, with n pointing outwards.
+    """Fix the slope of a field at a wall, du/dn = value, where n is the outward normal.
 
-    With u_c in the cell beside the wall and h the width of this cell::
+    Let u_c be the value in the cell next to the wall and h the width of this cell. Then::
 
         u_wall = u_c + value h / 2
         du/dn  = value
 
-    In an operator the slope is 0, an insulated or impermeable wall; `lift` adds other slopes. It is the condition of
-    axes that are not named. In `transport` a velocity that points inwards brings in the value of the cell at the wall.
-    An argument ``boundary=`` of `gradient`, `laplacian`, `upwind`, `average`, `lift` and `transport` takes it, alone
-    for all walls or as an entry of a dict; ``solid_boundary=`` takes it for the walls of obstacles.
+    Operators use the slope 0, as for an insulated or impermeable wall; add other slopes by `lift`. neumann is the
+    default for axes that a dict of conditions does not name. In `transport`, where the velocity points inwards, the
+    value that flows in is that of the cell at the wall. Use this condition in the argument ``boundary=`` of `gradient`,
+    `laplacian`, `upwind`, `average`, `lift` and `transport`, alone (for all walls) or in a dict, and in
+    ``solid_boundary=`` for the surfaces of obstacles.
 
     See Also
     --------
@@ -152,22 +155,22 @@ neumann = Condition(
 
 
 def robin(a: float, b: float) -> Condition:
-    """Return the condition a u + b du/dn = value, with n pointing outwards.
+    """Return the boundary condition a u + b du/dn = value, where n is the outward normal.
 
-    With u_c in the cell beside the wall and h the width of this cell::
+    Let u_c be the value in the cell next to the wall and h the width of this cell. Then::
 
         u_wall = (b u_c + value h / 2) / (a h / 2 + b)
         du/dn  = (value - a u_c) / (a h / 2 + b)
 
-    In an operator the value is 0; `lift` adds other values. A wall that exchanges heat with surroundings of the
-    temperature T is robin(h, k) with the value h T, for a heat transfer coefficient h and a conductivity k. An argument
-    ``boundary=`` of `gradient`, `laplacian`, `upwind`, `average` and `lift` takes it, alone for all walls or as an
-    entry of a dict; ``solid_boundary=`` takes it for the walls of obstacles. `transport` does not.
+    Operators use the value 0; add other values by `lift`. For example, a wall with heat transfer coefficient c and
+    conductivity k, in surroundings of temperature T, has the condition robin(c, k) with the value c T. Use robin in the
+    argument ``boundary=`` of `gradient`, `laplacian`, `upwind`, `average` and `lift`, alone (for all walls) or in a
+    dict, and in ``solid_boundary=`` for the surfaces of obstacles. `transport` does not accept it.
 
     Parameters
     ----------
     a, b : float
-        Finite, >= 0, not both 0; `b` carries [length] relative to `a`.
+        Finite, >= 0, not both 0. The unit of `b` is the unit of `a` times [length].
 
     Returns
     -------
@@ -176,9 +179,9 @@ def robin(a: float, b: float) -> Condition:
     Raises
     ------
     ValueError
-        If a weight is negative or not finite, or both are 0: the problem is not well posed.
+        If `a` or `b` is negative or not finite, or if both are 0.
     TypeError
-        If a weight is not a real number.
+        If `a` or `b` is not a real number.
 
     See Also
     --------
@@ -203,20 +206,21 @@ def robin(a: float, b: float) -> Condition:
 
 
 class FlowCondition(Value):
-    """The behaviour of a fluid at a wall: no_slip, free_slip, inflow or outflow. Frozen, equal by value.
+    """A boundary condition of a flow: no_slip, free_slip, inflow or outflow.
 
-    Write one for all walls, or a dict whose keys are axes, as for other conditions: axes that are not named are
-    no_slip.
+    An argument `boundary` is either one condition for all walls, or a dict such as {"x": condition} or
+    {"x": (lower, upper)}. Axes that are missing in the dict get no_slip. Conditions are immutable and compared by
+    value.
 
     Parameters
     ----------
     name : str
     closed : bool
-        Whether nothing passes.
+        True if no fluid passes through the wall.
     along : Condition
-        Of the velocity along the wall.
+        Condition of the velocity components parallel to the wall.
     pressure : Condition
-        Of the pressure.
+        Condition of the pressure.
     description : str, optional
         Docstring of the instance.
 
@@ -254,16 +258,17 @@ no_slip = FlowCondition(
     True,
     dirichlet,
     neumann,
-    """Make a fluid stick to a wall, where it has the velocity of the wall.
+    """Let the fluid have the velocity of the wall at the wall.
 
-    With v the component of the velocity across the wall, w one along it (w_c half a cell of width h away from the
-    wall), p the pressure and n pointing outwards::
+    Let v be the velocity component normal to the wall, w a tangential component, w_c its value at the distance h / 2
+    from the wall, where h is the cell width, p the pressure and n the outward normal. Then::
 
         v = 0,   w_wall = velocity of the wall,   dw/dn = (w_wall - w_c) / (h / 2),   dp/dn = 0
 
-    A wall is at rest, unless `face_lift` or the argument ``walls=`` of `flow_step` moves it along itself (a lid). It is
-    the condition of flow on axes that are not named. An argument ``boundary=`` of `projection`, `flow_step`,
-    `face_laplacian`, `face_lift`, `convection` and `forces` takes it; ``solid_boundary=`` takes it for obstacles.
+    Walls are at rest unless a tangential velocity is given by `face_lift` or by the argument ``walls=`` of `flow_step`
+    (as for a driven cavity). no_slip is the default for axes that a dict of conditions does not name. Use this
+    condition in the argument ``boundary=`` of `projection`, `flow_step`, `face_laplacian`, `face_lift`, `convection`
+    and `forces`, and in ``solid_boundary=`` for obstacles.
 
     See Also
     --------
@@ -271,7 +276,7 @@ no_slip = FlowCondition(
 
     Examples
     --------
-    A uniform flow between two walls is slowed down in the cells beside them:
+    A uniform flow between two walls is decelerated in the cells next to them:
 
     >>> import sparsedp as dp
     >>> channel = dp.Grid((1, 3), periodic=(True, False))
@@ -284,15 +289,17 @@ free_slip = FlowCondition(
     True,
     neumann,
     neumann,
-    """Let a fluid slip along a wall that nothing passes, without friction.
+    """Let the fluid slide along a closed wall without friction.
 
-    With v the component of the velocity across the wall, w one along it, p the pressure and n pointing outwards::
+    Let v be the velocity component normal to the wall, w a tangential component, p the pressure and n the outward
+    normal. Then::
 
         v = 0,   dw/dn = 0,   dp/dn = 0
 
-    This is also a plane of symmetry. An argument ``boundary=`` of `projection`, `flow_step`, `face_laplacian`,
-    `face_lift`, `convection` and `forces` takes it; ``solid_boundary=`` takes it for obstacles. In `conservation_law`
-    it is a wall that reflects waves: the cells are mirrored, and ``momentum=`` names the field that changes its sign.
+    A plane of symmetry has the same condition. Use this condition in the argument ``boundary=`` of `projection`,
+    `flow_step`, `face_laplacian`, `face_lift`, `convection` and `forces`, and in ``solid_boundary=`` for obstacles. In
+    `conservation_law` it is a reflecting wall: the ghost cells are mirror images of the cells at the wall, and
+    ``momentum=`` names the field whose sign is reversed.
 
     See Also
     --------
@@ -313,17 +320,19 @@ inflow = FlowCondition(
     False,
     dirichlet,
     neumann,
-    """Prescribe the velocity of a fluid on a side, as the faces of the side hold it.
+    """Prescribe the velocity of the fluid on a boundary.
 
-    With v the component of the velocity across the side, w one along it (w_c half a cell of width h away from the
-    side), p the pressure and n pointing outwards::
+    Let v be the velocity component normal to the boundary, w a tangential component, w_side its value on the boundary,
+    w_c its value at the distance h / 2 from it, where h is the cell width, p the pressure and n the outward normal.
+    Then::
 
-        v = value on the faces,   w_side = given,   dw/dn = (w_side - w_c) / (h / 2),   dp/dn = 0
+        v = prescribed,   w_side = prescribed,   dw/dn = (w_side - w_c) / (h / 2),   dp/dn = 0
 
-    A `projection` does not change v on these faces: set it in the first state, or by ``inflow=`` of `flow_step`. w_side
-    is 0, unless `face_lift` or ``walls=`` of `flow_step` gives it. A region with an inflow needs an outflow. An
-    argument ``boundary=`` of `projection`, `flow_step`, `face_laplacian`, `face_lift`, `convection` and `forces` takes
-    it. In `conservation_law` the state beyond the side is its argument ``inflow=``.
+    The value of v is that of the boundary faces in the velocity field, which `projection` does not change: set it in
+    the initial state, or by ``inflow=`` of `flow_step`. w_side is 0 unless it is given by `face_lift` or by ``walls=``
+    of `flow_step`. A domain with an inflow also needs an outflow. Use this condition in the argument ``boundary=`` of
+    `projection`, `flow_step`, `face_laplacian`, `face_lift`, `convection` and `forces`. In `conservation_law` the state
+    outside the boundary is given by the argument ``inflow=``.
 
     See Also
     --------
@@ -331,7 +340,7 @@ inflow = FlowCondition(
 
     Examples
     --------
-    What enters a channel passes all of it:
+    The flow through a channel is the same at all cross-sections:
 
     >>> import numpy as np
     >>> import sparsedp as dp
@@ -347,16 +356,17 @@ outflow = FlowCondition(
     False,
     neumann,
     dirichlet,
-    """Open a side to a fluid, with the pressure 0 there and a flow that is computed.
+    """Let the fluid leave through an open boundary, on which the pressure is 0.
 
-    With w a component of the velocity along the side, p the pressure (p_c in the cell beside the side, h the width of
-    this cell) and n pointing outwards::
+    Let w be a tangential velocity component, p the pressure, p_side its value on the boundary, p_c its value in the
+    cell next to the boundary, h the width of this cell and n the outward normal. Then::
 
         p_side = 0,   dp/dn = -p_c / (h / 2),   dw/dn = 0
 
-    The component across the side follows from the divergence, which is 0 in each cell; it may also point inwards. An
-    argument ``boundary=`` of `projection`, `flow_step`, `face_laplacian`, `face_lift`, `convection` and `forces` takes
-    it. In `conservation_law`, where it is the default, the last cell is repeated beyond the side, and waves leave.
+    The normal velocity is computed so that the divergence is 0 in each cell; it may also point inwards. Use this
+    condition in the argument ``boundary=`` of `projection`, `flow_step`, `face_laplacian`, `face_lift`, `convection`
+    and `forces`. In `conservation_law` it is the default: the ghost cells are copies of the last cell, so that waves
+    leave the domain.
 
     See Also
     --------
@@ -364,7 +374,7 @@ outflow = FlowCondition(
 
     Examples
     --------
-    What enters a channel leaves it at its open end:
+    The flow that enters a channel leaves it through the outflow boundary:
 
     >>> import numpy as np
     >>> import sparsedp as dp
@@ -380,16 +390,16 @@ outflow = FlowCondition(
 def resolve(
     grid: Grid, boundary: Any, default: Condition | FlowCondition = neumann
 ) -> tuple[tuple[Any, Any] | None, ...]:
-    """Return the conditions of both sides of each axis, from an argument `boundary`.
+    """Convert an argument `boundary` to one pair of conditions (lower, upper) for each axis.
 
     Parameters
     ----------
     grid : Grid
     boundary : condition or dict
-        One condition for all bounded sides, or a dict with keys "x", "y", "z", each a condition
-        or a pair (lower, upper). On a grid of one axis a pair needs no dict.
+        One condition for all walls, or a dict with keys "x", "y", "z" whose values are conditions or pairs
+        (lower, upper). On a 1-D grid a pair may be given without a dict.
     default : Condition or FlowCondition
-        Condition of the axes that are not named; its type is the type of all conditions.
+        Condition of the axes that the dict does not name. All conditions must have the same type as `default`.
 
     Returns
     -------
@@ -399,10 +409,10 @@ def resolve(
     Raises
     ------
     ValueError
-        If a periodic axis or an axis the grid does not have is named.
+        If the dict names a periodic axis, or an axis that the grid does not have.
     TypeError
-        If an entry is not a condition of the type of `default`, if a pair is given without an axis, or if `grid` is no
-        Grid.
+        If an entry is not a condition of the type of `default`, if a pair is given without an axis on a grid of more
+        than one axis, or if `grid` is not a Grid.
 
     Examples
     --------
@@ -457,7 +467,7 @@ def _sides(axis, entry, kind):
 
 
 def _instead(sides, kind):
-    """Return advice for an entry that is not a condition of a kind; empty if there is none."""
+    """Return advice for an entry that is not a condition of type `kind`; an empty string if there is none."""
     first = sides
     if isinstance(sides, (tuple, list)) and sides:
         first = sides[0]

@@ -1,13 +1,14 @@
-"""Grid: where cells, faces, nodes and edges are. The conventions of the library, stated once.
+"""Grid: the positions of cells, faces, nodes and edges, with the indexing conventions of the library.
 
-* Axis 0 is x, axis 1 is y, axis 2 is z: `field[i, j]` is the cell i along x and j along y.
+* Axis 0 is x, axis 1 is y, axis 2 is z: `field[i, j]` is the value in cell i along x and j along y.
 * Cells are numbered from the lower end; cell i of an axis lies between nodes i and i + 1.
 * Face i of an axis is the LOWER face of cell i. A bounded axis of n cells has n + 1 faces, the two
-  walls included; a periodic axis has n, and its face 0 lies between cell n - 1 and cell 0.
-* A face field is one flat array: all x-faces, then all y-faces, then all z-faces. Edges alike:
-  an x-edge runs along a cell in x and sits on nodes in the other axes.
-* Nodes sit on the corners: n + 1 along a bounded axis, n along a periodic one.
-* Lengths carry whatever unit the user chose; every docstring says [length].
+  walls included. A periodic axis has n faces, and its face 0 lies between cell n - 1 and cell 0.
+* A face field is one flat array: all x-faces, then all y-faces, then all z-faces. Edge fields are stored
+  in the same way: all x-edges, then all y-edges, then all z-edges. An x-edge is parallel to x; its
+  coordinates are those of a cell centre along x and of nodes along the other axes.
+* Nodes are the corners of cells: n + 1 along a bounded axis, n along a periodic one.
+* The user chooses the unit of length; docstrings write it as [length].
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ __all__ = [
 
 
 def _what_to_write(*shape, **options):
-    """Return what to write instead of a call that `Grid` refuses, such as Grid(64, 64) or Grid((64, 64), dx=0.1)."""
+    """Return the correct form of a wrong call of `Grid`, such as Grid(64, 64) or Grid((64, 64), dx=0.1)."""
     lengths = [n for n in shape if isinstance(n, (int, np.integer))]
     if len(lengths) == len(shape) > 1:
         return f"dp.Grid({tuple(map(int, lengths))})"
@@ -55,20 +56,22 @@ def _what_to_write(*shape, **options):
 
 
 class Grid(Value, Uncached):
-    """A box of cells in 1-D, 2-D or 3-D, with uniform or stretched spacing. Frozen, equal by value.
+    """A rectangular grid of cells in 1-D, 2-D or 3-D, with uniform or stretched spacing.
+
+    Grids are immutable, and two grids with the same values are equal.
 
     Parameters
     ----------
     shape : int or tuple of int
         Number of cells along each axis.
     size : float or sequence of float, optional
-        Extent of each axis [length]. Give `size` or `spacing`, not both; default unit cells.
+        Extent of the grid along each axis [length]. Give `size` or `spacing`, not both. Default: cells of width 1.
     spacing : float, sequence or array, optional
-        Cell width of each axis [length]; an entry may be an array of widths (stretched axis).
+        Cell width along each axis [length]. For a stretched axis the entry is an array with the width of each cell.
     origin : float or sequence of float
         Coordinate of the lower corner [length].
     periodic : bool or sequence of bool
-        Whether the last cell of an axis is followed by the first.
+        Whether each axis is periodic, so that its last cell is a neighbour of its first cell.
 
     Raises
     ------
@@ -77,7 +80,7 @@ class Grid(Value, Uncached):
     ValueError
         If a width is not positive and finite, or both `size` and `spacing` are given.
     TypeError
-        If a length is not a real number, or an entry of `periodic` not True or False.
+        If a length is not a real number, or an entry of `periodic` is not True or False.
 
     See Also
     --------
@@ -147,7 +150,7 @@ class Grid(Value, Uncached):
         return Space(None, kind, self, [self._part(kind, axis) for axis in range(self.dim)])
 
     def _part(self, kind, component):
-        """Return the shape of a component of a space."""
+        """Return the shape of component number `component` of the fields of a kind, such as "faces"."""
         on_nodes = node_axes(kind, component, self.dim) or ()
         lengths = list(self.shape)
         for axis in on_nodes:
@@ -159,12 +162,12 @@ class Grid(Value, Uncached):
         return self.shape[axis] + (not self.periodic[axis])
 
     def face_shape(self, axis: int) -> tuple[int, ...]:
-        """Return the shape of the component of a face field that crosses `axis`."""
+        """Return the shape of the values on the faces perpendicular to `axis`."""
         return self._part("faces", axis)
 
     @cached_property
     def volumes(self) -> Any:
-        """Cell volumes [length^dim], shape `grid.shape`, read-only."""
+        """Cell volumes [length^dim], a read-only array of shape `grid.shape`."""
         return self.cells.volumes
 
     @cached_property
@@ -178,9 +181,9 @@ class Grid(Value, Uncached):
         return tuple(bool(np.all(widths == widths[:1])) for widths in self.widths)
 
     def spacings(self, axis: int) -> NDArray:
-        """Return the distance between the neighbouring centres at each face of an axis [length].
+        """Return the distance between the centres of the two cells at each face of an axis [length].
 
-        At a wall it is the distance from the centre to the wall: half a cell.
+        At a wall it is the distance between the wall and the centre of its cell, which is half a cell width.
         """
         widths = self.widths[axis]
         if self.periodic[axis]:
@@ -188,7 +191,7 @@ class Grid(Value, Uncached):
         return 0.5 * (np.append(widths, 0.0) + np.append(0.0, widths))
 
     def control_lengths(self, kind: str, axis: int) -> list[NDArray]:
-        """Return the lengths along each axis whose products are the control volumes of a component."""
+        """Return one array of lengths for each axis; their outer product is the control volumes of a component."""
         on_nodes = node_axes(kind, axis, self.dim)
         if on_nodes is None:
             raise ShapeError(f"values on {kind} have no volumes; take those of grid.cells, faces, nodes or edges")
@@ -197,7 +200,7 @@ class Grid(Value, Uncached):
     def split(self, v: ArrayLike) -> tuple:
         """Return the components of a face field, or of an edge field in 3-D. Differentiable.
 
-        For an edge field in 2-D write ``grid.edges.split(v)``.
+        An edge field in 2-D can have the same size as a face field; for it write ``grid.edges.split(v)``.
 
         Parameters
         ----------
@@ -211,7 +214,7 @@ class Grid(Value, Uncached):
         Raises
         ------
         ShapeError
-            If `v` is neither.
+            If `v` has neither of the two shapes.
 
         Examples
         --------
@@ -223,14 +226,14 @@ class Grid(Value, Uncached):
         return (self.edges if on_edges else self.faces).split(v)
 
     def join(self, *parts: ArrayLike) -> Any:
-        """Return a face field, or an edge field in 3-D, as one flat array from its components. Differentiable.
+        """Join components into one flat face field, or into an edge field in 3-D. Differentiable.
 
         For an edge field in 2-D write ``grid.edges.join(*parts)``.
 
         Parameters
         ----------
         *parts : arrays, one for each axis
-            They broadcast to the shapes of the components.
+            Each is broadcast to the shape of its component.
 
         Returns
         -------
@@ -239,7 +242,7 @@ class Grid(Value, Uncached):
         Raises
         ------
         ShapeError
-            If the number of components or a shape does not fit.
+            If the number of components is wrong, or a component cannot be broadcast.
 
         Examples
         --------
@@ -250,13 +253,14 @@ class Grid(Value, Uncached):
         return (self.edges if on_edges else self.faces).join(*parts)
 
     def coordinates(self, axis: int, at: str = "cells") -> NDArray:
-        """Return the 1-D coordinates of cell centres, nodes or cell ends along one axis [length].
+        """Return the 1-D coordinates of cell centres, nodes or cell boundaries along one axis [length].
 
         Parameters
         ----------
         axis : int
         at : "cells", "nodes" or "ends"
-            The ends are the nodes and, on a periodic axis, also the end of the last cell.
+            "ends" gives the n + 1 boundaries of n cells. On a periodic axis this is one more than the nodes, because
+            the upper boundary of the last cell is the same node as the first one.
 
         Returns
         -------
@@ -270,7 +274,7 @@ class Grid(Value, Uncached):
         return ends
 
     def centres(self) -> tuple:
-        """Return the coordinates of the cell centres: a tuple of `dim` full arrays, also in 1-D.
+        """Return the coordinates of the cell centres: a tuple of `dim` arrays (a tuple of one in 1-D).
 
         Returns
         -------
@@ -284,7 +288,7 @@ class Grid(Value, Uncached):
         return self._mesh(["cells"] * self.dim)
 
     def face_centres(self, axis: int) -> tuple:
-        """Return the coordinates of the centres of the faces that cross `axis`: a tuple of `dim` full arrays.
+        """Return the coordinates of the centres of the faces perpendicular to `axis`, a tuple of `dim` arrays.
 
         Parameters
         ----------
@@ -303,12 +307,12 @@ class Grid(Value, Uncached):
         return self._mesh(["nodes" if a == axis else "cells" for a in range(self.dim)])
 
     def _mesh(self, places):
-        """Return the coordinates of points that are cells or nodes along each axis."""
+        """Return coordinate arrays as from np.meshgrid; `places` has "cells" or "nodes" for each axis."""
         lines = [self.coordinates(axis, at) for axis, at in enumerate(places)]
         return self.backend.mesh(self, lines)
 
     def axis(self, axis: int | str) -> int:
-        """Return the number of an axis that is given by its number or name ("x")."""
+        """Return the number of an axis, given its number or its name ("x"); raise ValueError if there is none."""
         number: Any = axis
         if isinstance(axis, str) and axis in AXES:
             number = AXES.index(axis)
@@ -319,7 +323,7 @@ class Grid(Value, Uncached):
         )
 
     def stored_by(self, backend: Backend) -> Grid:
-        """Return an equal grid whose fields are stored by a backend."""
+        """Return a copy of this grid whose fields are stored by another backend."""
         grid = object.__new__(type(self))
         Value.__init__(grid, **{**self.__getstate__(), "backend": backend})
         return grid
@@ -366,12 +370,12 @@ class Grid(Value, Uncached):
 
 
 def check_grid(name: str, grid: Any) -> None:
-    """Raise TypeError if an argument is not a Grid, or a function does not support where its fields are stored."""
+    """Raise TypeError if `grid` is not a Grid, or if the function `name` does not support its backend."""
     check_type(name, grid, Grid, "a Grid", "dp.Grid((64, 64), size=1.0)")
     grid.backend.check(name)
 
 
-# ---- arguments with one entry for each axis ----
+# ---- arguments of Grid that have one entry for each axis ----
 
 
 AXES = ("x", "y", "z")
@@ -386,7 +390,7 @@ def lengths(shape: Any) -> tuple[int, ...]:
 
 
 def node_axes(kind: str, component: int, dim: int) -> tuple[int, ...] | None:
-    """Return the axes along which values are placed on nodes, not on centres.
+    """Return the axes along which values are located at nodes; along the others they are at cell centres.
 
     Parameters
     ----------
@@ -399,7 +403,7 @@ def node_axes(kind: str, component: int, dim: int) -> tuple[int, ...] | None:
     Returns
     -------
     tuple of int, or None
-        None for a kind without places, such as walls.
+        None for a kind whose values have no control volumes, such as walls.
     """
     axes: dict[str, tuple[int, ...]] = {
         "cells": (),
@@ -422,7 +426,7 @@ def per_axis(value: Any, shape: tuple[int, ...], name: str) -> tuple:
 
 
 def real_numbers(entry: Any, name: str, example: str) -> NDArray:
-    """Return an array of real numbers; raise TypeError if an argument holds anything else."""
+    """Return an argument as an array; raise TypeError if its entries are not real numbers."""
     values = np.asarray(entry)
     if values.dtype.kind not in "biuf":
         raise TypeError(f"{name} needs real numbers, got {entry!r}; write for example {example}")
@@ -430,7 +434,10 @@ def real_numbers(entry: Any, name: str, example: str) -> NDArray:
 
 
 def numbers_per_axis(value: Any, shape: tuple[int, ...], name: str, needs: str = "") -> tuple[float, ...]:
-    """Return one finite float for each axis, in a required range such as "> 0"; a number is repeated."""
+    """Return one finite float for each axis; a scalar is repeated.
+
+    `needs` is an optional condition on the values, such as "> 0".
+    """
     advice = "; write one number for each axis, or one for all"
     return tuple(check_number(name, entry, needs, kind=advice) for entry in per_axis(value, shape, name))
 
@@ -451,7 +458,7 @@ def cell_widths(shape: tuple[int, ...], size: Any, spacing: Any) -> tuple[NDArra
         extents = numbers_per_axis(size, shape, "size", "> 0")
         spacing = [extent / max(n, 1) for n, extent in zip(shape, extents, strict=True)]
     elif len(shape) == 1 and isinstance(spacing, np.ndarray) and spacing.ndim == 1:
-        spacing = [spacing]  # in 1-D an array holds the widths of the one axis
+        spacing = [spacing]  # in 1-D an array is the cell widths of the only axis, not one entry for each axis
     elif spacing is None:
         spacing = 1.0
     entries = per_axis(spacing, shape, "spacing")

@@ -1,4 +1,4 @@
-"""Space: where the numbers of a field are placed, as a value. It stores no numbers."""
+"""Space: the shape of a field and the grid locations of its values. It stores no field values."""
 
 from __future__ import annotations
 
@@ -24,12 +24,13 @@ __all__ = ["Space", "components", "fits", "whole_lengths"]
 
 
 class Space(Value, Uncached):
-    """The place of a field: the cells, faces, nodes or edges of a grid, or a plain shape.
+    """The shape and location of a field: on the cells, faces, nodes or edges of a grid, or without a grid.
 
     Parameters
     ----------
     shape : int, tuple of int or None
-        For a space without a grid: ``Space(7)`` holds 7 numbers. None: one flat array of all `parts`.
+        Shape of a field; ``Space(7)`` is the space of arrays of 7 numbers, without a grid. None: a field is one flat
+        array that contains all `parts`.
     kind : str
         "cells", "faces", ... Set by Grid.
     grid : Grid or None
@@ -48,9 +49,9 @@ class Space(Value, Uncached):
 
     Notes
     -----
-    `shape` is the shape of a field. Cells and nodes have the shape of the grid of cells or nodes;
-    faces and edges are ONE flat array, component after component (x, then y, then z), each
-    component in C order with shape `parts[axis]`.
+    A field on cells or nodes has one array axis for each axis of the grid. A field on faces or edges is ONE flat array
+    in which the components follow each other (x, then y, then z); each component is stored in C order and has shape
+    `parts[axis]`.
 
     Examples
     --------
@@ -80,19 +81,19 @@ class Space(Value, Uncached):
 
     @cached_property
     def offsets(self) -> tuple[int, ...]:
-        """Where each component starts in the flat array, and where the last one ends."""
+        """Start index of each component in the flat array, followed by the total size."""
         return (0, *accumulate(map(prod, self.parts)))
 
     @cached_property
     def backend(self) -> Backend:
-        """Where the fields are stored."""
+        """The backend that stores the fields: NumPy, or blocks on MPI ranks."""
         if self.grid is None:
             return NUMPY
         return self.grid.backend
 
     @cached_property
     def volumes(self) -> Any:
-        """Control volume of each value [length^dim]; ones in a space without a grid."""
+        """Control volume of each value [length^dim]; 1 for every value in a space without a grid."""
         return self.backend.volumes(self)
 
     def array_of_volumes(self) -> NDArray:
@@ -100,7 +101,7 @@ class Space(Value, Uncached):
         if self.grid is None:
             return np.ones(self.shape)
         flat = []
-        with np.errstate(over="ignore"):  # infinite volumes are refused below
+        with np.errstate(over="ignore"):  # infinite volumes raise an error below
             for axis in range(len(self.parts)):
                 lengths = self.grid.control_lengths(self.kind, axis)
                 flat.append(reduce(np.multiply.outer, lengths).ravel())
@@ -119,7 +120,7 @@ class Space(Value, Uncached):
         Returns
         -------
         Space
-            Its fields have the shape `parts[axis]`, as those that `split` returns.
+            The space of fields of shape `parts[axis]`, which `split` returns.
 
         Raises
         ------
@@ -160,7 +161,7 @@ class Space(Value, Uncached):
         return self.backend.split(self, v)
 
     def split_array(self, v: Any) -> tuple:
-        """Return the components of an array, traced or not: see `split`."""
+        """Return the components of an array, which autograd may be tracing: see `split`."""
         check_plain("split", v)
         if len(self.parts) == 1:
             return (anp.reshape(v, self.parts[0]),)
@@ -172,8 +173,8 @@ class Space(Value, Uncached):
         Parameters
         ----------
         *parts : arrays
-            They broadcast to the shapes in `self.parts`, or differ from them by axes of length 1 only, as the values
-            along one wall do.
+            Each component is broadcast to its shape in `self.parts`. A component with the right number of entries may
+            also lack axes of length 1, or have additional ones; so the values on a wall need no axis across the wall.
 
         Returns
         -------
@@ -182,7 +183,7 @@ class Space(Value, Uncached):
         Raises
         ------
         ShapeError
-            If the number of components or a shape does not fit.
+            If the number of components is wrong, or a component cannot be broadcast.
         """
         if len(parts) != len(self.parts):
             shapes = ", ".join(map(str, self.parts)) or "none"
@@ -193,8 +194,8 @@ class Space(Value, Uncached):
         return self.backend.join(self, parts)
 
     def join_arrays(self, parts: Any) -> Any:
-        """Return one array of its components, traced or not: see `join`."""
-        if len(parts) == 0:  # the space of walls in a periodic box has no components
+        """Return one array joined from components, which autograd may be tracing: see `join`."""
+        if len(parts) == 0:  # the space of walls of a fully periodic grid has no components
             return np.zeros(self.shape)
         numpy = anp if any(map(isbox, parts)) else np  # NumPy's own functions are faster
         flat = [numpy.reshape(_broadcast(self, part, shape), (-1,)) for part, shape in zip(parts, self.parts)]
@@ -212,7 +213,7 @@ class Space(Value, Uncached):
 
     @property
     def described(self) -> str:
-        """Its name for messages, with the shape of a field if the name does not show it: face fields are flat."""
+        """The name of the space for error messages, followed by the shape of its fields where the name differs."""
         shape = self.shape if self.grid is None else self.grid.shape
         if shape == self.shape:
             return str(self)
@@ -220,13 +221,13 @@ class Space(Value, Uncached):
 
 
 def components(flat: Any, parts: Sequence[tuple[int, ...]]) -> list:
-    """Return the components of a flat field, traced or not, in their shapes."""
+    """Split a flat array, which autograd may be tracing, into components of the given shapes."""
     ends = accumulate(map(prod, parts))
     return [flat[end - prod(part) : end].reshape(part) for end, part in zip(ends, parts)]
 
 
 def whole_lengths(shape: Any) -> tuple[int, ...] | None:
-    """Return a length, or a sequence of lengths, as a tuple of int; None if one is not an integer >= 0."""
+    """Return one length, or a sequence of lengths, as a tuple of int; return None unless all are integers >= 0."""
     lengths = (shape,) if np.ndim(shape) == 0 else tuple(shape)
     for length in lengths:
         if isinstance(length, bool) or not isinstance(length, (int, np.integer)) or length < 0:
@@ -235,14 +236,17 @@ def whole_lengths(shape: Any) -> tuple[int, ...] | None:
 
 
 def fits(first: Space, second: Space) -> bool:
-    """Return whether two spaces hold the same fields: they are equal, or of one size and one has no grid."""
+    """Return True if a field on one space is valid on the other.
+
+    This is so if the spaces are equal, or if they have the same size and at least one of them has no grid.
+    """
     if first.grid is None or second.grid is None:
         return first.size == second.size
     return first == second
 
 
 def _broadcast(space: Space, part: Any, shape: tuple[int, ...]) -> Any:
-    """Return a component with as many entries as its shape has, in C order."""
+    """Broadcast a component to its shape; return it unchanged if it differs only by axes of length 1."""
     if [n for n in np.shape(part) if n != 1] == [n for n in shape if n != 1]:
         return part
     try:

@@ -77,8 +77,8 @@ def minimize(
         minimized. For physical_gradient it is called with ``physics(x)`` in place of x.
     start : array, number, or any nesting of them in tuples, lists and dicts
         The initial x. Not modified. Leaves that are not floating-point are constants and stay unchanged. If a leaf is a
-        field distributed over MPI ranks, PETSc/TAO performs the minimization; then only method="lbfgs" is available,
-        bounds must be numbers, and the other options cannot be used.
+        field distributed over MPI ranks, PETSc/TAO performs the minimization. Then only method="lbfgs", maxiter,
+        tolerance, callback and bounds that are numbers can be used.
     method : str
         "lbfgs", "gd", "adam", "newton_cg", "gauss_newton", "levenberg_marquardt", "half_inverse",
         "physical_gradient", or "admm". The method "admm" adds weight |K x|_1 to the loss; use it for results that are
