@@ -27,7 +27,7 @@ COMPILED_MODULES = [
     "sparsedp.kernels.projection",
     "sparsedp.kernels.stencil",
     "sparsedp.kernels.substitution",
-    "sparsedp.solvers.multigrid.loops",
+    "sparsedp.solvers.structured_multigrid.loops",
 ]
 
 

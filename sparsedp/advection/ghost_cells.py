@@ -14,7 +14,7 @@ import scipy.sparse as sp
 
 from sparsedp.advection.settings import wall_space
 from sparsedp.grid.boundary_conditions import dirichlet
-from sparsedp.kernels.departure_samples import PAD
+from sparsedp.kernels.interpolation_weights import PAD
 from sparsedp.operators.stencils import cell_beside
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from sparsedp.advection.settings import TransportSettings
     from sparsedp.grid.grid import Grid
-    from sparsedp.kernels.departure_samples import Points
+    from sparsedp.kernels.interpolation_weights import Points
 
 __all__ = ["ghost_sources", "solid_filling"]
 

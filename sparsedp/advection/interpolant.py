@@ -12,8 +12,8 @@ from sparsedp._utils import buffers
 from sparsedp._utils.validation import EPS
 from sparsedp.advection.ghost_cells import ghost_sources, solid_filling
 from sparsedp.advection.index_coordinates import IndexCoordinates
-from sparsedp.kernels import departure_samples
-from sparsedp.kernels.departure_samples import PAD
+from sparsedp.kernels import interpolation_weights
+from sparsedp.kernels.interpolation_weights import PAD
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -50,7 +50,9 @@ class Interpolant:
             interpolation = settings.interpolation
         self.settings = settings
         self.span = slice(*settings.space.offsets[number : number + 2])
-        self.points = departure_samples.Points.of(settings.space.parts[number], settings.grid.periodic, interpolation)
+        self.points = interpolation_weights.Points.of(
+            settings.space.parts[number], settings.grid.periodic, interpolation
+        )
         self.coordinates = IndexCoordinates(settings, number, interpolation)
         self.half_way: Interpolant | None = None
         if settings.backtrace == "midpoint" and not closed:
@@ -125,7 +127,7 @@ class InterpolatedComponent:
         """Return another field at the same departure points."""
         return InterpolatedComponent(self.interpolant, self.displacement, u, inflow)
 
-    def value(self, out: NDArray | None = None, bounds: NDArray = departure_samples.NO_BOUNDS) -> NDArray:
+    def value(self, out: NDArray | None = None, bounds: NDArray = interpolation_weights.NO_BOUNDS) -> NDArray:
         """Return the values at the departure points.
 
         `bounds` is filled with the least and the greatest sample of the cells around them, if it has room.
@@ -133,7 +135,7 @@ class InterpolatedComponent:
         if out is None:
             out = buffers.empty((self.points.size,), float)
         values, scale, _ = self.displacement
-        return departure_samples.interpolate(self.points, self.samples, values, scale, out, bounds=bounds)
+        return interpolation_weights.interpolate(self.points, self.samples, values, scale, out, bounds=bounds)
 
     def vjp(
         self,
@@ -151,7 +153,7 @@ class InterpolatedComponent:
         if of_samples is not None:
             np.add.at(samples, *of_samples)
         values, scale, _ = self.displacement
-        departure_samples.scatter(self.points, values, scale, g, samples)
+        interpolation_weights.scatter(self.points, values, scale, g, samples)
         self.interpolant.pad_vjp(samples, of_u, of_inflow)
         self.interpolant.fill_solid_vjp(of_u)
 
@@ -159,13 +161,13 @@ class InterpolatedComponent:
         """Set `out` (axis, point) to g times the derivative of the values in the velocity used along the step."""
         values, scale, slopes = self.displacement
         if not len(slopes):
-            return departure_samples.interpolate(self.points, self.samples, values, scale, out, g)
+            return interpolation_weights.interpolate(self.points, self.samples, values, scale, out, g)
         # Move a point at which the slope jumps to the side that the slope belongs to.
         nudge = 32 * EPS * max(self.points.shape) * (slopes[0] != slopes[-1])
         total = 0.0
         for slope, shift in zip(slopes, (-nudge, nudge)):
             field_slope = buffers.empty(out.shape, float)
-            departure_samples.interpolate(self.points, self.samples, values + shift, scale, field_slope, g)
+            interpolation_weights.interpolate(self.points, self.samples, values + shift, scale, field_slope, g)
             total += slope * field_slope
         return np.divide(total, len(slopes), out=out)
 
@@ -184,6 +186,6 @@ class InterpolatedComponent:
         values, scale, _ = self.displacement
         total = sum(
             sp.csr_array((weight, sources[index], np.arange(n + 1)), (n, n + 1))
-            for index, weight in departure_samples.entries(self.points, values, scale)
+            for index, weight in interpolation_weights.entries(self.points, values, scale)
         )
         return self.interpolant.filled_matrix(total[:, :n])

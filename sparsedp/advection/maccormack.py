@@ -24,7 +24,7 @@ import numpy as np
 from sparsedp._utils import buffers
 from sparsedp.advection.departure_points import Trajectory
 from sparsedp.advection.semi_lagrangian import SemiLagrangian
-from sparsedp.kernels import departure_samples
+from sparsedp.kernels import interpolation_weights
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -65,7 +65,7 @@ class CorrectedStep:
         if self.clamp:
             self.bounds = buffers.empty((2, u.size), float)
         else:
-            self.bounds = departure_samples.NO_BOUNDS
+            self.bounds = interpolation_weights.NO_BOUNDS
         self.first = self.back.at_departure_points(u, inflow)
         f = self.first.value(bounds=self.bounds)
         self.second = self.ahead.at_departure_points(f, inflow)
@@ -80,7 +80,7 @@ class CorrectedStep:
         below = np.heaviside(self.bounds[0, points] - value, 0.5)
         above = np.heaviside(value - self.bounds[1, points], 0.5)
         values, scale, _ = self.first.displacement
-        samples, least, greatest = departure_samples.bound_shares(
+        samples, least, greatest = interpolation_weights.bound_shares(
             self.first.points, self.first.samples, values, scale, points
         )
         return _Clamped(points, 1.0 - below - above, samples, least * below + greatest * above)

@@ -25,9 +25,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sparsedp.check.audit_thresholds import THRESHOLDS
 from sparsedp.check.evaluations import Line
 from sparsedp.check.summary import Result
+from sparsedp.check.thresholds import THRESHOLDS
 
 __all__ = ["PROVED", "DirectionEvidence", "DirectionResult", "pairwise_orders", "rms_of_both_sides", "weigh"]
 

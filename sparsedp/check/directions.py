@@ -11,21 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sparsedp._utils.validation import place
-from sparsedp.check.audit_thresholds import THRESHOLDS
 from sparsedp.check.direction_evidence import DirectionEvidence, weigh
 from sparsedp.check.evaluations import REFUSALS, Evaluations, Line
 from sparsedp.check.loss_noise import measure_noise
 from sparsedp.check.overall_verdict import overall_verdict
 from sparsedp.check.point import Point, audit_generator
+from sparsedp.check.step_sizes import COARSER_STEPS, FINER_STEPS, RIPPLE_STEPS, STEPS_BETWEEN
+from sparsedp.check.thresholds import THRESHOLDS
 
 __all__ = ["RANDOM_DIRECTIONS", "examine_directions", "excuse_kinks"]
 
 RANDOM_DIRECTIONS = 3
-# Steps beyond those of the sweep.
-COARSER_STEPS = tuple(2.0**k for k in range(1, 38, 3))  # for noise of rounding: x may be small beside the loss
-FINER_STEPS = tuple(2.0**-k for k in range(33, 46, 3))  # for other noise: there may be finer features
-STEPS_BETWEEN = 2.0 ** np.arange(-9, 7)  # times the step of the plateau: more levels for an order
-RIPPLE_STEPS = 2.0 ** -np.arange(27, 46)  # that may show a ripple
 # The step to the point where a loss with kinks is examined again: its length in units of x, and its seed.
 SHIFT = 2.0**-6
 SHIFT_SEED = 7

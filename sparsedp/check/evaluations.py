@@ -17,27 +17,15 @@ from sparsedp._utils.validation import advise
 from sparsedp.autodiff.derivative import check_loss
 from sparsedp.autodiff.flattening import joined
 from sparsedp.check.point import Point
+from sparsedp.check.step_sizes import default_steps
 from sparsedp.check.summary import error_text
 from sparsedp.errors import SparsedpError
 
-__all__ = ["REFUSALS", "UNCHANGED", "Evaluations", "Level", "Line", "default_steps", "solvers_of"]
+__all__ = ["REFUSALS", "UNCHANGED", "Evaluations", "Level", "Line", "solvers_of"]
 
 REFUSALS = (SparsedpError, ValueError, ArithmeticError)  # exceptions that a loss may raise at a trial point
 UNCHANGED = "the loss does not change"
 LOST_SHARE = 0.1  # a step is unusable if the rounding of x changes the displacement by more than this share
-
-
-def default_steps(eps: float) -> tuple[float, ...]:
-    """Return the step sizes of an audit in units of x, over at least eight decades, from coarse to fine.
-
-    The steps are powers of two, so that x + step * d has small rounding errors. Single precision has fewer usable
-    decades, and the steps are closer together.
-    """
-    if eps < 1e-10:
-        exponents = range(2, 31, 3)
-    else:
-        exponents = range(-2, 27, 2)
-    return tuple(2.0**-exponent for exponent in exponents)
 
 
 def _no_tick() -> None:

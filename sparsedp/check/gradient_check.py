@@ -13,7 +13,6 @@ import numpy as np
 from sparsedp._utils.progress import bar
 from sparsedp._utils.validation import check_function, check_whole
 from sparsedp.autodiff.derivative import grad, unwarned
-from sparsedp.check.audit_thresholds import THRESHOLDS
 from sparsedp.check.culprit import culprit_of
 from sparsedp.check.direction_evidence import PROVED, DirectionEvidence
 from sparsedp.check.directions import RANDOM_DIRECTIONS, examine_directions, excuse_kinks
@@ -25,6 +24,7 @@ from sparsedp.check.overall_verdict import overall_verdict
 from sparsedp.check.point import QUICK_DIRECTIONS, Point, audit_generator
 from sparsedp.check.summary import Result
 from sparsedp.check.table import Table, table_of
+from sparsedp.check.thresholds import THRESHOLDS
 
 __all__ = ["Audit", "gradient"]
 
@@ -100,7 +100,7 @@ def gradient(
     and the gap alone decides: if the remainder is noise at all steps (a linear loss; order 2 is shown as "exact"), or
     if the slope is so small that the quadratic term dominates at all steps (near a minimum, or in the kernel of a
     Laplacian; there is no order 1). Forward and reverse mode differ by at most 1e-10, or by at most 1e-6 with an
-    iterative solve or with noise. All thresholds are in `sparsedp.check.audit_thresholds`.
+    iterative solve or with noise. All thresholds are in `sparsedp.check.thresholds`.
 
     **Noise.** It is measured by a table of differences of neighbouring values. If the noise is larger than rounding,
     agreement needs six digits; with fewer digits the verdict is "inconclusive", and the reason says how many digits

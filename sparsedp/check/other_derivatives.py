@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sparsedp.autodiff.derivative import NO_JVP, hvp, pushforward
-from sparsedp.check.audit_thresholds import THRESHOLDS
 from sparsedp.check.direction_evidence import PROVED, DirectionEvidence, pairwise_orders, rms_of_both_sides, weigh
 from sparsedp.check.point import Point
+from sparsedp.check.thresholds import THRESHOLDS
 
 __all__ = ["ModeComparison", "check_complex_step", "check_hessian_product", "compare_modes"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import inf
 
-from sparsedp.check.audit_thresholds import THRESHOLDS
 from sparsedp.check.direction_evidence import PROVED, DirectionEvidence
+from sparsedp.check.thresholds import THRESHOLDS
 
 __all__ = ["overall_verdict"]
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from sparsedp._utils.validation import check_finite
 from sparsedp.grid.grid import Grid, check_grid
 from sparsedp.io.atomic_files import load_tree, save_tree
-from sparsedp.io.contents import KIND, OTHERS, REAL, check_fields
+from sparsedp.io.file_format import KIND, OTHERS, REAL, check_fields
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

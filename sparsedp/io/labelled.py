@@ -17,7 +17,7 @@ from sparsedp._utils.validation import check_type
 from sparsedp.errors import ShapeError
 from sparsedp.grid.grid import AXES, Grid, check_grid, node_axes
 from sparsedp.io.atomic_files import path_errors, write_file, write_through
-from sparsedp.io.contents import KIND, check_fields, check_names
+from sparsedp.io.file_format import KIND, check_fields, check_names
 
 __all__ = ["dataset_of", "from_xarray", "read_dataset", "to_xarray", "write_dataset"]
 

@@ -1,7 +1,7 @@
 """Compiled loops of semi-Lagrangian transport: interpolation at departure points, its slope and its transpose.
 
 The departure point of the point (i, j, k) is (i, j, k) - scale w, in index coordinates. The flat array `samples` is a
-field with ghost cells; `axes` and `tables` are those of `departure_samples.Points`.
+field with ghost cells; `axes` and `tables` are those of `interpolation_weights.Points`.
 
 The loops work on TILE points at a time, counted by `start` and `stop`: the data of a tile stay in the L1 cache, and
 every inner loop runs over a tile, for one axis or one sample of the stencil. The same loops therefore serve 1-D to 3-D,
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit
 
-from sparsedp.kernels.departure_samples import PAD, TILE
+from sparsedp.kernels.interpolation_weights import PAD, TILE
 from sparsedp.kernels.team import INNER, kernel
 
 if TYPE_CHECKING:

@@ -19,13 +19,13 @@ from sparsedp._utils.counters import thread
 from sparsedp._utils.pytree import copied, leaves, norm
 from sparsedp._utils.validation import EPS
 from sparsedp.autodiff.derivative import value_and_grad
-from sparsedp.check.audit_thresholds import THRESHOLDS
 from sparsedp.check.directions import examine_directions, excuse_kinks
 from sparsedp.check.evaluations import Evaluations, Line
 from sparsedp.check.operators import layouts
 from sparsedp.check.overall_verdict import overall_verdict
 from sparsedp.check.point import Point, audit_generator, root_mean_square
 from sparsedp.check.summary import error_text
+from sparsedp.check.thresholds import THRESHOLDS
 from sparsedp.errors import SparsedpError
 from sparsedp.report.certificate import distance
 from sparsedp.report.stability import LARGEST_STEADY_GROWTH, SEED, Growth, growth_of

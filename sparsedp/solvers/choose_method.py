@@ -12,13 +12,13 @@ from sparsedp._utils.calls import advice_near
 from sparsedp._utils.pytree import copied
 from sparsedp._utils.validation import check_choice, check_number, check_whole
 from sparsedp.errors import ConvergenceError
-from sparsedp.solvers.amg import check_multigrid_options, multigrid_engine
+from sparsedp.solvers.algebraic_multigrid import check_multigrid_options, multigrid_engine
 from sparsedp.solvers.direct import check_precision, direct_engine
 from sparsedp.solvers.engine import EmptySystem
-from sparsedp.solvers.multigrid.engine import structured_engine, structured_if_suited
 from sparsedp.solvers.preconditioners import Near, krylov_engine
 from sparsedp.solvers.records import failure
 from sparsedp.solvers.separable import find_eigenbasis, separable_engine, transform_engine
+from sparsedp.solvers.structured_multigrid.engine import structured_engine, structured_if_suited
 from sparsedp.solvers.substitution import BlockTriangular, largest_block
 
 if TYPE_CHECKING:

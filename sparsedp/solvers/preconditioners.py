@@ -15,7 +15,7 @@ from scipy.sparse import csr_array, diags_array
 from sparsedp._utils.validation import check_choice, check_whole
 from sparsedp.operators.given import from_matrix
 from sparsedp.operators.operator import Operator
-from sparsedp.solvers.amg import Hierarchy, Level, ruge_stueben
+from sparsedp.solvers.algebraic_multigrid import Hierarchy, Level, ruge_stueben
 from sparsedp.solvers.direct import direct_engine
 from sparsedp.solvers.engine import Engine
 from sparsedp.solvers.krylov import Krylov

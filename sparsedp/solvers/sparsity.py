@@ -38,7 +38,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.operators.structure.base import rows_of
-from sparsedp.solvers.amg import colour_graph
+from sparsedp.solvers.algebraic_multigrid import colour_graph
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

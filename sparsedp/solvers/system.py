@@ -132,7 +132,7 @@ class System:
         """The stencil of an operator that is known to be one without looking at its entries; else None."""
         if self.grid is None or self.grid.dim == 1:
             return None
-        from sparsedp.solvers.multigrid.stencil import stencil_without_entries
+        from sparsedp.solvers.structured_multigrid.stencil import stencil_without_entries
 
         return stencil_without_entries(self.op, self.grid)
 

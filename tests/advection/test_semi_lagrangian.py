@@ -8,7 +8,7 @@ import sparsedp as dp
 from sparsedp import kernels
 from sparsedp.autodiff.derivative import pullback, pushforward
 from sparsedp.errors import DerivativeError
-from sparsedp.kernels import departure_samples, team
+from sparsedp.kernels import interpolation_weights, team
 
 NUMBA = pytest.mark.skipif(not kernels.compiled(), reason="numba is not installed")
 SCHEMES = [
@@ -147,7 +147,7 @@ def test_second_derivatives(without_numba):
 def test_loops_agree_with_the_matrix_and_stay_within_the_samples(shape, interpolation):
     """Departure points far outside and at the points; memory around the samples holds NaN."""
     periodic = (False, True, False)[: len(shape)]
-    points = departure_samples.Points.of(shape, periodic, interpolation)
+    points = interpolation_weights.Points.of(shape, periodic, interpolation)
     rng = np.random.default_rng(1)
     n = points.size
     scale = np.array([1.0, 0.5, 2.0])[: len(shape)]
@@ -162,17 +162,17 @@ def test_loops_agree_with_the_matrix_and_stay_within_the_samples(shape, interpol
         value = _dense(points, w, scale)
         slope = [_dense(points, w, scale, axis) for axis in axes]
         close = dict(rtol=1e-13, atol=1e-13)
-        found = departure_samples.interpolate(points, samples, w, scale, np.empty(n))
+        found = interpolation_weights.interpolate(points, samples, w, scale, np.empty(n))
         np.testing.assert_allclose(found, value @ samples, **close)
-        back = departure_samples.scatter(points, w, scale, g, np.zeros(points.samples))
+        back = interpolation_weights.scatter(points, w, scale, g, np.zeros(points.samples))
         np.testing.assert_allclose(back, value.T @ g, **close)
-        steep = departure_samples.interpolate(points, samples, w, scale, np.empty(w.shape), g)
+        steep = interpolation_weights.interpolate(points, samples, w, scale, np.empty(w.shape), g)
         for axis in axes:
             np.testing.assert_allclose(steep[axis], -scale[axis] * g * (slope[axis] @ samples), **close)
         low, high = bounds = np.empty((2, n))
-        departure_samples.interpolate(points, samples, w, scale, np.empty(n), bounds=bounds)
+        interpolation_weights.interpolate(points, samples, w, scale, np.empty(n), bounds=bounds)
         assert np.isfinite([low, high]).all() and (low <= high).all()
-        corners, *shares = departure_samples.bound_shares(points, samples, w, scale, np.arange(n))
+        corners, *shares = interpolation_weights.bound_shares(points, samples, w, scale, np.arange(n))
         for share, bound in zip(shares, (low, high)):
             np.testing.assert_array_equal(np.sum(share * samples[corners], axis=0), bound)
 
@@ -180,7 +180,7 @@ def test_loops_agree_with_the_matrix_and_stay_within_the_samples(shape, interpol
 def _dense(points, w, scale, along=None):
     """The matrix of the interpolation, or of its slope."""
     found = np.zeros((points.size, points.samples))
-    for index, weight in departure_samples.entries(points, w, scale, along):
+    for index, weight in interpolation_weights.entries(points, w, scale, along):
         np.add.at(found, (np.arange(points.size), index), weight)
     return found
 

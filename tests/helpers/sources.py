@@ -21,12 +21,12 @@ class Module:
 
     @property
     def place(self):
-        """Path inside the package, such as "solvers/multigrid.py"."""
+        """Path inside the package, such as "solvers/solve.py"."""
         return self.path.relative_to(PACKAGE).as_posix()
 
     @property
     def name(self):
-        """Dotted name, such as "sparsedp.solvers.multigrid"."""
+        """Dotted name, such as "sparsedp.solvers.structured_multigrid"."""
         parts = self.path.relative_to(ROOT).with_suffix("").parts
         return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 

@@ -58,7 +58,7 @@ def dense(level, extras=True):
 
 def prolongation(level):
     """Return the black-box interpolation as a matrix, and the transfer."""
-    from sparsedp.solvers.multigrid.cycle import Transfer, interpolation_weights
+    from sparsedp.solvers.structured_multigrid.cycle import Transfer, interpolation_weights
 
     fine = level.grid
     coarse = level.grid.coarse()
@@ -121,7 +121,7 @@ def test_the_cycle_is_symmetric_and_positive(shape, periodic, rng):
 
 @pytest.mark.parametrize("shape", [(5, 4), (5, 4, 3)])
 def test_steps_lead_to_the_neighbours(shape, rng):
-    from sparsedp.solvers.multigrid.loops import PaddedGrid
+    from sparsedp.solvers.structured_multigrid.loops import PaddedGrid
 
     for periodic in product((False, True), repeat=len(shape)):
         grid = PaddedGrid(shape, periodic)

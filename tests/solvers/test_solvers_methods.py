@@ -9,7 +9,7 @@ import sparsedp as dp
 from sparsedp._utils.counters import recording
 from sparsedp.autodiff.derivative import value_and_grad
 from sparsedp.kernels import compiled
-from sparsedp.solvers.amg import coarse_solver
+from sparsedp.solvers.algebraic_multigrid import coarse_solver
 
 SWEEPS = {
     "forward, backward": (("forward",), ("backward",)),

@@ -12,7 +12,7 @@ from scipy.sparse.linalg import spsolve_triangular
 import sparsedp as dp
 from sparsedp import kernels
 from sparsedp.errors import ConvergenceError, IncompatibleError, NonFiniteError
-from sparsedp.solvers import amg, substitution
+from sparsedp.solvers import algebraic_multigrid, substitution
 from sparsedp.solvers.substitution import split
 from sparsedp.solvers.system import System
 
@@ -386,7 +386,7 @@ def test_a_large_coarsest_level_is_refused():
 
 
 def test_auto_takes_lu_where_multigrid_does_not_coarsen(monkeypatch):
-    monkeypatch.setattr(amg, "DENSE_UP_TO", 10)
+    monkeypatch.setattr(algebraic_multigrid, "DENSE_UP_TO", 10)
     ring = dp.Grid((1600, 3, 3), size=1.0, periodic=True)
     op = dp.identity(ring.cells) + 0.01 * sum((dp.upwind(ring, axis) for axis in "yz"), dp.upwind(ring, "x"))
     inv = dp.inverse(op)

@@ -10,7 +10,7 @@ import pytest
 import sparsedp as dp
 from sparsedp import kernels
 from sparsedp.autodiff.derivative import value_and_grad
-from sparsedp.solvers.multigrid.engine import WEAK_SHARE
+from sparsedp.solvers.structured_multigrid.engine import WEAK_SHARE
 from sparsedp.solvers.system import System
 
 pytestmark = pytest.mark.skipif(not kernels.compiled(), reason="structured multigrid needs numba")

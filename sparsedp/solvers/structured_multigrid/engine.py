@@ -19,14 +19,14 @@ from sparsedp import kernels
 from sparsedp._utils.validation import EPS
 from sparsedp.solvers.direct import check_precision
 from sparsedp.solvers.engine import Engine
-from sparsedp.solvers.multigrid.stencil import UnsuitableOperator, component_labels, stencil_of_system
 from sparsedp.solvers.nullspace import NullSpace
 from sparsedp.solvers.scaling import exponent_of, norm
+from sparsedp.solvers.structured_multigrid.stencil import UnsuitableOperator, component_labels, stencil_of_system
 
 if TYPE_CHECKING:
     from numpy.typing import DTypeLike, NDArray
 
-    from sparsedp.solvers.multigrid.stencil import Stencil
+    from sparsedp.solvers.structured_multigrid.stencil import Stencil
     from sparsedp.solvers.system import System
 
 __all__ = ["Structured", "structured_engine", "structured_if_suited"]
@@ -176,9 +176,9 @@ class Structured(Engine):
         maxiter: int | None = None,
         dtype: DTypeLike = np.float32,
     ) -> None:
-        from sparsedp.solvers.multigrid import loops
-        from sparsedp.solvers.multigrid.cycle import build_hierarchy
-        from sparsedp.solvers.multigrid.loops import PaddedGrid
+        from sparsedp.solvers.structured_multigrid import loops
+        from sparsedp.solvers.structured_multigrid.cycle import build_hierarchy
+        from sparsedp.solvers.structured_multigrid.loops import PaddedGrid
 
         grid = stencil.grid
         self.scale = stencil.scale
@@ -196,7 +196,7 @@ class Structured(Engine):
         self.lock = threading.Lock()  # the vectors serve one solve at a time
 
     def _finest_level(self, stencil, singular, dtype):
-        from sparsedp.solvers.multigrid.cycle import Level
+        from sparsedp.solvers.structured_multigrid.cycle import Level
 
         padded_grid = self.padded_grid
         shape = padded_grid.shape

@@ -23,13 +23,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, eigsh
 
-from sparsedp.solvers.multigrid import loops
-from sparsedp.solvers.multigrid.loops import neighbour_steps
+from sparsedp.solvers.structured_multigrid import loops
+from sparsedp.solvers.structured_multigrid.loops import neighbour_steps
 
 if TYPE_CHECKING:
     from numpy.typing import DTypeLike, NDArray
 
-    from sparsedp.solvers.multigrid.loops import PaddedGrid
+    from sparsedp.solvers.structured_multigrid.loops import PaddedGrid
 
     Step = tuple[int, ...]
 

@@ -1,0 +1,26 @@
+"""Step sizes of the finite differences in an audit of a gradient."""
+
+from __future__ import annotations
+
+import numpy as np
+
+__all__ = ["COARSER_STEPS", "FINER_STEPS", "RIPPLE_STEPS", "STEPS_BETWEEN", "default_steps"]
+
+# Steps beyond those of the sweep.
+COARSER_STEPS = tuple(2.0**k for k in range(1, 38, 3))  # for noise of rounding: x may be small beside the loss
+FINER_STEPS = tuple(2.0**-k for k in range(33, 46, 3))  # for other noise: there may be finer features
+STEPS_BETWEEN = 2.0 ** np.arange(-9, 7)  # times the step of the plateau: more levels for an order
+RIPPLE_STEPS = 2.0 ** -np.arange(27, 46)  # that may show a ripple
+
+
+def default_steps(eps: float) -> tuple[float, ...]:
+    """Return the step sizes of an audit in units of x, over at least eight decades, from coarse to fine.
+
+    The steps are powers of two, so that x + step * d has small rounding errors. Single precision has fewer usable
+    decades, and the steps are closer together.
+    """
+    if eps < 1e-10:
+        exponents = range(2, 31, 3)
+    else:
+        exponents = range(-2, 27, 2)
+    return tuple(2.0**-exponent for exponent in exponents)
