@@ -1,10 +1,10 @@
-"""Bridges to PyTorch and JAX: functions of this library there, theirs here, with derivatives of every order both ways.
+"""Bridges to PyTorch, JAX and xarray. Functions can be differentiated to every order across a bridge.
 
 to_torch, from_torch     torch_bridge.py, the extra `torch`
 to_jax, from_jax         jax_bridge.py, the extra `jax`
 to_xarray, from_xarray   fields with coordinates: ../io/labelled.py, the extra `files`
 
-A library is imported when one of its two names is first used.
+PyTorch, JAX or xarray is imported when one of its two functions is first used.
 """
 
 from importlib import import_module
@@ -13,7 +13,7 @@ from sparsedp._utils.calls import describe_module, public_name
 
 __all__ = ["from_jax", "from_torch", "from_xarray", "to_jax", "to_torch", "to_xarray"]
 
-EXTRAS = {  # of each library, and the module with its two functions
+EXTRAS = {  # for each library: the extra that installs it, and the module with its two functions
     "torch": ("torch", "sparsedp.interop.torch_bridge"),
     "jax": ("jax", "sparsedp.interop.jax_bridge"),
     "xarray": ("files", "sparsedp.io.labelled"),

@@ -1,4 +1,4 @@
-"""Differentiable black boxes: sparse Jacobians of a simulator without derivatives, by coloured differences."""
+"""Differentiable black boxes: the sparse Jacobian of a NumPy function by complex steps or finite differences."""
 
 from __future__ import annotations
 
@@ -30,53 +30,55 @@ __all__ = ["BlackBox", "from_blackbox"]
 COMPLEX_STEP = "complex step"
 DIFFERENCES = "central differences"
 METHODS = {"auto": "", "complex": COMPLEX_STEP, "difference": DIFFERENCES}
-COMPLEX_STEP_SIZE = 1e-30  # no difference is taken, so nothing cancels
+COMPLEX_STEP_SIZE = 1e-30  # can be tiny: no difference is taken, so nothing cancels
 DIFFERENCE_STEP = EPS ** (1 / 3)  # step of central differences, relative to x
-DIFFERENCE_SHARES = 1.0, 1e-2  # of the step of central differences: Jacobians and probes
-# How far a row of the Jacobian may differ from a probe: as a share of the row, and of the largest row.
+DIFFERENCE_SHARES = 1.0, 1e-2  # factors of DIFFERENCE_STEP, for Jacobians and probes
+# Largest difference allowed between a row of the Jacobian and a probe: relative to the row, and to the largest row.
 TOLERANCES = {COMPLEX_STEP: (1e-9, 1e-12), DIFFERENCES: (1e-4, 1e-4)}
-LARGEST_ROUNDING = 1e-5  # share of a row; a larger difference from a probe that is proportional to the step is an error
-EVALUATION_ERRORS = ValueError, ArithmeticError, RuntimeError  # raised by foreign code at points without a result
+LARGEST_ROUNDING = 1e-5  # a difference above this share of a row must not be proportional to the step
+EVALUATION_ERRORS = ValueError, ArithmeticError, RuntimeError  # of f at points without a result
 MOVE_SHARES = 1.0, -1.0, 1e-2, -1e-2, 1e-4, -1e-4  # tried in turn until the function has a result
 STEP_MULTIPLES = 2, 5, 11  # steps at which the difference between a row and a probe is computed again
 
 
 def from_blackbox(f: Callable, sparsity: Any = None, derivative: str = "auto", name: str | None = None) -> BlackBox:
-    """Return a NumPy function of an array as a differentiable function.
+    """Make a NumPy function of one array differentiable, by its sparse Jacobian.
 
     Parameters
     ----------
     f : callable
-        ``f(x)``, real arrays of any shapes; it must return the same result for the same x.
+        ``f(x)`` maps a real array of any shape to a real array of any shape. It must be deterministic.
     sparsity : sparse matrix or array, optional
-        (y.size, x.size), not 0 where y_i may depend on x_j. Default: the stencil found at three cells, repeated over
-        the grid, if each row of the Jacobian agrees with a derivative along a random direction; else found by changing
-        random parts of x, slightly and by a tenth. At a later point that takes another branch it is searched again, and
-        entries are added. An entry below 1e-9 (differences: 1e-5) of its row may be missed.
+        Matrix of shape (y.size, x.size), with a nonzero entry (i, j) where y_i may depend on x_j. By default, the
+        pattern is detected. If x and y have the same shape, f is first treated as a stencil: its neighbours are
+        determined at three cells and repeated over the grid. If a row of the resulting Jacobian disagrees with a
+        derivative along a random direction, the pattern is instead searched by changing random parts of x, both
+        slightly and by a tenth. If f takes another branch at a later point, the search is repeated there and entries
+        are added. An entry below 1e-9 of its row (below 1e-5 with central differences) may be missed.
     derivative : "auto", "complex" or "difference"
-        complex: f(x + i h v), to rounding, for code that is analytic and takes complex numbers. difference: central
-        differences, about ten digits. auto: complex where it is found to agree with differences.
+        "complex" uses complex steps f(x + i h v), which are accurate to rounding but need analytic code that accepts
+        complex numbers. "difference" uses central differences, with about ten correct digits. "auto" uses complex steps
+        if they agree with central differences.
     name : str, optional
-        Name in errors and counts; default: the name of f.
+        Name in error messages and counters. Default: the name of `f`.
 
     Returns
     -------
     BlackBox
-        ``box(x)``; `.jacobian(x)` is the csr_array dy/dx, `.runs` the number of runs so far; str() says how many runs
-        one Jacobian takes.
+        A differentiable function ``box(x)``. `.jacobian(x)` returns dy/dx as a csr_array, `.runs` is the number of
+        runs so far, and str() says how many runs one Jacobian takes.
 
     Raises
     ------
     TypeError
-        If f is no function.
+        If `f` is not callable.
     ValueError
-        If `derivative` is not known.
+        If `derivative` is none of the three words.
     ShapeError
-        If the sparsity or a later x has another shape.
+        If `sparsity` does not have the shape (y.size, x.size), or if a later x has another shape than the first one.
     DerivativeError
-        If f is not deterministic or has changed since it was run, or no Jacobian agrees with a difference along a
-        random direction: a sparsity that lacks entries, a point where f has no derivative; on derivatives of second
-        order.
+        If `f` returns different results for the same x; if the Jacobian disagrees with a difference along a random
+        direction, because `sparsity` lacks entries or f has no derivative at x; or if a second derivative is computed.
     NonFiniteError
         If f is NaN or infinite near x.
 
@@ -86,10 +88,11 @@ def from_blackbox(f: Callable, sparsity: Any = None, derivative: str = "auto", n
 
     Notes
     -----
-    Cost: one run for each colour of the pattern (two for central differences), one at x, and two or three that probe
-    the Jacobian row by row along a direction which is another one at each x. Where only a few rows miss something, at
-    a branch of code that takes no complex step there, they are taken by central differences. At a kink the derivative
-    is the mean of both sides, next to it that of its own side.
+    A Jacobian costs one run for each colour of the pattern (two runs with central differences), one run at x, and two
+    or three runs that test each row of the Jacobian along a random direction, which depends on x. If the test fails
+    only in some rows, for example because a branch of the code does not support complex numbers, these rows are
+    computed by central differences. At a kink the derivative is the mean of the one-sided derivatives; next to a kink
+    it is the derivative on the same side.
 
     References
     ----------
@@ -110,14 +113,14 @@ def from_blackbox(f: Callable, sparsity: Any = None, derivative: str = "auto", n
 
 
 class BlackBox(Reconstructible):
-    """A foreign function with a sparse Jacobian, cached for the last two points: see `from_blackbox`.
+    """A NumPy function with a sparse Jacobian, which is cached for the last two points. See `from_blackbox`.
 
     Attributes
     ----------
     runs : int
-        Runs of the function so far.
+        Number of runs of the function so far.
     way : str
-        COMPLEX_STEP or DIFFERENCES; empty until the first derivative decides.
+        The method: COMPLEX_STEP or DIFFERENCES. Empty until it is chosen at the first derivative.
     """
 
     _shapes: Any
@@ -136,18 +139,18 @@ class BlackBox(Reconstructible):
         self.way = self.way or METHODS[derivative]
         self.runs = 0
         self._points = Cache()
-        self._lock = RLock()  # foreign code may work in arrays of its own: one thread at a time
+        self._lock = RLock()  # the user's function may not be thread-safe
         self._rule = Rule(name, self._run, self._vjp, self._jvp)
 
     def recipe(self) -> tuple:
         """Return the call that builds an equal object, for pickling and copying."""
-        # The pattern found so far is included: it took many runs.
+        # The detected pattern is included, because it took many runs to find.
         jacobian = self._shapes, self.way, self._coloured
         return BlackBox, (self._f, self._sparsity, self._derivative, self.name, jacobian)
 
     @public("dp.from_blackbox(f)")
     def __call__(self, x: Any) -> Any:
-        """Return the result of the function; it can be differentiated."""
+        """Return f(x). The result can be differentiated."""
         return self._rule(x)
 
     def __str__(self):
@@ -165,7 +168,7 @@ class BlackBox(Reconstructible):
     __repr__ = __str__
 
     def _run(self, x):
-        """Run the function on plain values and return a copy: it may write into the returned array at the next run."""
+        """Run the function on plain values. Return a copy, because f may reuse its result array."""
         check_precision(f"the argument of {self.name}", x)
         count(f"{self.name}.run", "forward")
         with self._lock:
@@ -188,7 +191,7 @@ class BlackBox(Reconstructible):
         return self._operator(x, y)(tangents[0])
 
     def _operator(self, x, y):
-        """Return the Jacobian as an Operator, at the argument of a run with the result y."""
+        """Return the Jacobian at x as an Operator. `y` is the recorded result f(x)."""
         if isbox(x):
             raise DerivativeError(
                 f"{self.name} is a black box without second derivatives; use a method with first derivatives, or "
@@ -207,7 +210,7 @@ class BlackBox(Reconstructible):
         return from_matrix(matrix, inputs, outputs, f"{self.name}.J")
 
     def jacobian(self, x: Any) -> Any:
-        """Return dy/dx at a point as a csr_array; kept for the last two points.
+        """Return dy/dx at a point as a csr_array, cached for the last two points.
 
         Parameters
         ----------
@@ -220,13 +223,13 @@ class BlackBox(Reconstructible):
         return self._at(plain(x))[0]
 
     def _at(self, x):
-        """Return the Jacobian at a point and the result there, cached for the last two points."""
+        """Return the Jacobian and the result at a point, cached for the last two points."""
         x = np.asarray(x, dtype=float)
         with self._lock:
             return self._points.find((x,)) or self._points.put((x,), self._computed(x))
 
     def _computed(self, x):
-        """Compute the Jacobian at a point and the result there."""
+        """Compute the Jacobian and the result at a point."""
         check_finite(f"the argument of {self.name}", x)
         y = self._run(x)
         check_finite(f"{self.name} near x", y, "must be finite to be differentiated")
@@ -254,11 +257,11 @@ class BlackBox(Reconstructible):
     # ------------------------------------------------------------ the pattern
 
     def _patterns(self, x, y):
-        """Yield coloured patterns to try at x, the cheapest first; each includes the entries of earlier points."""
+        """Yield coloured patterns to try at x, the cheapest first. Each includes all entries found earlier."""
         rows = y.size
         columns = x.size
         earlier = self._sparsity
-        shapes = None  # of the grid, if x and y are fields on the same one
+        shapes = None  # shape of the grid, if x and y have the same shape
         if self._shapes[0] == self._shapes[1]:
             shapes = [self._shapes[0]]
         if self._coloured is not None:
@@ -284,7 +287,8 @@ class BlackBox(Reconstructible):
                 pattern = pattern_like(pattern + earlier)
             return ColouredPattern(pattern, shapes)
 
-        # Both changes are exactly 0 in a row that does not depend on the moved columns; far moves cross branches.
+        # Both changes are exactly 0 in a row that does not depend on the changed entries of x. The large change may
+        # reach other branches of the code.
         changes = [near, far]
         if shapes is not None:
             guess = stencil_pattern(changes, shapes)
@@ -329,12 +333,13 @@ class BlackBox(Reconstructible):
         return matrix
 
     def _probed(self, coloured, x):
-        """Return the Jacobian on a pattern, and the rows in which it disagrees with the probes.
+        """Return the Jacobian on a pattern, and a mask of the rows in which it disagrees with the probes.
 
-        Rows in which the complex step fails are computed by central differences, then by shorter ones: next to a kink
-        these stay on one side of it, and at a kink they give the mean of both. Rows that no short probe agrees with, as
-        in code with noise, may agree with a longer one. The method that all rows agree with at the first point is used
-        at later ones.
+        A probe is a derivative along a random direction. Rows in which the complex step fails are computed by central
+        differences, and then by central differences with a shorter step. Near a kink the shorter step stays on one side
+        of it; at a kink it gives the mean of both sides. Rows that disagree with a short probe, because the function
+        has noise, may agree with a longer probe. The method with which all rows agree at the first point is also used
+        at later points.
         """
         ways = []
         if self.way != DIFFERENCES:
@@ -354,7 +359,7 @@ class BlackBox(Reconstructible):
                     wrong &= self._disagreeing_rows(matrix, x, way[0], share)
             except MemoryError:
                 raise
-            except Exception as error:  # the code takes no complex numbers, or no point this far from x
+            except Exception as error:  # f does not accept complex numbers, or a point this far from x
                 trouble = error
                 continue
             probed = True
@@ -366,8 +371,8 @@ class BlackBox(Reconstructible):
         return matrix, wrong
 
     def _disagreeing_rows(self, matrix, x, way, share):
-        """Return the rows in which a Jacobian disagrees with its own method or with a difference along a direction."""
-        generator = np.random.default_rng(crc32(x.tobytes()))  # one direction for each point
+        """Return a mask of the rows in which a Jacobian disagrees with a derivative along a random direction."""
+        generator = np.random.default_rng(crc32(x.tobytes()))  # the same direction each time at the same point
         v = share * self._steps(x) * generator.standard_normal(x.shape)
         wrong = [_wrong_rows(matrix, v, self._product(x, method), method) for method in {way, DIFFERENCES}]
         return np.any(wrong, axis=0)
@@ -375,38 +380,38 @@ class BlackBox(Reconstructible):
 
 @contextmanager
 def _strict():
-    """Raise an error if a complex number is cast to real, which loses the derivative; ignore NumPy's warnings."""
+    """Raise an error if a complex number is cast to real, which loses the derivative. Ignore other warnings."""
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("error", np.exceptions.ComplexWarning)
         yield
 
 
 def _with_rows(matrix, other, rows):
-    """Return a matrix with some rows from another one on the same pattern."""
+    """Return a copy of `matrix` in which the rows of the mask `rows` are taken from `other`, with the same pattern."""
     entries = np.repeat(rows, np.diff(matrix.indptr))
     return sp.csr_array((np.where(entries, other.data, matrix.data), matrix.indices, matrix.indptr), matrix.shape)
 
 
 def _wrong_rows(matrix, v, along, way):
-    """Return the rows in which the product of a matrix with v differs too much from the product along v."""
+    """Return a mask of the rows in which ``matrix @ v`` differs too much from the derivative ``along(v)``."""
     lacks = along(v) - matrix @ v
     size = abs(matrix) @ np.abs(v)
     share, floor = TOLERANCES[way]
     wrong = ~(np.abs(lacks) <= share * size + floor * np.max(size, initial=0.0))
     doubtful = ~wrong & (np.abs(lacks) > LARGEST_ROUNDING * size)
     if way == DIFFERENCES and doubtful.any():
-        # Entries, however small, lack something in proportion to the step, and what rounding makes does not. A row may
-        # be far smaller than the largest, as one of other units is.
+        # The error of a missing entry is proportional to the step, however small the entry is; rounding errors are
+        # not. This test also finds errors in rows far below the largest row, such as rows with other units.
         gaps = [along(times * v) - times * (matrix @ v + lacks) for times in STEP_MULTIPLES]
         wrong |= doubtful & (lacks != 0) & ~np.any(np.abs(gaps) > 0.1 * np.abs(lacks), axis=0)
     return wrong
 
 
 def change(run: Callable, x: NDArray, y: NDArray, v: NDArray) -> NDArray:
-    """Return the change of ``y = run(x)`` when x moves along v.
+    """Return the change of ``y = run(x)`` if x is displaced along v.
 
-    The move is a tenth of the size of x; shorter moves are tried if the function raises an error or returns NaN or
-    infinity. The change is 0 if it does so for all of them.
+    The displacement is a tenth of the root mean square of x. If the function raises an error or returns NaN or
+    infinity, the opposite and shorter displacements are tried. The result is 0 if all of them fail.
     """
     for share in MOVE_SHARES:
         with suppress(*EVALUATION_ERRORS):

@@ -30,16 +30,16 @@ __all__ = ["from_jax", "to_jax"]
 
 
 def to_jax(f: Callable, like: Any = None) -> Callable:
-    """Return a function of arrays as a function of JAX arrays, for jit, grad and vmap.
+    """Convert a function of NumPy arrays to a function of JAX arrays that supports jit, grad and vmap.
 
     Parameters
     ----------
     f : callable
-        ``f(*args)``, of this library and autograd.numpy: an Operator, an inverse, a solver, a rollout, a loss.
-        Arguments and result are arrays, or pytrees of arrays.
+        ``f(*args)``, written with this library and autograd.numpy: for example an Operator, an inverse, a solver, a
+        rollout or a loss. Arguments and result are arrays, or pytrees of arrays.
     like : pytree of arrays, optional
-        Of the structure, shapes and dtypes of the result of f, whose entries are paired with it by key. Default: f is
-        called once with ones, for each set of shapes that jit or vmap use.
+        Arrays with the structure, shapes and dtypes of the result of `f`. Leaves are matched by their keys. By default,
+        `f` is called once with ones for each new set of argument shapes under jit or vmap.
 
     Returns
     -------
@@ -49,10 +49,10 @@ def to_jax(f: Callable, like: Any = None) -> Callable:
     Raises
     ------
     TypeError
-        If f is no function; on use, if f does not take ones and `like` is not given, or a dtype has other than single
-        or double precision.
+        If `f` is not callable. The returned function raises it if f fails for ones and `like` is not given, or if a
+        dtype has neither single nor double precision.
     ShapeError
-        On use, if the result has other entries or shapes than `like`.
+        Raised by the returned function if the result does not have the leaves and shapes of `like`.
 
     See Also
     --------
@@ -60,12 +60,13 @@ def to_jax(f: Callable, like: Any = None) -> Callable:
 
     Notes
     -----
-    JAX calls back into Python: f runs on the CPU and must return the same result for the same arguments. An exception
-    of f is raised unchanged, under jit inside an error of JAX. vmap runs f for one entry of a batch after the other.
-    Only the arguments whose derivatives JAX asks for are differentiated, in reverse mode to every order. There is no
-    forward mode, as in ``jax.hessian``, ``jacfwd`` and ``jvp``: the Hessian is ``jax.jacrev(jax.grad(f))``. JAX cannot
-    keep the tape of f, so the backward pass runs f a second time.
-    Complex numbers: see docs/guides/complex_numbers.md.
+    Compiled JAX code calls f in Python by a callback. f runs on the CPU and must be deterministic. An exception of f is
+    raised unchanged; under jit, JAX wraps it in an exception of its own. vmap calls f once for each entry of the batch.
+    Only arguments whose derivatives JAX requests are differentiated, in reverse mode, to every order. Forward mode
+    (``jax.jvp``, ``jax.jacfwd``, ``jax.hessian``) is not supported; write ``jax.jacrev(jax.grad(f))`` for the Hessian.
+    The backward pass runs f a second time, because JAX cannot store the tape of f.
+
+    For complex numbers see docs/guides/complex_numbers.md.
 
     Examples
     --------
@@ -75,7 +76,7 @@ def to_jax(f: Callable, like: Any = None) -> Callable:
     Array([-16.,  -2.,  -4.,  22.], dtype=float32)
     """
     check_function("to_jax", f, "dp.interop.to_jax(dp.laplacian(grid))")
-    functions: dict = {}  # by structure, shapes and dtypes of the arguments: the form of the result may depend on all
+    functions: dict = {}  # by structure, shapes and dtypes of the arguments, on which the result structure may depend
 
     def call(*args):
         entries, structure = jax.tree.flatten(args)
@@ -122,9 +123,9 @@ def _jax_function(f, structure, like):
 
 
 class _ResultStructure:
-    """The structure of the result of a function: that of `like`, or of its first run.
+    """The tree structure of the result of a function: that of `like`, or else that of its first result.
 
-    Results of other runs are reordered to it.
+    The leaves of later results are reordered to this structure.
 
     Parameters
     ----------
@@ -146,7 +147,7 @@ class _ResultStructure:
             self._shapes = [np.shape(leaf) for leaf in self.leaves(like)]
 
     def leaves(self, tree):
-        """Return the leaves of a result, paired by their paths: keys of dicts, fields of named tuples."""
+        """Return the leaves of a result in the order of the structure, matched by their key paths."""
         rows, structure = jax.tree_util.tree_flatten_with_path(tree)
         if self.structure is None:
             self.structure = structure
@@ -175,14 +176,14 @@ def _joined(paths):
 
 
 class _JaxFunction:
-    """A function of a list of arrays as one of JAX arrays, with derivatives of every order.
+    """A function of a list of NumPy arrays as a function of JAX arrays, with derivatives of every order.
 
     Parameters
     ----------
     fun : callable
         Takes and returns a list of arrays.
     forms : callable
-        Takes a list of JAX arrays and returns arrays of the shapes and dtypes of the results.
+        Takes a list of JAX arrays and returns arrays with the shapes and dtypes of the results.
     """
 
     def __init__(self, fun, forms):
@@ -209,7 +210,7 @@ class _JaxFunction:
         """Run the function directly, or register a callback if JAX traces the arguments."""
         if not any(isinstance(value, jax.core.Tracer) for value in values):
             return [*map(jnp.array, self.fun([np.asarray(value)[()] for value in values]))]
-        forms = jax.eval_shape(lambda *results: [*results], *self.forms(values))  # as JAX converts dtypes
+        forms = jax.eval_shape(lambda *results: [*results], *self.forms(values))  # with dtypes as JAX converts them
         host = _HostCallback(self.fun, tuple(form.dtype for form in forms))
         return jax.pure_callback(host, forms, *values, vmap_method="sequential")
 
@@ -244,7 +245,7 @@ class _JaxFunction:
 
 
 class _HostCallback(NamedTuple):
-    """The callback of JAX; JAX compiles equal callbacks once."""
+    """The function that JAX calls back. It compares by value, because JAX compiles equal callbacks only once."""
 
     fun: Any
     dtypes: tuple
@@ -258,22 +259,24 @@ class _HostCallback(NamedTuple):
 
 
 def from_jax(function: Callable) -> Callable:
-    """Return a function of JAX arrays as a function of NumPy arrays, differentiable by this library.
+    """Convert a function of JAX arrays to a function of NumPy arrays that this library can differentiate.
 
     Parameters
     ----------
     function : callable
-        ``function(*args)``, one that ``jax.jit`` takes; arguments and result are arrays, or pytrees of arrays.
+        ``function(*args)``, which ``jax.jit`` can compile. Arguments and result are arrays, or pytrees of arrays.
 
     Returns
     -------
     callable
-        Takes and returns NumPy arrays. Arguments of float64 are computed in float64, whatever ``jax_enable_x64`` says.
+        Takes and returns NumPy arrays. With float64 arguments it computes in float64, also if ``jax_enable_x64`` is
+        not set.
 
     Raises
     ------
     TypeError
-        If it is no function; on use, if a dtype has other than single or double precision.
+        If `function` is not callable. The returned function raises it if a dtype has neither single nor double
+        precision.
 
     See Also
     --------
@@ -284,7 +287,8 @@ def from_jax(function: Callable) -> Callable:
     JAX compiles the function at the first call with each set of shapes. The VJP is ``jax.vjp``, which runs the function
     again, and the JVP is ``jax.jvp``; derivatives of every order are supported. Only traced arguments are
     differentiated.
-    Complex numbers: see docs/guides/complex_numbers.md.
+
+    For complex numbers see docs/guides/complex_numbers.md.
 
     Examples
     --------
@@ -294,7 +298,7 @@ def from_jax(function: Callable) -> Callable:
     (9.0, array([ 3., 12.]))
     """
     check_function("from_jax", function, "dp.interop.from_jax(jax.numpy.sin)")
-    rules: dict = {}  # by structure, shapes and dtypes of the arguments: the form of the result may depend on all
+    rules: dict = {}  # by structure, shapes and dtypes of the arguments, on which the result structure may depend
 
     def call(*args):
         entries, structure = jax.tree.flatten(args)
@@ -316,7 +320,7 @@ def from_jax(function: Callable) -> Callable:
 
 
 class _JaxRule:
-    """A JAX function that returns a list, as a rule of the tape; its derivatives are JAX functions, too."""
+    """A JAX function that returns a list, as a rule of the tape. Its derivatives are JAX functions, too."""
 
     def __init__(self, function):
         self.function = function
@@ -341,7 +345,7 @@ class _JaxRule:
         return self._derivative(_pushed, nums, ans, entries)[0](*entries, *tangents)
 
     def _derivative(self, make, nums, ans, entries):
-        """Return the rule of a derivative, and the places of the results that have one."""
+        """Return the rule of a derivative, and the positions of the floating results."""
         used = tuple(k for k, y in enumerate(plain(ans)) if dtype_of(y).kind in "fc")
         key = make, nums, used, len(entries)
         if key not in self._derivatives:
@@ -361,7 +365,10 @@ def _pulled(function, nums, used, count, *values):
 
 
 def _pushed(function, nums, used, count, *values):
-    """Return the tangents of the results (0 if not `used`), from the arguments and the tangents of those in `nums`."""
+    """Return the tangents of all results from the arguments and the tangents of the arguments `nums`.
+
+    Tangents of results that are not in `used` are 0.
+    """
     moving = [values[num] for num in nums]
     tangents = _alike(values[count:], moving)
 
@@ -373,5 +380,5 @@ def _pushed(function, nums, used, count, *values):
 
 
 def _alike(slopes, values):
-    """Return derivatives converted to the dtypes of the values, as JAX requires."""
+    """Return derivatives converted to the dtypes of the values. JAX requires equal dtypes."""
     return [jnp.asarray(slope, jnp.result_type(x)) for slope, x in zip(slopes, values, strict=True)]

@@ -1,4 +1,4 @@
-"""Record one run of a function on the tape, and compute its gradients: for both bridges."""
+"""Record one run of a function on the tape, and compute its gradients. Both bridges use this module."""
 
 from __future__ import annotations
 
@@ -21,16 +21,17 @@ def recorded(fun: Callable, arrays: Sequence, moving: Sequence[bool]) -> tuple[l
     fun : callable
     arrays : list of arrays
     moving : list of bool
-        Whether each array is a variable.
+        Whether each array is a variable, to which gradients are computed.
 
     Returns
     -------
     values : list
         The leaves of the result.
     rebuild : callable
-        ``rebuild(values)`` is the result.
+        ``rebuild(values)`` returns the result as a tree.
     gradients : callable
-        ``gradients(cotangents)`` are the gradients of the variables; a cotangent for each leaf, or None.
+        ``gradients(cotangents)`` returns the gradients with respect to the variables. `cotangents` has an array or None
+        for each leaf of the result.
     """
     tape = taped(fun, arrays, moving)
 
@@ -42,7 +43,7 @@ def recorded(fun: Callable, arrays: Sequence, moving: Sequence[bool]) -> tuple[l
 
 
 def owned(array: Any) -> Any:
-    """Return an array of another library as a NumPy array, or as a number if it is floating and has no axes."""
+    """Return a copy of an array of another library as a NumPy array, or as a NumPy scalar if it is floating and 0-d."""
     check_precision("a result of another library", array)
     array = np.array(array)
     if array.dtype.kind in "fc":
@@ -51,5 +52,5 @@ def owned(array: Any) -> Any:
 
 
 def parts(values: Any, count: int) -> tuple:
-    """Return the entries of a tuple that may be traced."""
+    """Return the first `count` entries of a tuple, which may be a traced value, as a plain tuple."""
     return tuple(values[k] for k in range(count))

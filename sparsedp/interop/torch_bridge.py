@@ -3,7 +3,7 @@
 This is the only module that imports torch (extra `torch`).
 
 For a complex number, the gradient of torch is dL/dRe + i dL/dIm and the cotangent of our tape is dL/dRe - i dL/dIm;
-each is the complex conjugate of the other and is converted where it passes from one library to the other.
+they are complex conjugates. The bridge conjugates derivatives when they pass from one library to the other.
 """
 
 from __future__ import annotations
@@ -32,27 +32,27 @@ SAME = "; return the same entries each time"
 
 
 def to_torch(f: Callable) -> Callable:
-    """Return a function of arrays as a function of torch tensors, differentiable by torch.
+    """Convert a function of NumPy arrays to a function of torch tensors that torch can differentiate.
 
     Parameters
     ----------
     f : callable
-        ``f(*args, **options)``, of this library and autograd.numpy: an Operator, an inverse, a solver, a rollout,
-        a loss. Arguments and result are arrays, or trees (tuples, lists, dicts) of arrays.
+        ``f(*args, **options)``, written with this library and autograd.numpy: for example an Operator, an inverse, a
+        solver, a rollout or a loss. Arguments and result are arrays, or trees (tuples, lists, dicts) of arrays.
 
     Returns
     -------
     callable
-        Takes tensors instead of arrays, in the same trees, and passes other arguments unchanged. Results have the
-        dtypes of the results of f: float32 for float32. Only arguments that require a gradient are differentiated; if
-        there are none, nothing is recorded.
+        Takes tensors in place of arrays, in the same trees. Other arguments are passed to `f` unchanged. Results have
+        the dtypes that `f` returns. Only arguments that require a gradient are differentiated. If no argument requires
+        a gradient, nothing is recorded.
 
     Raises
     ------
     TypeError
-        If f is no function; on use, if a tensor is not on the CPU, or has half precision.
+        If `f` is not callable. The returned function raises it if a tensor is not on the CPU, or has half precision.
     RuntimeError
-        By torch, in the backward pass, if a tensor has been changed in place since the call.
+        Raised by torch in the backward pass if a tensor was modified in place after the call.
 
     See Also
     --------
@@ -60,11 +60,12 @@ def to_torch(f: Callable) -> Callable:
 
     Notes
     -----
-    Tensors and arrays share their memory; a result is copied where f may know its memory. f runs once for a value and
-    its gradient, and a second time for a gradient of the gradient (``create_graph=True``). Derivatives of every order
-    are supported; f must return the same result for the same arguments. ``torch.func`` and forward mode are not
-    supported; torch raises an error.
-    Complex numbers: gradients are those of torch, dL/dRe + i dL/dIm, see docs/guides/complex_numbers.md.
+    Tensors and arrays share their memory. A result is copied if `f` may have kept a reference to it. f runs once for a
+    value and its gradient, and a second time for a gradient of the gradient (``create_graph=True``). Derivatives of
+    every order are supported; f must be deterministic. ``torch.func`` and forward mode are not supported, and torch
+    raises an error for them.
+
+    Gradients of complex numbers follow torch, dL/dRe + i dL/dIm; see docs/guides/complex_numbers.md.
 
     Examples
     --------
@@ -88,11 +89,11 @@ def to_torch(f: Callable) -> Callable:
 
 
 def _bridged(fun, tree):
-    """Return the result of a function of a tree of arrays as a tree of tensors, for a tree with some tensors."""
+    """Call a function of a tree of arrays with a tree that contains tensors; return the result as a tree of tensors."""
     entries, rebuild = flatten(tree)
     places = [place for place, leaf in enumerate(entries) if isinstance(leaf, torch.Tensor)]
     tensors = [entries[place] for place in places]
-    # The closure below holds no tensor: a tensor would keep its graph alive.
+    # The closure below must not refer to tensors, because a tensor would keep its graph alive.
     constants = [*map(constant, placed(entries, places, [None] * len(places)))]
     if not torch.is_grad_enabled():
         tensors = [tensor.detach() for tensor in tensors]
@@ -100,7 +101,7 @@ def _bridged(fun, tree):
     def of_arrays(arrays):
         return fun(rebuild(placed(constants, places, arrays)))
 
-    result: list = []  # filled by `_TorchNode.forward`, which can return tensors only
+    result: list = []  # filled by `_TorchNode.forward`, which can only return tensors
     outputs = _TorchNode.apply(of_arrays, result, *tensors)
     values, output_places, rebuild_result = result
     return rebuild_result(placed(values, output_places, outputs))
@@ -126,17 +127,17 @@ class _TorchNode(torch.autograd.Function):
         results = []
         for place in places:
             value = values[place]
-            # A traced result was computed by this call; f may keep a reference to any other one.
+            # A traced result is a new array of this call. f may have kept a reference to any other result.
             results.append(value if traced[place] else np.array(value))
         outputs = _tensors(results, arrays)
         result += values, places, rebuild
-        form = rebuild(range(len(values)))  # a second run may return a dict in another order
+        form = rebuild(range(len(values)))  # a second run may return the keys of a dict in another order
 
         def rerun(arrays):
             return paired(fun(arrays), form, "result of to_torch", advice=SAME)
 
         ctx.kept = rerun, moving, gradients, places, len(values)
-        ctx.save_for_backward(*tensors, *outputs)  # torch raises an error if one is changed in place
+        ctx.save_for_backward(*tensors, *outputs)  # torch raises an error if one of them is modified in place
         ctx.set_materialize_grads(False)
         return tuple(outputs)
 
@@ -156,7 +157,7 @@ class _TorchNode(torch.autograd.Function):
             gradients = recorded(fun, arrays[:input_count], moving)[2]
             return input_gradients(gradients, arrays[input_count:])
 
-        if torch.is_grad_enabled():  # a gradient of this gradient may be asked for
+        if torch.is_grad_enabled():  # a gradient of this gradient may be requested
             slopes = _bridged(differentiable, [*tensors, *seeds])
         else:
             arrays = [*map(_array, seeds)]
@@ -166,7 +167,7 @@ class _TorchNode(torch.autograd.Function):
 
 
 def _array(tensor):
-    """Return the memory of a tensor as a read-only array, or as a number."""
+    """Return a tensor as a read-only array that shares its memory, or as a NumPy scalar."""
     if tensor.device.type != "cpu":
         raise TypeError(f"to_torch computes on the CPU, got a tensor on {tensor.device}; write tensor.cpu()")
     if tensor.is_floating_point() and tensor.dtype.itemsize < 4:
@@ -175,7 +176,7 @@ def _array(tensor):
 
 
 def _tensors(values, others):
-    """Return arrays as tensors of the same memory; copied if it is read-only or shared with other arrays."""
+    """Return arrays as tensors that share their memory. Read-only, reversed and overlapping arrays are copied."""
     tensors = []
     seen = [*others]
     for value in map(np.asarray, values):
@@ -189,7 +190,7 @@ def _tensors(values, others):
 
 
 def _conjugated(g):
-    """Convert a gradient of torch to a cotangent of the tape, or the reverse."""
+    """Convert a gradient of torch to a cotangent of the tape, or a cotangent of the tape to a gradient of torch."""
     if dtype_of(g).kind == "c":
         return anp.conj(g)
     return g
@@ -199,26 +200,27 @@ def _conjugated(g):
 
 
 def from_torch(function: Callable) -> TorchFunction:
-    """Return a function of torch tensors, or a module, as a function of arrays, differentiable by this library.
+    """Convert a torch function or module to a function of NumPy arrays that this library can differentiate.
 
     Parameters
     ----------
     function : callable or torch.nn.Module
-        ``function(*args)``; arguments and result are tensors, or trees (tuples, lists, dicts) of tensors.
+        ``function(*args)``. Arguments and result are tensors, or trees (tuples, lists, dicts) of tensors.
 
     Returns
     -------
     TorchFunction
-        A callable that takes and returns arrays instead of tensors. For a module the first argument is a dict of its
-        parameters as arrays: ``net(net.parameters, x)``; ``net.parameters`` are copies of the parameters of the module.
-        Parameters that are missing in a dict are taken from the module, as constants.
+        A function that takes and returns arrays in place of tensors. For a module the first argument is a dict of its
+        parameters as arrays: ``net(net.parameters, x)``. Here ``net.parameters`` has copies of the parameters of the
+        module. Parameters that are missing in the dict are taken from the module, as constants.
 
     Raises
     ------
     TypeError
-        If it is no function; on use, if a dtype has other than single or double precision.
+        If `function` is not callable. The returned function raises it if a dtype has neither single nor double
+        precision.
     ShapeError
-        On use, if the dict holds parameters that the module does not have.
+        Raised by the returned function if the dict has parameters that the module does not have.
 
     See Also
     --------
@@ -231,10 +233,11 @@ def from_torch(function: Callable) -> TorchFunction:
     the optimal parameters into the module. torch computes in the dtypes of its arguments: for float64 fields write
     ``module.double()``.
 
-    The function runs once for its value and its derivatives of every order, also if it draws random numbers (dropout).
-    Only traced arguments are differentiated. Derivatives are in reverse mode: `jvp` takes two passes.
+    The function runs only once for its value and its derivatives of every order, so that random numbers (dropout) are
+    the same in all of them. Only traced arguments are differentiated. There is only reverse mode; `jvp` is computed by
+    two reverse passes.
 
-    Complex numbers: see docs/guides/complex_numbers.md.
+    For complex numbers see docs/guides/complex_numbers.md.
 
     Examples
     --------
@@ -270,7 +273,8 @@ def from_torch(function: Callable) -> TorchFunction:
         entries, rebuild = flatten(args)
         moving = [*map(isbox, entries)]
         for place, entry in enumerate(entries):
-            # torch, or the caller before the backward pass, may write into an array. Traced entries are not arrays.
+            # Copy, because torch or the caller may modify an array before the backward pass. Traced entries are boxes
+            # and not instances of np.ndarray.
             if isinstance(entry, np.ndarray):
                 entries[place] = np.array(entry)
         rebuild_result: Any = None
@@ -288,7 +292,7 @@ def from_torch(function: Callable) -> TorchFunction:
 
 
 class TorchFunction(ReconstructibleFunction):
-    """A torch function of arrays, as `from_torch` returns it.
+    """A torch function or module as a function of arrays. `from_torch` returns it.
 
     Parameters
     ----------
@@ -299,7 +303,7 @@ class TorchFunction(ReconstructibleFunction):
     Attributes
     ----------
     parameters : dict
-        Copies of the parameters of a module by name; empty for other functions.
+        Copies of the parameters of a module, by name; empty if `function` is not a module.
     """
 
     def __init__(self, call: Callable, function: Callable, parameters: dict[str, Any]) -> None:
@@ -317,7 +321,7 @@ class _Graph:
     moving : list of bool
         Whether each argument may be differentiated.
     inputs : list of tensors, optional
-        The first arguments, if they are tensors of an earlier run.
+        The first arguments, if they are tensors of a previous run.
     """
 
     outputs: list[torch.Tensor]
@@ -342,13 +346,13 @@ class _Graph:
         return tuple(map(_owned, self.outputs))
 
     def as_new(self):
-        """Return a graph of the same function that has not run; a graph of gradients belongs to one run."""
+        """Return a graph of the same function that has not run. A graph of gradients belongs to one run: return it."""
         if self._continues:
             return self
         return _Graph(self._act, self._moving)
 
     def pulled(self, places, moving):
-        """Return the graph of the gradients of some arguments; it takes these arguments, then the cotangents."""
+        """Return the graph of gradients with respect to arguments `places`; it takes all arguments, then cotangents."""
 
         def act(tensors):
             outputs = [y for y in self.outputs if y.requires_grad]
@@ -384,7 +388,7 @@ _rule = Rule("torch function", _Graph.run, _pull)
 
 
 def _owned(tensor):
-    """Return a tensor as an array or number with its own memory: the tensor may be a parameter, or saved by torch."""
+    """Return a copy of a tensor as an array or scalar. The tensor itself may be a parameter, or saved by torch."""
     if tensor.is_floating_point() and tensor.dtype.itemsize < 4:
         raise TypeError(f"from_torch takes and gives float32 or float64, got {tensor.dtype}; write tensor.float()")
     return owned(tensor.numpy(force=True))

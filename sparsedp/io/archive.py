@@ -1,4 +1,4 @@
-"""Save fields with their grid in files, and load them; the suffix of a name chooses the format."""
+"""Save fields with their grid to files, and load them. The suffix of the file name selects the format."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["load", "save"]
 
 LABELLED = (".nc", ".zarr")
 PARAVIEW = (".vti", ".vtr", ".pvd")
-NEEDS: dict[str, tuple[str, ...]] = {  # of the extra `files`
+NEEDS: dict[str, tuple[str, ...]] = {  # libraries of the extra `files`, by suffix
     ".npz": (),
     ".nc": ("xarray", "h5netcdf", "h5py"),
     ".zarr": ("xarray", "zarr"),
@@ -38,48 +38,52 @@ def save(
     at: dict[str, str] | None = None,
     **fields: ArrayLike,
 ) -> None:
-    """Save a grid and fields on it in a file, or a series in several files; the suffix chooses the format.
+    """Save a grid and fields on it to a file. The suffix of the file name selects the format.
 
     =========== ==============================================================================================
-    .npz        NumPy alone. `load` returns the same bits.
-    .nc, .zarr  A Dataset of xarray (see `dp.interop.to_xarray`) as NetCDF 4, or as a folder of Zarr, with a checksum.
-                `load` returns the same bits, bytes in the order of this machine.
-    .vti, .vtr  For ParaView: .vti for a uniform grid, .vtr for any grid. Fields on cells are cell data, on nodes point
-                data. Fields on faces or edges are stored as vectors in the cells: each component is the mean of the 2
-                faces, or of the 2 or 4 edges, of a cell. An entry of a batch has its number in the name. In 1-D and
-                2-D the other axes have one cell, as wide as the first one along x. `load` does not read these files.
-    .pvd        The same at each of `times`: wind.pvd, and wind/0000.vtr and so on.
+    .npz        Needs only NumPy. `load` returns bit-identical arrays.
+    .nc, .zarr  An xarray Dataset (see `dp.interop.to_xarray`) as a NetCDF 4 file or a Zarr folder, with a checksum.
+                `load` returns bit-identical values in native byte order.
+    .vti, .vtr  For ParaView: .vti for a uniform grid, .vtr for any grid. Fields on cells become cell data, fields on
+                nodes point data. Fields on faces or edges become cell vectors: each component is the mean over the 2
+                faces, or over the 2 or 4 edges, of a cell. Batch entries are numbered in the name of the field. A 1-D
+                or 2-D grid gets one cell along each missing axis, as wide as the first cell along x. `load` does not
+                read these files.
+    .pvd        A time series for ParaView: wind.pvd is the index, and wind/0000.vtr, ... have the fields at each time.
     =========== ==============================================================================================
 
-    An existing file or folder of this name is replaced once the new one is complete; of a series, file by file.
+    An existing file or folder with this name is replaced only when the new one is complete. The files of a .pvd series
+    are replaced one by one.
 
     Parameters
     ----------
     path : str or path
     grid : Grid
-        Stretched axes, origin and periodic axes are stored; files for ParaView do not store periodicity.
+        The file stores cell widths, origin and periodicity; files for ParaView do not store periodicity.
     times : array, shape (n,), optional
-        Times [time] of a series: then each field has n entries in its first axis.
+        Times [time] of a series. If given, the first axis of each field has length n.
     attrs : dict, optional
-        Units, or a dict of attributes, by the name of a field, "x", "y", "z" or "times", for other readers of .nc and
-        .zarr files: ``{"x": "m", "u": {"units": "m/s", "long_name": "speed"}}``.
+        Attributes for other programs that read .nc and .zarr files. The keys are names of fields, "x", "y", "z" or
+        "times"; a value is the unit, or a dict of attributes:
+        ``{"x": "m", "u": {"units": "m/s", "long_name": "speed"}}``.
     at : dict of str, optional
-        "cells", "faces", "nodes" or "edges" by the name of a field; default: the first of them whose shape fits.
+        The space of a field: "cells", "faces", "nodes" or "edges", by the name of the field. Default: the first of
+        these spaces whose shape matches.
     **fields : arrays, shape (..., *space.shape)
-        On cells, faces, nodes or edges of the grid; leading axes are a batch.
+        Fields on cells, faces, nodes or edges of the grid. Leading axes are batch axes.
 
     Raises
     ------
     ShapeError
-        If an array is no field on the grid, or does not have one entry for each time.
+        If the shape of an array matches no space of the grid, or its first axis does not match `times`.
     TypeError
-        If a field is no plain array of numbers (a traced value, a tensor, a distributed field), if its dtype cannot be
-        stored (half precision; for ParaView also complex numbers and bools), or if attributes are neither text nor
-        numbers.
+        If a field is not a plain array of numbers (but a traced value, a tensor or a distributed field), if the format
+        does not support its dtype (half precision in .nc and .zarr; in files for ParaView also complex and bool), or if
+        an attribute is neither text nor numbers.
     ValueError
-        If the suffix is another one, or the file cannot hold this grid, a series, or attributes.
+        If the suffix is unknown, or the format does not support the grid, a series, or attributes.
     ImportError
-        If a library is missing; the extra `files` installs all of them; .npz needs none.
+        If a library for the format is missing. The extra `files` installs all of them; .npz needs none.
     OSError
         If the file cannot be written.
 
@@ -122,7 +126,7 @@ def save(
 
 
 def _check_for_paraview(suffix, grid, times, content):
-    """Raise ValueError if a file for ParaView cannot hold the fields."""
+    """Raise ValueError if a file for ParaView cannot store these fields, times or grid."""
     if (times is None) == (suffix == ".pvd"):
         raise ValueError(f"save puts one state into .vti or .vtr, and a series with times into .pvd, got {suffix}")
     if times is not None:
@@ -134,28 +138,29 @@ def _check_for_paraview(suffix, grid, times, content):
 
 
 def load(path: str | os.PathLike) -> tuple[Grid, dict[str, Any]]:
-    """Load the grid and the fields of a file that `save` wrote.
+    """Load the grid and the fields from a file that `save` wrote.
 
     Parameters
     ----------
     path : str or path
-        Ends in .npz, .nc or .zarr.
+        A path that ends in .npz, .nc or .zarr.
 
     Returns
     -------
     grid : Grid
-        Equal to the one that was saved.
+        Equal to the saved grid.
     fields : dict of arrays
-        By name, with shapes and dtypes as saved; and "times", if times were saved.
+        The fields by name, with the saved shapes and dtypes. If times were saved, they have the key "times".
 
     Raises
     ------
     ValueError
-        If the file is of another kind, damaged, or changed by another program, or if its suffix is another one.
+        If the suffix is not supported, or if the file was not written by `save`, is damaged, or was changed by another
+        program.
     ImportError
-        If a library is missing; the extra `files` installs all of them; .npz needs none.
+        If a library for the format is missing. The extra `files` installs all of them; .npz needs none.
     OSError
-        If there is no such file, or it cannot be read.
+        If the file does not exist or cannot be read.
 
     See Also
     --------

@@ -1,4 +1,4 @@
-"""Atomic writing: a file exists in complete form or not at all, even if the disk is full or the process is killed."""
+"""Atomic writing: a file is complete or unchanged, even if the disk is full or the process is killed."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ PATH_ADVICE = {
     errno.ENOTDIR: "give a path through folders, a part of this one is a file",
 }
 SEQUENCES = {"list": list, "tuple": tuple}
-UNFINISHED = ".part"  # suffix of a file that is being written, or was when its process was killed
+UNFINISHED = ".part"  # suffix of incomplete files; they remain only if the process was killed while it wrote them
 
 
 def write_file(path: str | os.PathLike, content: Any) -> None:
     """Write a file atomically.
 
-    It is written under another name in the same folder, synced and renamed. Links are followed, and the mode of a
-    replaced file is kept; devices and pipes are written directly.
+    The content is written to a temporary file in the same folder, flushed to disk, and renamed to `path`. Symbolic
+    links are followed, and the mode of a replaced file is preserved. Devices and pipes are written directly.
 
     Parameters
     ----------
     path : str or path
     content : str, bytes or callable
-        A function is called with the open binary stream.
+        The content, or a function that is called with the open binary stream and writes the content.
 
     Raises
     ------
     OSError
-        If the file cannot be written. It names `path`; an existing file is unchanged.
+        If the file cannot be written. The message names `path`, and an existing file is unchanged.
 
     Examples
     --------
@@ -54,7 +54,7 @@ def write_file(path: str | os.PathLike, content: Any) -> None:
     ('1 2 3', 1)
     """
     target = Path(os.path.realpath(path))
-    part = target.parent / f"{target.name[:40]}.{uuid4().hex[:8]}{UNFINISHED}"  # another writer has another name
+    part = target.parent / f"{target.name[:40]}.{uuid4().hex[:8]}{UNFINISHED}"  # a unique name, for concurrent writers
     with path_errors(path):
         try:
             exists = target.exists()
@@ -62,26 +62,26 @@ def write_file(path: str | os.PathLike, content: Any) -> None:
                 _write(target, "wb", content)
                 return
             if exists:
-                open(target, "rb+").close()  # raises if the file may not be changed; then it is not replaced
+                open(target, "rb+").close()  # raises an error for a read-only file, so that it is not replaced
             _write(part, "xb", content)
             if exists:
                 shutil.copymode(target, part)
             os.replace(part, target)
             _sync(target.parent)
         finally:
-            with contextlib.suppress(OSError):  # it was renamed unless an error occurred
+            with contextlib.suppress(OSError):  # without an error it has been renamed and does not exist
                 part.unlink()
 
 
 @contextlib.contextmanager
 def path_errors(path: Any, reading: bool = False) -> Iterator[None]:
-    """Let an OSError inside name `path`, not a temporary file, and add advice about the path."""
+    """Change an OSError raised inside so that it names `path` (not a temporary file), and add advice about the path."""
     try:
         yield
     except OSError as error:
-        if error.errno is not None:  # otherwise a library raised it, with its own message
+        if error.errno is not None:  # else a library raised it, with its own message
             advice = PATH_ADVICE.get(error.errno)
-            if reading and error.errno == errno.ENOENT:  # a new folder does not help
+            if reading and error.errno == errno.ENOENT:  # to create the folder does not help a reader
                 advice = None
             if advice and advice not in (error.strerror or ""):  # an inner block may have added it
                 error.strerror = f"{error.strerror}; {advice}"
@@ -91,7 +91,7 @@ def path_errors(path: Any, reading: bool = False) -> Iterator[None]:
 
 
 def _write(path, mode, content):
-    """Write content into an opened file."""
+    """Open a file in the given mode and write content to it."""
     with open(path, mode) as stream:
         if callable(content):
             content(stream)
@@ -105,7 +105,7 @@ def _write(path, mode, content):
 
 
 def _sync(folder):
-    """Sync a folder, so that the new name of a file is on the disk; some systems do not support it."""
+    """Sync a folder, so that a renamed file is on disk. Ignore errors of systems that do not support it."""
     with contextlib.suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:
@@ -115,18 +115,19 @@ def _sync(folder):
 
 
 def write_through(path: str | os.PathLike, write: Callable) -> None:
-    """Write a file or a folder atomically by a function of a library that takes no stream.
+    """Write a file or a folder atomically by a function that takes a path and not a stream.
 
     Parameters
     ----------
     path : str or path
     write : callable
-        ``write(name)``: the name has the suffix of `path`, in lower case, and is in a temporary folder beside it.
+        ``write(name)`` writes the file or folder `name`, which is in a temporary folder next to `path` and has the
+        suffix of `path` in lower case.
 
     Raises
     ------
     OSError
-        If it cannot be written. It names `path`; an existing file or folder is unchanged.
+        If the file or folder cannot be written. The message names `path`, and an existing file or folder is unchanged.
     """
     target = Path(os.path.realpath(path))
     with path_errors(path), TemporaryDirectory(suffix=UNFINISHED, dir=target.parent) as folder:
@@ -142,15 +143,15 @@ def write_through(path: str | os.PathLike, write: Callable) -> None:
                 os.replace(target, old)
             os.replace(part, target)
         except BaseException:
-            if old.exists() and not target.exists():  # the temporary folder is deleted with its content
+            if old.exists() and not target.exists():  # else the old folder would be deleted with the temporary one
                 os.replace(old, target)
             raise
 
 
 def save_tree(path: str | os.PathLike, tree: Any, kind: str) -> None:
-    """Save nested tuples, lists and dicts of arrays, numbers, strings and None in a .npz file without pickle.
+    """Save nested tuples, lists and dicts of arrays, numbers, strings and None to an .npz file without pickle.
 
-    The structure is stored as JSON beside the arrays, with a word for the kind of file.
+    The structure is stored as JSON in the same file. `kind` names the format; `load_tree` checks it.
     """
     arrays: list = []
     text = json.dumps({"format": kind, "tree": _words(tree, arrays)})
@@ -162,7 +163,7 @@ def save_tree(path: str | os.PathLike, tree: Any, kind: str) -> None:
 
 
 def load_tree(path: str | os.PathLike, kind: str) -> tuple[Any] | None:
-    """Return the tree of a file that `save_tree` wrote, in a tuple; None if the file is of another kind or damaged.
+    """Load a tree that `save_tree` wrote. Return (tree,), or None if the file is damaged or of another kind.
 
     Examples
     --------
@@ -186,7 +187,7 @@ def load_tree(path: str | os.PathLike, kind: str) -> tuple[Any] | None:
 
 
 def _words(tree, arrays):
-    """Return a tree as JSON stores it; arrays are appended to a list and replaced by their number."""
+    """Return a tree as plain data for JSON. Arrays are appended to the list `arrays` and replaced by their number."""
     if isinstance(tree, dict):
         if not all(isinstance(key, str) for key in tree):
             raise TypeError("save needs dicts with strings as keys; write str(key)")
@@ -203,7 +204,7 @@ def _words(tree, arrays):
 
 
 def _tree(words, stored):
-    """Return the tree of its form in JSON and the stored arrays."""
+    """Return the tree from its JSON data and the stored arrays."""
     [(kind, value)] = words.items()
     if kind == "dict":
         return {key: _tree(branch, stored) for key, branch in value}

@@ -1,4 +1,4 @@
-"""The content of a file of fields: arrays of numbers, each on a space of the grid."""
+"""Check the fields that are to be saved, and find the space of the grid on which each of them lives."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from sparsedp.grid.grid import Grid
 __all__ = ["KIND", "OTHERS", "REAL", "check_fields", "check_names"]
 
 KIND = "sparsedp fields 1"
-REAL = "bBhHiIlLqQfd"  # letters of the dtypes that all formats store
-OTHERS = "?FD"  # letters of the dtypes that some formats store
+REAL = "bBhHiIlLqQfd"  # type codes of the dtypes that all formats store
+OTHERS = "?FD"  # type codes of the dtypes that .nc and .zarr files also store
 
 
 def check_fields(
     name: str, grid: Grid, times: Any, at: dict[str, str] | None, fields: dict[str, Any], dtypes: str | None = None
 ) -> tuple[Any, dict[str, Any]]:
-    """Return checked arguments of `save`.
+    """Check the arguments of `save` and return them as arrays.
 
     Parameters
     ----------
     name : str
-        Of the function, for messages.
+        Name of the calling function, for error messages.
     grid, times, at, fields
         See `save`.
     dtypes : str, optional
-        Letters of the allowed dtypes; default: all numbers.
+        Type codes of the allowed dtypes. Default: all numeric dtypes.
 
     Returns
     -------
     times : array or None
     content : dict
-        (space, array) of each field, by its name.
+        The pair (space, array) of each field, by name.
     """
     check_names(name, "at", at, fields)
     if times is not None:
@@ -52,7 +52,7 @@ def check_fields(
 
 
 def check_names(name: str, argument: str, entries: Any, known: Any) -> None:
-    """Raise ValueError if an argument is not a dict whose keys are some names."""
+    """Raise ValueError if an argument is not a dict, or has a key that is not in `known`. None is allowed."""
     unknown = entries
     if isinstance(entries or {}, dict):
         unknown = sorted(set(entries or ()) - set(known), key=str)
@@ -61,7 +61,7 @@ def check_names(name: str, argument: str, entries: Any, known: Any) -> None:
 
 
 def _numbers(name, field, value, dtypes):
-    """Return a field as an array of an allowed dtype."""
+    """Return a field as an array; raise TypeError if it is not an array of numbers with an allowed dtype."""
     check_plain(name, value)
     numbers = None
     if isinstance(value, (np.ndarray, np.generic, float, int, list, tuple)):
@@ -77,12 +77,12 @@ def _numbers(name, field, value, dtypes):
             instead = f"{field}.real and {field}.imag"
         raise TypeError(f"{field} has dtype {numbers.dtype}, which such a file does not hold; write {instead}")
     if dtypes:
-        return numbers.astype(numbers.dtype.name)  # bytes in the order of this machine
+        return numbers.astype(numbers.dtype.name)  # native byte order
     return numbers
 
 
 def _space(field, grid, numbers, times, at):
-    """Return the first space whose shape is the shape of an array without leading axes, or the one that `at` names."""
+    """Return the first space whose shape matches the last axes of an array, or the space that `at` names."""
     shape = numbers.shape
     if times is not None:
         if shape[:1] != times.shape:

@@ -1,4 +1,4 @@
-"""Fields as datasets of xarray, and .nc and .zarr files of them. The only file that imports xarray (extra `files`)."""
+"""Fields as xarray Datasets, and as .nc and .zarr files. Only this module imports xarray (extra `files`)."""
 
 from __future__ import annotations
 
@@ -21,41 +21,44 @@ from sparsedp.io.file_format import KIND, check_fields, check_names
 
 __all__ = ["dataset_of", "from_xarray", "read_dataset", "to_xarray", "write_dataset"]
 
-TOLERANCE = 1e-3  # of the thinnest cell: largest deviation of coordinates, which float32 needs
+TOLERANCE = 1e-3  # largest deviation of coordinates relative to the thinnest cell; float32 coordinates need it
 
 
 def to_xarray(
     grid: Grid, /, *, times: Any = None, attrs: dict | None = None, at: dict[str, str] | None = None, **fields: Any
 ) -> xarray.Dataset:
-    """Return fields on a grid as a Dataset of xarray, with coordinates.
+    """Return fields on a grid as an xarray Dataset with coordinates.
 
-    A variable on cells has the dimensions x, y, z, on nodes x_nodes, y_nodes, z_nodes. A field on faces or edges is a
-    variable for each component, u_x on (x_nodes, y, z) and so on; leading axes are u_batch_0 and so on. The widths
-    of the cells are the variables x_widths and so on.
+    A field on cells has the dimensions x, y, z; a field on nodes has x_nodes, y_nodes, z_nodes. A field u on faces or
+    edges becomes one variable for each component; for example u_x on faces has the dimensions (x_nodes, y, z). Batch
+    axes are named u_batch_0, u_batch_1, ... The variables x_widths, ... have the widths of the cells.
 
     Parameters
     ----------
     grid : Grid
     times : array, shape (n,), optional
-        Times [time] of a series, the coordinate `time`: then each field has n entries in its first axis.
+        Times [time] of a series; they become the coordinate `time`. If given, the first axis of each field has
+        length n.
     attrs : dict, optional
-        Units, or a dict of attributes, by the name of a field, "x", "y", "z" or "times":
-        ``{"x": "m", "u": {"units": "m/s", "long_name": "speed"}}``.
+        Attributes. The keys are names of fields, "x", "y", "z" or "times"; a value is the unit, or a dict of
+        attributes: ``{"x": "m", "u": {"units": "m/s", "long_name": "speed"}}``.
     at : dict of str, optional
-        "cells", "faces", "nodes" or "edges" by the name of a field; default: the first of them whose shape fits.
+        The space of a field: "cells", "faces", "nodes" or "edges", by the name of the field. Default: the first of
+        these spaces whose shape matches.
     **fields : arrays, shape (..., *space.shape)
+        Fields on cells, faces, nodes or edges of the grid. Leading axes are batch axes.
 
     Returns
     -------
     xarray.Dataset
-        It may share memory with the fields.
+        The Dataset may share memory with the fields.
 
     Raises
     ------
     ShapeError, TypeError
-        If an array is no field on the grid, or no plain array of numbers.
+        If the shape of an array matches no space of the grid, or a field is not a plain array of numbers.
     ValueError
-        If two variables would have one name, or a key of `attrs` or `at` is unknown.
+        If two variables would have the same name, or if `attrs` or `at` has an unknown key.
 
     See Also
     --------
@@ -72,28 +75,31 @@ def to_xarray(
 
 
 def from_xarray(grid: Grid, array: xarray.DataArray, /) -> np.ndarray:
-    """Return a DataArray of xarray as an array on the cells of a grid; dimensions are ordered by their names.
+    """Convert an xarray DataArray to a NumPy array on the cells of a grid.
+
+    The dimensions are transposed to the order of the axes of the grid.
 
     Parameters
     ----------
     grid : Grid
     array : xarray.DataArray
-        With the dimensions x, y, z of the grid. If these have coordinates, they are the centres of its cells, up to
-        0.1 % of the thinnest cell. Other dimensions come first, as a batch, and have no coordinates.
+        It has a dimension for each axis (x, y, z) of the grid. If such a dimension has coordinates, they must be equal
+        to the cell centres, up to 0.1 % of the thinnest cell. Other dimensions become leading batch axes and must not
+        have coordinates.
 
     Returns
     -------
     array, shape (..., *grid.shape)
-        A copy.
+        A copy of the values.
 
     Raises
     ------
     TypeError
-        If `array` is no DataArray.
+        If `array` is not a DataArray.
     ShapeError
-        If its coordinates along an axis are not those of the grid.
+        If the coordinates along an axis are not the cell centres of the grid.
     ValueError
-        If a dimension is missing, or the array has coordinates that would be lost.
+        If a dimension is missing, or if the array has other coordinates, which the result could not store.
 
     See Also
     --------
@@ -129,7 +135,7 @@ def from_xarray(grid: Grid, array: xarray.DataArray, /) -> np.ndarray:
 
 
 def dataset_of(name: str, grid: Grid, attrs: dict | None, times: Any, content: dict[str, Any]) -> xarray.Dataset:
-    """Return the Dataset of fields that `check_fields` has checked."""
+    """Return a Dataset of fields that were checked by `check_fields`."""
     check_names(name, "attrs", attrs, [*content, *grid.axes, "times"])
     for key, one in (attrs or {}).items():
         if not isinstance(one, str) and not (isinstance(one, dict) and all(map(_is_attribute, one, one.values()))):
@@ -166,7 +172,7 @@ def dataset_of(name: str, grid: Grid, attrs: dict | None, times: Any, content: d
 
 
 def _is_attribute(key, value):
-    """Return whether files can store an attribute: text, numbers or an array of numbers."""
+    """Return True if files can store an attribute: text, a number, or a list or array of numbers."""
     entries = value if isinstance(value, (list, tuple)) else [value]
     numbers = all(
         isinstance(x, (np.ndarray, np.generic, int, float))
@@ -180,26 +186,26 @@ def _is_attribute(key, value):
 def write_dataset(path: Any, dataset: xarray.Dataset) -> None:
     """Write a Dataset atomically as a .nc file or a .zarr folder, with a checksum of its content."""
     dataset.attrs["sparsedp_crc32"] = _checksum(dataset)
-    if _is_zarr(path):  # Zarr would drop chunks of -0.0, and of NaN with other bits, as empty
+    if _is_zarr(path):  # by default Zarr omits chunks of -0.0 or NaN, and loses their exact bits
         options = {"zarr_format": 2, "consolidated": True, "write_empty_chunks": True}
         write_through(path, lambda part: dataset.to_zarr(part, **options))
     else:
         import h5netcdf
 
-        memory = io.BytesIO()  # on a full disk HDF5 would end the process
+        memory = io.BytesIO()  # written to memory first, because HDF5 aborts the process if the disk is full
         with h5netcdf.File(memory, "w") as file:
             dataset.dump_to_store(xarray.backends.H5NetCDFStore(file))
         write_file(path, memory.getbuffer())
 
 
 def _is_zarr(path):
-    """Return whether a path is a folder of Zarr."""
+    """Return whether a path has the suffix of a Zarr folder."""
     return Path(path).suffix.lower() == ".zarr"
 
 
 def read_dataset(path: Any) -> tuple[dict] | None:
-    """Return the content of a file that `write_dataset` wrote, in a tuple; None if it is another file, or changed."""
-    with path_errors(path, reading=True):  # a missing or unreadable file is not a damaged one
+    """Read a file that `write_dataset` wrote. Return (content,), or None if the file is another one or was changed."""
+    with path_errors(path, reading=True):  # a missing or unreadable file raises OSError; damaged ones give None
         if _is_zarr(path):
             os.scandir(path).close()
         else:
@@ -223,7 +229,7 @@ def read_dataset(path: Any) -> tuple[dict] | None:
 
 
 def _joined(dataset, kind, labels):
-    """Return a field of its variables."""
+    """Return a field, joined from the variables of its components."""
     parts = [dataset[label].values for label in labels]
     if kind in ("cells", "nodes"):
         return parts[0]
@@ -232,7 +238,7 @@ def _joined(dataset, kind, labels):
 
 
 def _checksum(dataset):
-    """Return a checksum of all variables and notes of a Dataset."""
+    """Return a checksum of all variables and of the attribute `sparsedp` of a Dataset."""
     total = crc32(dataset.attrs["sparsedp"].encode())
     for name in sorted(dataset.variables):
         values = dataset[name].values

@@ -1,4 +1,4 @@
-"""Fields as .vti, .vtr and .pvd files for ParaView. The only file that imports pyevtk (extra `files`)."""
+"""Write fields to .vti, .vtr and .pvd files for ParaView. Only this module imports pyevtk (extra `files`)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["write_grid", "write_series"]
 
 
 def write_series(path: Any, grid: Grid, times: Any, content: dict[str, Any]) -> None:
-    """Write the fields at each time into a file of the folder `path` without .pvd, and then the index `path`."""
+    """Write the fields at each time to a .vtr file in a folder named like `path` without .pvd; then write the index."""
     folder = Path(path).with_suffix("")
     with path_errors(path):
         folder.mkdir(exist_ok=True)
@@ -29,18 +29,18 @@ def write_series(path: Any, grid: Grid, times: Any, content: dict[str, Any]) -> 
         )
         entries.append(f'<DataSet timestep="{time}" file={quoteattr(place)}/>\n')
     write_file(path, f'<VTKFile type="Collection"><Collection>\n{"".join(entries)}</Collection></VTKFile>\n')
-    for old in folder.glob("*.vtr"):  # files of a longer series of the same name
+    for old in folder.glob("*.vtr"):  # delete remaining files of a longer series that had the same name
         if re.fullmatch("[0-9]{4,}", old.stem) and int(old.stem) >= len(entries):
             old.unlink()
 
 
 def write_grid(path: Any, grid: Grid, content: dict[str, Any]) -> None:
-    """Write fields, as `check_fields` returns them, into a .vti file (uniform grid) or a .vtr file (any grid)."""
+    """Write fields, as returned by `check_fields`, to a .vti file (uniform grid) or a .vtr file (any grid)."""
     cells: dict = {}
     points: dict = {}
     for field, (space, values) in content.items():
         (points if space.kind == "nodes" else cells).update(_arrays(field, space, values))
-    missing = 3 - grid.dim  # axes that the grid lacks: one cell, as wide as the first one along x
+    missing = 3 - grid.dim  # each missing axis gets one cell, as wide as the first cell along x
     lines = [grid.coordinates(axis, "ends") for axis in range(grid.dim)]
     lines += [np.append(0.0, grid.widths[0][:1])] * missing
 
@@ -56,13 +56,13 @@ def write_grid(path: Any, grid: Grid, content: dict[str, Any]) -> None:
 
 
 def _arrays(field, space, values):
-    """Yield the name and the array, or the three components, of a field or of each entry of a batch."""
+    """Yield (name, array) for a field or for each of its batch entries. A vector is a tuple of three arrays."""
     grid = space.grid
     kind = space.kind
     flat = (1,) * (3 - grid.dim)
     for index in np.ndindex(values.shape[: values.ndim - len(space.shape)]):
         parts = [part.reshape(part.shape + flat) for part in space.split(values[index])]
-        if kind == "nodes":  # the file stores the last node of a periodic axis, too
+        if kind == "nodes":  # ParaView needs the last node of a periodic axis, which equals the first one
             parts = [np.pad(parts[0], [(0, int(more)) for more in grid.periodic + flat], mode="wrap")]
         elif kind != "cells":
             parts = [_means(part, node_axes(kind, number, grid.dim), grid.shape) for number, part in enumerate(parts)]
@@ -72,8 +72,8 @@ def _arrays(field, space, values):
 
 
 def _means(part, on_nodes, shape):
-    """Return the mean of a component of faces or edges around each cell."""
+    """Return for each cell the mean of a component over its faces or edges."""
     part = part.astype(np.result_type(part, np.float32))
     for axis in on_nodes:
         part = 0.5 * part + 0.5 * np.roll(part, -1, axis)
-    return part[tuple(map(slice, shape))]  # the mean of the last face of a bounded axis wraps around
+    return part[tuple(map(slice, shape))]  # drop the wrapped mean at the last face of a bounded axis

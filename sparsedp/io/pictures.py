@@ -1,4 +1,4 @@
-"""Pictures as fields. The extra `plot` installs Pillow."""
+"""Read images as fields. This needs Pillow, which the extra `plot` installs."""
 
 from __future__ import annotations
 
@@ -18,30 +18,33 @@ SHADES = {
     "I;16": 65535,
     "I;16L": 65535,
     "I;16B": 65535,
-}  # white
+}  # value of white for each mode of Pillow
 
 
 def from_image(path: str | os.PathLike) -> np.ndarray:
-    """Return a picture as an array from 0 (black) to 1 (white); axis 0 is x, to the right, axis 1 is y, upwards.
+    """Read an image as an array with values from 0 (black) to 1 (white).
+
+    Axis 0 is x, which points to the right; axis 1 is y, which points upwards.
 
     Parameters
     ----------
     path : str or path
-        Of a .png, .jpg or any other format that Pillow reads; grey, coloured or of two colours.
+        A .png or .jpg file, or any other format that Pillow reads. The image may be black and white, grey or colour.
 
     Returns
     -------
-    array, shape (width, height), or (3, width, height) of a coloured picture: a batch of red, green and blue
-        Write ``dp.Grid(u.shape[-2:])`` for a grid of its pixels.
+    array, shape (width, height) or (3, width, height)
+        The first axis of a colour image is a batch of red, green and blue. ``dp.Grid(u.shape[-2:])`` is a grid with
+        one cell for each pixel.
 
     Raises
     ------
     ValueError
-        If the picture has transparent parts, or a mode without a known number for white.
+        If the image has transparency, or a mode for which the value of white is unknown.
     ImportError
         If Pillow is missing; the extra `plot` installs it.
     OSError
-        If there is no such file, or it is no picture.
+        If the file does not exist, or is not an image.
 
     See Also
     --------
