@@ -1,9 +1,9 @@
-"""Derivatives of the most frequent calls on a tape: arithmetic, entries of arrays, arrays built from numbers.
+"""Derivatives of the most frequent calls on a tape: arithmetic, indexing, and arrays built from numbers.
 
-autograd has all of these derivatives, but takes three to ten times as long, because it handles every kind of
-broadcasting, other dtypes and nested traces. The formulas of this module apply only to float64 and to traced operands
-with the shape of the result. Without them a gradient of small steps takes twice the time (benchmarks/small.py, 200
-steps of rk4).
+autograd has all of these derivatives, but takes three to ten times as long, because it handles all cases of
+broadcasting, all dtypes and nested traces. The formulas of this module apply only to float64, and to traced operands
+with the shape of the result; in other cases autograd is used. Without these formulas a gradient through steps of a
+small problem takes twice the time (benchmarks/small.py, 200 steps of rk4).
 """
 
 from __future__ import annotations
@@ -54,10 +54,10 @@ FLOAT = np.dtype(float)
 NUMBERS = {np.ndarray, np.float64}  # types with a shape and a dtype
 SCALARS = {np.float64, float}
 REAL = {np.ndarray, np.float64, float, int}
-# Types of operands that have no operator of their own beside a traced value.
+# Types of operands that do not define their own operator with a traced value.
 PLAIN = {*REAL, slice, tuple, list, bool, type(None), type(Ellipsis)}
 SEQUENCES = {list, tuple}
-BASIC = {int, slice, type(None), type(Ellipsis)}  # indices that select no entry twice
+BASIC = {int, slice, type(None), type(Ellipsis)}  # basic indexing selects no entry twice
 # Operators of Python by the name of their method.
 OPERATORS = {
     "add": anp.add,
@@ -70,8 +70,9 @@ MAKERS = "_array_from_scalar_or_array", "array_from_args"  # functions that anp.
 ITEM = unwrap(BOX.__getitem__)
 COPY = unwrap(getattr(anp.numpy_wrapper, MAKERS[0]))
 ARRAY = unwrap(getattr(anp.numpy_wrapper, MAKERS[1]))
-# The operators of Python take a tenth of the time for numbers of NumPy. They also keep the bits of a step that is
-# computed again without a tape: the last bit of a power may differ between the operator and the function.
+# For NumPy scalars the operators of Python take a tenth of the time of NumPy's functions. They are also used without a
+# tape; the last bit of a power may differ between operator and function, but a step must give the same bits with and
+# without a tape.
 PYTHON_OPERATORS = {
     anp.add: operator.add,
     anp.subtract: operator.sub,
@@ -81,14 +82,14 @@ PYTHON_OPERATORS = {
     ITEM: operator.getitem,
 }
 REDUCTIONS = "sum", "mean", "prod", "var", "std", "max", "min", "amax", "amin"
-FIRST = (0,)  # positions of the traced operands of a function of two
+FIRST = (0,)  # positions of the traced operands of a function of two operands
 SECOND = (1,)
 BOTH = (0, 1)
-by_entry: set = set()  # pullbacks of functions that act entry by entry
+by_entry: set = set()  # pullbacks of elementwise functions
 
 
 class Part(tuple):
-    """A cotangent (g, index, shape) of an array of this shape: g at the index, and zero elsewhere."""
+    """A cotangent (g, index, shape) for an array of this shape, which is g at the index and zero elsewhere."""
 
     __slots__ = ()
 
@@ -99,11 +100,12 @@ class Formula(NamedTuple):
     Attributes
     ----------
     backward : callable
-        ``backward(value, nums, args)`` returns, for a call with this result and traced arguments at `nums`, a pullback
-        and the tuple `held` of what it needs; None if the formula does not hold for this call. ``pull(g, *held)``
+        ``backward(value, nums, args)`` returns the pair (pull, held) for a call with the result `value` and traced
+        arguments at the positions `nums`, or None if the formula does not apply to this call. ``pull(g, *held)``
         returns the cotangents of the arguments `nums`.
     forward : callable
-        ``forward(g, num, args, shape)``: the tangent of the result, of this shape, for the tangent g of one argument.
+        ``forward(g, num, args, shape)`` returns the tangent of the result, which has this shape, for the tangent g of
+        the argument at position `num`.
     """
 
     backward: Callable
@@ -111,7 +113,7 @@ class Formula(NamedTuple):
 
 
 def distributed_formula(function: Callable, value: Any, args: Sequence, nums: Sequence[int]) -> Formula | None:
-    """Return the formula for a call with a field that is no NumPy array, see `ArrayKind.formulas`; None without one."""
+    """Return the formula for a call with a distributed field, see `ArrayKind.formulas`; None if there is none."""
     formulas = formulas_of_kind(function, value, tuple(args), tuple(nums))
     if formulas is None:
         return None
@@ -120,7 +122,7 @@ def distributed_formula(function: Callable, value: Any, args: Sequence, nums: Se
 
 
 def refuse_options(function: Callable, options: dict) -> None:
-    """Refuse the options `where` and `initial` of reductions, which autograd's derivatives ignore."""
+    """Raise DerivativeError for the options `where` and `initial` of reductions, which autograd ignores."""
     if function.__name__ in REDUCTIONS and {"where", "initial"} & options.keys():
         raise DerivativeError(
             f"autograd's derivative of {function.__name__} does not know where= and initial=; choose entries by "
@@ -129,22 +131,22 @@ def refuse_options(function: Callable, options: dict) -> None:
 
 
 def in_dtype(value: Any, dtype: DTypeLike) -> Any:
-    """Return a plain value in a dtype."""
+    """Convert a plain value to a dtype."""
     return as_field(value).astype(dtype, copy=False)
 
 
 def operand(x: Any) -> Any:
-    """Return a list or tuple as an array, which may hold traced values; all else as it is."""
+    """Convert a list or tuple, which may contain traced values, to an array; return other values unchanged."""
     if type(x) in SEQUENCES:
         return anp.array(x)
     return x
 
 
-# ---- functions entry by entry ----------------------------------------------------------------------------------------
+# ---- elementwise functions -------------------------------------------------------------------------------------------
 
 
 def power_slope(g: Any, x: Any, y: Any) -> Any:
-    """Return g times the derivative of x**y in x, without the overflow of x**(y - 1) for a negative number y."""
+    """Return g times dx**y / dx; for a negative number y without x**(y - 1), which may overflow."""
     if type(y) in (int, float) and y < 0:
         return g / x * y * x**y
     where = anp.where if type(y) is BOX else np.where  # the latter is faster
@@ -152,23 +154,23 @@ def power_slope(g: Any, x: Any, y: Any) -> Any:
 
 
 def numerator_slope(g: Any, x: Any, y: Any) -> Any:
-    """Return g times the derivative of x / y in x."""
+    """Return g times the derivative of x / y with respect to x."""
     return g / y
 
 
 def denominator_slope(g: Any, x: Any, y: Any) -> Any:
-    """Return g times the derivative of x / y in y, without the square of y, which underflows below 1e-162."""
+    """Return g times the derivative of x / y with respect to y, without y**2, which underflows for y below 1e-162."""
     return -g * (x / y) / y
 
 
 def _entrywise(*slopes):
-    """Return the formula of a function that acts entry by entry, which is its own transpose.
+    """Return the formula of an elementwise function, whose JVP and VJP are the same product.
 
     Parameters
     ----------
     *slopes : (callable, tuple of int)
-        For each operand ``slope(g, *args)``, g times the derivative in this operand, and the positions of the operands
-        that the derivative needs: the tape holds no others.
+        For each operand the function ``slope(g, *args)``, which returns g times the derivative with respect to this
+        operand, and the positions of the operands that it uses. The tape stores only these.
     """
     slope, needed = slopes[0]
 
@@ -223,7 +225,7 @@ def _entrywise(*slopes):
 
 
 def _is_real(value):
-    """Whether a value is a number or array of float64."""
+    """Return True for a float64 number or array."""
     return type(value) is np.float64 or (type(value) is np.ndarray and value.dtype is FLOAT)
 
 
@@ -262,7 +264,7 @@ def _array_forward(g, num, args, shape):
 
 _quotient = _entrywise((numerator_slope, SECOND), (denominator_slope, BOTH))
 
-FORMULAS: dict[Any, Formula] = {  # by identity: a primitive that a user defines has other derivatives
+FORMULAS: dict[Any, Formula] = {
     anp.add: _entrywise((lambda g, *args: g, ()), (lambda g, *args: g, ())),
     anp.subtract: _entrywise((lambda g, *args: g, ()), (lambda g, *args: -g, ())),
     anp.multiply: _entrywise((lambda g, x, y: y * g, SECOND), (lambda g, x, y: x * g, FIRST)),

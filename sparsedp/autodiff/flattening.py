@@ -1,4 +1,4 @@
-"""The floating leaves of a tree as one vector of doubles, and back: the unknowns of a search or of a check."""
+"""Convert the floating leaves of a tree to one float64 vector and back, for minimisation and gradient checks."""
 
 from __future__ import annotations
 
@@ -23,29 +23,29 @@ FINITE = "must be finite (dp.check.gradient(loss, x) shows where it comes from)"
 
 
 def flatten(tree: Any) -> tuple[np.ndarray, Callable]:
-    """Return the numbers of a tree as one vector of doubles, and the function from such a vector to a tree.
+    """Convert a tree of arrays to one float64 vector, and return a function that converts such a vector to a tree.
 
-    For libraries that accept only flat vectors, such as SciPy's minimize with ``jac=True``.
+    Use it with libraries that accept only flat vectors, such as SciPy's minimize with ``jac=True``.
 
     Parameters
     ----------
     tree : any nesting of tuple, list, dict and dataclass
-        Of arrays and numbers, floating or complex (a complex number takes two). Other leaves (int, bool, None, str)
-        have no place in the vector.
+        Its floating leaves, arrays and numbers, form the vector; a complex value takes two entries, the real and the
+        imaginary part. Other leaves (int, bool, None, str) are not part of the vector.
 
     Returns
     -------
     vector : array, shape (n,)
     unflatten : callable
-        ``unflatten(vector)``: a tree of the same structure, shapes and dtypes, and with the same leaves that are not
-        floating. Differentiable, to every order.
+        ``unflatten(vector)`` returns a tree with the structure, shapes and dtypes of `tree`, and with its leaves that
+        are not floating. It is differentiable to every order.
 
     Raises
     ------
     DerivativeError
-        If the tree holds no floating leaf.
+        If the tree has no floating leaf.
     ShapeError
-        On use, if a vector has another length.
+        When `unflatten` is called with a vector of another length.
 
     See Also
     --------
@@ -88,7 +88,7 @@ def _unflatten(tree):
 
 
 def _traced_leaf(part, value):
-    """Return a part of a traced vector as a leaf of the shape and dtype of a value."""
+    """Convert a part of a traced vector to the shape and dtype of a leaf with this value."""
     numbers = part
     if np.iscomplexobj(value):
         numbers = part[::2] + 1j * part[1::2]
@@ -96,10 +96,10 @@ def _traced_leaf(part, value):
 
 
 class Packing(TreeStructure):
-    """How the floating leaves of a tree lie in one vector.
+    """The order of the floating leaves of a tree in one float64 vector.
 
-    Leaves that are not floating (int, bool, None, str) are kept as they are. A complex leaf takes two
-    numbers for each entry, the real and the imaginary part.
+    Leaves that are not floating (int, bool, None, str) are stored here and are not part of the vector. Each entry of a
+    complex leaf takes two entries of the vector, the real and the imaginary part.
 
     Parameters
     ----------
@@ -112,16 +112,16 @@ class Packing(TreeStructure):
     values : list of arrays
         The floating leaves.
     complex : bool
-        Whether one of them is complex.
+        Whether one of the floating leaves is complex.
     eps : float
-        Rounding of the coarsest dtype.
+        Largest machine epsilon of the dtypes.
     size : int
-        Number of numbers in the vector.
+        Length of the vector.
 
     Raises
     ------
     DerivativeError
-        If the tree holds no floating leaf.
+        If the tree has no floating leaf.
 
     Examples
     --------
@@ -147,23 +147,24 @@ class Packing(TreeStructure):
         self._parts = [slice(start, end) for start, end in zip(ends, ends[1:])]
 
     def pack(self, tree: Any) -> np.ndarray:
-        """Return a tree of the same structure as a flat vector of doubles."""
+        """Convert a tree of the same structure to a float64 vector."""
         return joined(self.variables(tree))
 
     def slopes(self, gradient: Any) -> list[np.ndarray]:
-        """Return the floating leaves of a gradient, dL/dRe + i dL/dIm for complex ones.
+        """Return the floating leaves of a gradient, with dL/dRe + i dL/dIm for complex leaves.
 
-        The tape gives dL/dRe - i dL/dIm there. Joined, the leaves are the gradient with respect to the packed vector.
+        The tape returns the conjugate, dL/dRe - i dL/dIm. Joined to one vector, the leaves are the gradient with
+        respect to the packed vector.
 
         Parameters
         ----------
         gradient : tree
-            Of the same structure.
+            A tree of the same structure.
 
         Raises
         ------
         DerivativeError
-            If a leaf has another shape, or holds no numbers.
+            If a leaf has another shape or is not numeric.
         """
         advice = f"; return a tree like {self.root}"
         derivatives = self.variables(gradient, "gradient", advice=advice, error=DerivativeError)
@@ -181,22 +182,22 @@ class Packing(TreeStructure):
         return slopes
 
     def pack_gradient(self, gradient: Any) -> np.ndarray:
-        """Return a finite gradient of the same structure as the gradient with respect to the packed vector."""
+        """Convert a gradient tree to the gradient with respect to the packed vector; raise an error if not finite."""
         slopes = self.slopes(gradient)
         for name, g in zip(self.names, slopes):
             check_finite(f"the gradient of {name}", g, FINITE)
         return joined(slopes)
 
     def traced(self, tree: Any) -> Any:
-        """Return the floating leaves of a tree that may be traced as one traced vector."""
+        """Join the floating leaves of a tree, which may be traced, to one vector; differentiable."""
         return anp.concatenate([anp.reshape(leaf, (-1,)) for leaf in self.variables(tree)])
 
     def split(self, vector: Any) -> list:
-        """Return the part of a flat vector that belongs to each floating leaf, as views."""
+        """Return for each floating leaf the view of its part of a flat vector."""
         return [vector[part] for part in self._parts]
 
     def arrays(self, vector: np.ndarray) -> list[np.ndarray]:
-        """Return fresh arrays of the shapes and dtypes of the floating leaves; this rounds."""
+        """Convert a vector to new arrays of the shapes and dtypes of the floating leaves, rounded to these dtypes."""
         arrays = []
         for part, x in zip(self.split(vector), self.values):
             numbers = part.view(np.result_type(x.dtype, float))
@@ -204,27 +205,27 @@ class Packing(TreeStructure):
         return arrays
 
     def tree(self, arrays: Any) -> Any:
-        """Return the tree with these floating leaves, numbers where the original has numbers."""
+        """Build the tree with these floating leaves; a leaf that is a number in the original becomes a number."""
         return self.build(list(map(_like, self._originals, arrays)))
 
     def unpack(self, vector: np.ndarray) -> Any:
-        """Return a flat vector as a fresh tree; every leaf has the type, shape and dtype of its original."""
+        """Convert a flat vector to a new tree, whose leaves have the types, shapes and dtypes of the originals."""
         return self.tree(self.arrays(vector))
 
 
 def joined(arrays: Sequence) -> np.ndarray:
-    """Return arrays as one vector of doubles, complex numbers as pairs."""
+    """Join arrays to one float64 vector, with complex entries as pairs (real, imaginary)."""
     return np.concatenate([_doubles(x) for x in arrays])
 
 
 def _doubles(array):
-    """Return an array of any precision as one vector of doubles."""
+    """Convert an array of any precision to a float64 vector."""
     kind = complex if np.iscomplexobj(array) else float
     return np.ravel(array).astype(kind).view(float)
 
 
 def _like(leaf, value):
-    """Return a value as a number of the type of a leaf, where the leaf is a number."""
+    """Convert a value to the type of a leaf if the leaf is a number; return it unchanged if it is an array."""
     if isinstance(leaf, np.ndarray) or isbox(value):
         return value
     if isinstance(leaf, np.generic):

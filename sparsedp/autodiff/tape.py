@@ -1,10 +1,11 @@
 """The tape: rules with hand-written derivatives, the traces that record their calls, and the backward pass.
 
-Only this module imports autograd. All rules are calls of one primitive (`_call`) and all Operators of a faster one
-(`apply_operator`): a primitive for each rule would stay in the tables of autograd for the life of the process.
+Only this module uses the internals of autograd. All rules share one primitive of autograd (`_call`), and all Operators
+share another, faster one (`apply_operator`): a primitive for each rule would stay in the tables of autograd as long as
+the process runs.
 
-The traced arrays of autograd (`ArrayBox`) get faster operators. These act on traces of this module alone: for other
-users of autograd every call, its node on their tape and its result stay as they are.
+The traced arrays of autograd (`ArrayBox`) get faster arithmetic operators. These apply only to traces of this module;
+for other users of autograd every call, its node on their tape and its result are unchanged.
 
 Complex cotangents follow autograd, g = dL/dRe(y) - i dL/dIm(y): the VJP of y = A x is A^T g.
 """
@@ -91,7 +92,7 @@ __all__ = [
 ]
 
 plain = getval  # the value below all boxes
-# Functions of autograd -> functions whose derivatives replace those of autograd on the traces of this module.
+# Function of autograd -> function whose derivatives are used instead of those of autograd, on traces of this module.
 underflow_safe: dict[Callable, Callable] = {}
 
 
@@ -107,15 +108,16 @@ def autograd_rules(function: Callable) -> tuple[Callable, Callable]:
 def _replace_derivatives(*functions, slopes):
     """Register derivatives of some functions for the traces of this module.
 
-    autograd divides by squares in the derivatives of these functions. Below 1e-162 such a square underflows, and the
-    derivative becomes NaN or infinite where it is finite.
+    autograd's derivatives of these functions divide by the square of a value. The square of a value below 1e-162
+    underflows, so that autograd returns NaN or infinity although the derivative is finite.
 
     Parameters
     ----------
     *functions : callables
-        Names of the same function of autograd.
+        A function of autograd and its aliases.
     slopes : sequence of callables
-        For each argument ``slope(g, ans, *args)``: g times the derivative of the result `ans` in this argument.
+        For each argument ``slope(g, ans, *args)``, which returns g times the derivative of the result `ans` with
+        respect to this argument.
     """
 
     @primitive
@@ -135,7 +137,7 @@ def _replace_derivatives(*functions, slopes):
 
 
 def _without_result(slope):
-    """Return a derivative ``slope(g, *args)`` as one that is also given the result."""
+    """Adapt a derivative ``slope(g, *args)`` to the signature ``slope(g, ans, *args)``."""
     return lambda g, ans, *args: slope(g, *args)
 
 
@@ -184,17 +186,18 @@ class Recorder:
     Parameters
     ----------
     *witnesses : callables
-        ``see(node, function, value, arguments, options, numbers)`` is called for every node that is created, beside
-        those of `thread.witnesses`.
+        Callbacks ``see(node, function, value, arguments, options, numbers)``. They and those in `thread.witnesses` are
+        called for every node that is created.
 
     Attributes
     ----------
     nodes : list of ReverseNode
         The recorded calls.
     bytes : int or None
-        If it is a number, the bytes of results and of arguments that are not traced are added to it.
+        If it is a number, the sizes in bytes of results and of arguments that are not traced are added to it.
     ended : bool
-        Whether the traced function has returned: a later call has no derivative and is refused.
+        Whether the traced function has returned. Its values cannot be differentiated any more, so that using one of
+        them raises a DerivativeError.
     """
 
     def __init__(self, *witnesses: Callable):
@@ -229,7 +232,7 @@ class Recorder:
         return nodes
 
     def check_open(self) -> None:
-        """Refuse a call after the end of the trace."""
+        """Raise DerivativeError if the traced function has returned."""
         if self.ended:
             raise DerivativeError(
                 "a traced value was stored and used after the function or the step that computed it had ended, so its "
@@ -240,15 +243,15 @@ class Recorder:
 class ReverseNode(VJPNode):
     """A call on a reverse-mode trace.
 
-    A tape has very many nodes, and each object in them that Python's garbage collector tracks costs time: most calls
-    have one or two parents, which are stored without a tuple.
+    A tape has many nodes, and each object that Python's garbage collector tracks costs time. So one or two parents, the
+    most frequent case, are stored without a tuple.
 
     Attributes
     ----------
     vjp : callable
         The pullback ``vjp(g, *held)``.
     held : tuple
-        What the pullback needs, constants as they were at the call.
+        The further arguments of the pullback, with copies of those that the caller could modify.
     recorder : Recorder
     """
 
@@ -316,9 +319,10 @@ class ReverseNode(VJPNode):
             self._keep_real(args, nums)
 
     def _keep_real(self, args, nums):
-        """Take the real part of cotangents of real arguments: beside complex ones autograd returns complex ones.
+        """Take the real part of the cotangents of real arguments.
 
-        A tuple, or entries of an array, are neither real nor complex.
+        If another argument is complex, autograd returns complex cotangents for real arguments too. Arguments that are
+        tuples are not converted.
         """
         pull = self.vjp
         is_real = []
@@ -335,7 +339,7 @@ class ReverseNode(VJPNode):
 
 
 class UntapedNode(Node):
-    """A call of a step that will be computed again on a tape: it shows that the result is traced, and holds nothing."""
+    """A call in a step that is run again later on a tape: it marks its result as traced, and records nothing."""
 
     __slots__ = ("recorder",)
     recorder: Any
@@ -380,9 +384,10 @@ class ForwardNode(JVPNode):
 
 
 def _kind(function, value, args, nums):
-    """Return the kind of dtype of a result; refuse traced values inside a list, which autograd does not see.
+    """Return the kind of dtype of a result; raise DerivativeError for traced values inside a list.
 
-    They give an array of objects or, as in a product of two vectors, one traced value.
+    autograd does not trace values inside a list. The result is then an array of objects or, as in a product of two
+    vectors, one traced value.
     """
     kind = getattr(plain(value), "dtype", FLOAT).kind
     hidden = kind == "O"
@@ -397,7 +402,7 @@ def _kind(function, value, args, nums):
     return kind
 
 
-untraced = notrace_primitives  # by kind of node, functions that leave the tape
+untraced = notrace_primitives  # type of node -> functions whose results are not traced
 untraced[ReverseNode] = untraced[VJPNode]
 untraced[UntapedNode] = untraced[VJPNode]
 untraced[ForwardNode] = untraced[JVPNode]
@@ -406,16 +411,17 @@ forward_root = ForwardNode.new_root  # begins a forward-mode trace with its tang
 OWN_NODES = {ReverseNode, UntapedNode, ForwardNode}
 
 
-# Returns the number of a new trace: larger than those of the traces that it is nested in, and unique.
+# Returns the number of a new trace, which is unique and larger than the numbers of the traces around it.
 new_trace = count_from(trace_stack.top + 1).__next__
 
 
 @contextmanager
 def _new_autograd_trace():
-    """Give a trace of autograd the next number of this module.
+    """Use the counter of this module to number the traces of autograd.
 
-    autograd counts the open traces of all threads up and down. Of two nested traces, one of them of this module or of
-    another thread, the inner one could get the smaller number, and its derivative would be wrong.
+    autograd's own counter goes up and down with the open traces of all threads. If one of two nested traces belongs to
+    this module, or if other threads open traces, the inner trace could get the smaller number, and its derivative
+    would be wrong.
     """
     yield new_trace()
 
@@ -434,7 +440,7 @@ def traces_of(values: Iterable) -> set[int]:
 
 
 def innermost(values: Sequence) -> list[int]:
-    """Return the positions of the values on the innermost trace, if that is a reverse-mode trace; else none."""
+    """Return the positions of the values on the innermost trace; an empty list if that is a forward-mode trace."""
     trace = -1
     nums: list[int] = []
     for num, value in enumerate(values):
@@ -449,7 +455,7 @@ def innermost(values: Sequence) -> list[int]:
 
 
 def boxed(values: Iterable, roots: Iterable, number: int) -> list:
-    """Return values as a list, those with a root as traced values of the trace with this number."""
+    """Return values as a list, in which the values with a root are traced on the trace with this number."""
     traced = []
     for value, root in zip(values, roots, strict=True):
         if root is None:
@@ -460,14 +466,14 @@ def boxed(values: Iterable, roots: Iterable, number: int) -> list:
 
 
 def split_boxes(values: Iterable, number: int) -> tuple[list, list]:
-    """Split traced values of the trace with this number.
+    """Separate values on the trace with this number from their nodes.
 
     Returns
     -------
     below : list
-        The values; other values are returned as they are.
+        The values without the boxes of this trace; other values unchanged.
     nodes : list
-        The nodes of the traced values; None for other values.
+        The nodes of the values on this trace; None for other values.
     """
     below = list(values)
     nodes: list = [None] * len(below)
@@ -493,12 +499,12 @@ def backward(nodes: Sequence[ReverseNode], ends: Sequence, cotangents: Sequence,
     nodes : sequence of ReverseNode
         In the order of the calls.
     ends : sequence
-        Nodes of the results, or None.
+        For each result its node, or None.
     cotangents : sequence
-        Of the results, or None.
+        For each result its cotangent, or None.
     sums : dict
-        By node, the pair (sum of its cotangents, whether the sum may be written to). The cotangents of roots, and of
-        calls that are not in `nodes`, are added to it.
+        Maps a node to the pair (sum of its cotangents, whether the sum may be modified in place). On return it contains
+        the cotangents of roots, and of calls that are not in `nodes`.
     """
     for end, g in zip(ends, cotangents, strict=True):
         if end is not None and g is not None:
@@ -522,7 +528,7 @@ def backward(nodes: Sequence[ReverseNode], ends: Sequence, cotangents: Sequence,
                 sums[parent] = added(total, g)
 
 
-# Marks a call whose pullback is called ``pull(g, *sums)`` instead of ``pull(g, *held)``, see `Rule`.
+# Value of `held` for a call whose pullback is called as ``pull(g, *sums)``, see `Rule.adds`.
 SUMS: tuple = Part()
 
 
@@ -538,7 +544,7 @@ def _pull_into_sums(node, g, sums):
 
 
 def _open(total):
-    """Return the array of a sum of cotangents if it may be written to, else None."""
+    """Return the array of a sum of cotangents if it may be modified in place, else None."""
     if total is not None and total[1] and type(total[0]) is np.ndarray:
         return total[0]
     return None
@@ -550,7 +556,7 @@ def added(total: tuple | None, g: Any) -> tuple:
     Parameters
     ----------
     total : (Any, bool) or None
-        The sum, and whether it may be written to.
+        The sum, and whether it may be modified in place.
     g : Any
 
     Returns
@@ -582,7 +588,7 @@ def _add_part(total, part):
 
 
 def _whole(g, index, shape):
-    """Return an array of zeros around a part of it, which may be traced."""
+    """Return an array of this shape with the part g, which may be traced, at the index and zeros elsewhere."""
 
     def around(g):
         whole = np.zeros(shape)
@@ -599,7 +605,7 @@ def _whole(g, index, shape):
 
 
 def direct(function: Any) -> Callable:
-    """Return a primitive of autograd in a faster form: autograd is called only for its own and for nested traces."""
+    """Return a faster form of a primitive; it calls autograd only for nested traces and traces of other users."""
     raw = function.fun
 
     @wraps(function)
@@ -632,9 +638,9 @@ def direct(function: Any) -> Callable:
 
 
 def _binary(function):
-    """Return a primitive of autograd for two operands in a faster form, see `direct`.
+    """Return a faster form of a primitive of autograd for two operands, see `direct`.
 
-    An operand whose type is not PLAIN may have an operator of its own, as those of NumPy expect: autograd decides.
+    An operand whose type is not in `PLAIN` may define the operator itself, so that autograd is called.
     """
     raw = function.fun
     quick = PYTHON_OPERATORS.get(function, raw)
@@ -701,7 +707,7 @@ def _shape(box):
 
 
 def _install():
-    """Give the traced values of autograd the faster operators, which leave all other traces to autograd."""
+    """Replace operators of autograd's traced values by the faster ones, which call autograd for all other traces."""
     BOX.shape = property(_shape)
     BOX.__getitem__ = _binary(ITEM)
     BOX.__neg__ = direct(anp.negative)
@@ -726,7 +732,7 @@ def _install():
 
     @wraps(constant_full_like)
     def full_like(a, fill_value, *args, **options):
-        """Fill an array as NumPy does. autograd takes a traced fill value for a constant."""
+        """Fill an array as NumPy does; differentiable in the fill value, which autograd treats as a constant."""
         answer = constant_full_like(a, fill_value, *args, **options)
         if type(fill_value) is BOX and type(fill_value._node) in OWN_NODES and answer.dtype.kind in "fc":
             return (np.zeros_like(answer) + fill_value).astype(answer.dtype)
@@ -753,28 +759,33 @@ def differentiable(
     Parameters
     ----------
     name : str
-        Shown in errors and counts.
+        Name of the function in error messages and counts.
     forward : callable
-        ``forward(*args) -> ans`` on plain values; `ans` is an array, a float, or a tuple of arrays.
+        ``forward(*args) -> ans``, called with values that are not traced. `ans` is an array, a float, or a tuple of
+        arrays.
     vjp : callable, optional
-        ``vjp(nums, ans, *args) -> pull``, called once; ``pull(g)`` is a tuple of a cotangent for each place in `nums`.
+        ``vjp(nums, ans, *args) -> pull``. `nums` are the positions of the arguments that are differentiated, and
+        ``pull(g)`` returns a tuple with the cotangent of each of them, for the cotangent `g` of `ans`.
     jvp : callable, optional
-        ``jvp(nums, tangents, ans, *args) -> tangent of ans``.
+        ``jvp(nums, tangents, ans, *args) -> tangent of ans``, where `tangents` are those of the arguments `nums`.
     keywords : sequence of str
-        Trailing arguments of `forward` that a caller may pass by keyword; they are traced like the others.
+        Names of trailing arguments of `forward` that may be passed by keyword. They are differentiated like the others.
 
     Returns
     -------
     Rule
-        Call it like `forward`. If `vjp` and `jvp` use `ans`, `args` and `g` only through other rules, Operators or
-        autograd.numpy, derivatives of every order follow. What the three functions return is copied: each may return
-        the same array again and again. The arrays that they are given are read-only.
+        A function that is called like `forward`. It has derivatives of every order if `vjp` and `jvp` compute with
+        `ans`, `args` and `g` only by other rules, Operators or functions of autograd.numpy. The arrays that the three
+        functions return are copied, so that they may return the same array in every call. The arrays that they get
+        are read-only.
 
     Raises
     ------
     DerivativeError
-        On use, if a traced value is given where there is no derivative, or a cotangent has a wrong number, shape or
-        dtype.
+        When the function is differentiated: if the needed `vjp` or `jvp` was not given, or if a cotangent is complex
+        for a real argument, cannot be converted to its dtype, or if the number of cotangents is wrong.
+    ShapeError
+        When the function is differentiated: if the shape of a derivative is not that of its value.
 
     See Also
     --------
@@ -782,8 +793,8 @@ def differentiable(
 
     Notes
     -----
-    `vjp` gets read-only copies of the arrays in `args` that are not traced, also of those in tuples, lists and dicts:
-    a caller may write into them before the backward pass. Other objects must stay as they are.
+    `vjp` gets read-only copies of the arrays in `args` that are not traced, also of those in tuples, lists and dicts,
+    because the caller may write into the arrays before the backward pass. Other objects must not be modified.
     Complex numbers: see docs/guides/complex_numbers.md.
 
     Examples
@@ -801,12 +812,12 @@ def differentiable(
 
 
 def _isolated(function):
-    """Return a user's function with read-only arguments and copied results, and with its signature."""
+    """Wrap a user's function: its arguments are read-only and its results are copied; the signature stays."""
     return wraps(function)(lambda *args: copied(function(*map(frozen, args))))
 
 
 def _isolated_vjp(vjp):
-    """Return a user's `vjp` with read-only arguments, whose pullback is isolated too."""
+    """Wrap a user's `vjp`: its arguments are read-only, and its pullback is wrapped by `_isolated`."""
 
     def isolated(*args):
         return _isolated(vjp(*map(frozen, args)))
@@ -815,7 +826,7 @@ def _isolated_vjp(vjp):
 
 
 def _isolated_jvp(jvp):
-    """Return a user's `jvp` with read-only arguments, tangents too, and copied results."""
+    """Wrap a user's `jvp`: its arguments and tangents are read-only, and its results are copied."""
 
     def on_frozen_tangents(nums, tangents, *args):
         return jvp(nums, [frozen(tangent) for tangent in tangents], *args)
@@ -824,22 +835,25 @@ def _isolated_jvp(jvp):
 
 
 class Rule(Reconstructible):
-    """A function with hand-written derivatives that returns fresh arrays. Users create one with `differentiable`.
+    """A function with hand-written derivatives. Users create one with `differentiable`.
+
+    Its functions must return new arrays that no other code modifies.
 
     Parameters
     ----------
     name : str
     forward, vjp, jvp : callable
-        As of `differentiable`.
     keywords : tuple of str
+        The arguments of `differentiable`.
     made : (callable, tuple), optional
-        The function and arguments that construct the rule again; default: this class.
+        A function and its arguments that construct the rule again, for pickles. Default: this class and its arguments.
 
     Attributes
     ----------
     adds : bool
-        Whether pullbacks are called ``pull(g, *sums)``, with for each cotangent an array that holds the sum of others,
-        or None. The pullback may add its own cotangent to that array and return it; all else it returns is fresh.
+        Whether pullbacks are called as ``pull(g, *sums)``. For each cotangent to be returned `sums` has an array with
+        the sum of the other cotangents of this argument, or None. The pullback may add its cotangent to this array in
+        place and return the array; otherwise it must return a new array.
     """
 
     adds = False
@@ -861,7 +875,7 @@ class Rule(Reconstructible):
         self.made = made or (Rule, (name, forward, vjp, jvp, keywords))
 
     def __call__(self, *args: Any, **options: Any) -> Any:
-        """Evaluate the rule, and record it where an argument is traced."""
+        """Evaluate the rule, and record the call if an argument is traced."""
         if self.keywords or options:
             args = self._positional(args, options)
         return _call(self, *args)
@@ -877,7 +891,7 @@ class Rule(Reconstructible):
 
     @cached_property
     def _signature(self):
-        """The signature of the function. One without a signature, as in NumPy 1.26, takes all by position."""
+        """Signature of `forward`. A function without one, as some of NumPy 1.26, takes all arguments by position."""
         try:
             return inspect.signature(self.forward)
         except (TypeError, ValueError):
@@ -902,9 +916,10 @@ _call = direct(_primitive)
 
 
 def through(rule: Rule, nums: Sequence[int], *args: Any) -> Any:
-    """Call a rule whose functions take values of outer traces and propagate their cotangents themselves.
+    """Call a rule whose functions accept traced values of outer traces and use only differentiable operations.
 
-    Only the innermost trace, on which the arguments `nums` are, gets a node.
+    A node is created on the innermost trace only, to which the arguments `nums` belong. The outer traces record the
+    operations inside the functions of the rule.
     """
     if not nums:
         return _run(rule, *args)
@@ -919,7 +934,7 @@ def through(rule: Rule, nums: Sequence[int], *args: Any) -> Any:
 
 
 def _call_vjp(argnums, ans, args, options):
-    """Return the pullback of a call of a rule, which checks what the rule returns."""
+    """Return the pullback of a call of a rule, with checks of the cotangents that the rule returns."""
     rule = args[0]
     nums = tuple([num - 1 for num in argnums])
     if rule.vjp is None:
@@ -932,7 +947,7 @@ def _call_vjp(argnums, ans, args, options):
     def checked_pull(g, *sums):
         cotangents = timed(rule.name, "vjp", pull, g, *sums)
         is_sequence = isinstance(cotangents, (tuple, list))
-        if not is_sequence or len(cotangents) != len(nums):  # autograd would accept it silently
+        if not is_sequence or len(cotangents) != len(nums):  # autograd would not raise an error
             returned = len(cotangents) if is_sequence else type(cotangents).__name__
             raise DerivativeError(
                 f"{rule.name} must return one derivative for each of the {len(nums)} values asked for, "
@@ -947,7 +962,7 @@ def _call_vjp(argnums, ans, args, options):
 
 
 def _note_not_asked(rule, nums, values):
-    """Note the arguments of a rule that could have a derivative, but are not traced."""
+    """Note in the counters which arguments of a rule could have a derivative, but are not traced."""
     names = list(rule._signature.parameters)
     for num, value in enumerate(values):
         if num not in nums and is_variable(value):
@@ -959,11 +974,11 @@ def _call_jvp(argnums, tangents, ans, args, options):
     rule = args[0]
     if rule.jvp is None:
         raise DerivativeError(f"{rule.name} has no JVP; give differentiable(...) a jvp")
-    if any(map(isbox, (*tangents, *args))):  # inside a reverse-mode trace, whose pullback runs later
+    if any(map(isbox, (*tangents, *args))):  # inside a reverse-mode trace: the pullback runs later and needs copies
         args = constant_args(args, argnums)
     count(rule.name, "jvp")
     tangent = rule.jvp(tuple(num - 1 for num in argnums), tangents, ans, *args[1:])
-    if isinstance(plain(ans), tuple):  # the rule itself checks each result
+    if isinstance(plain(ans), tuple):  # rules with several results check the tangents themselves
         return tangent
     return fit(rule.name, ans, tangent, tangents[0])
 
@@ -979,9 +994,9 @@ def fit(name: str, value: Any, cotangent: Any, g: Any) -> Any:
     Parameters
     ----------
     name : str
-        Of the rule that returned the derivative.
+        Name of the rule that returned the derivative.
     value : Any
-        Plain or traced.
+        The value that was differentiated, plain or traced.
     cotangent : Any
         The derivative.
     g : Any
@@ -990,9 +1005,9 @@ def fit(name: str, value: Any, cotangent: Any, g: Any) -> Any:
     Raises
     ------
     ShapeError
-        If it has another shape than the value.
+        If the shape of the derivative is not that of the value.
     DerivativeError
-        If it is complex and the value real, or its dtype cannot be converted.
+        If the derivative is complex and the value real, or if its dtype cannot be converted without loss.
     """
     if type(cotangent) is type(value) and type(value) in NUMBERS:
         if cotangent.shape == value.shape and cotangent.dtype == value.dtype:
@@ -1005,7 +1020,7 @@ def fit(name: str, value: Any, cotangent: Any, g: Any) -> Any:
     if shape != expected_shape:
         raise ShapeError(f"{name} returned a derivative of shape {shape} where {expected_shape} is needed")
     if type(cotangent) is np.ndarray and not isinstance(plain(value), np.ndarray):
-        cotangent = cotangent[()]  # a number, as the value is
+        cotangent = cotangent[()]  # the value is a number, so return a NumPy scalar and not a 0-d array
     dtype = dtype_of(cotangent)
     precise = dtype_of(value)
     if dtype == precise:
@@ -1028,7 +1043,7 @@ def dtype_of(value: Any) -> np.dtype:
 
 
 def cast(g: Any, dtype: DTypeLike) -> Any:
-    """Return an array, plain or traced, in another dtype; its real part if the dtype is real."""
+    """Convert an array, plain or traced, to another dtype; take the real part if the dtype is real."""
     if dtype_of(g).kind == "c" and np.dtype(dtype).kind == "f":
         g = anp.real(g)
     if dtype_of(g) == dtype:
@@ -1042,13 +1057,13 @@ def cast(g: Any, dtype: DTypeLike) -> Any:
 
 
 def linear(name: str, forward: Callable, transpose: Callable) -> tuple[Rule, Rule]:
-    """Return a linear function and its transpose as two rules, each the derivative of the other.
+    """Return rules for a linear function and for its transpose; the VJP of each rule is the other one.
 
     Parameters
     ----------
     name : str
     forward, transpose : callable
-        ``forward(x)`` and ``transpose(g)``, on plain arrays.
+        ``forward(x)`` and ``transpose(g)``, for arrays that are not traced.
     """
     act = Rule(name, forward)
     transposed = Rule(f"{name}.T", transpose)
@@ -1064,13 +1079,13 @@ def _apply(op, u):
 
 
 _operator = primitive(_apply)
-apply_operator = direct(_operator)  # ``apply_operator(op, u)`` costs half of a call of a rule
+apply_operator = direct(_operator)  # ``apply_operator(op, u)`` takes half the time of a call of a rule
 
 
 def _operator_vjp(argnums, ans, args, options):
     op, u = args
     dtype = u.dtype
-    reference = op.backend.reference(u)  # the tape does not keep u
+    reference = op.backend.reference(u)  # so that the tape does not keep u in memory
     del args, u
 
     def pull(g):
@@ -1092,19 +1107,19 @@ def _operator_jvp(argnums, tangents, ans, args, options):
     return op.tangent.apply(tangent)
 
 
-# Their pullbacks need only the shapes of constants, or call `constant_args` themselves.
+# The pullbacks of these functions use only the shapes of constants, or the functions call `constant_args` themselves.
 sparing.update((_primitive, _operator, through, anp.add, anp.subtract, anp.concatenate_args, ARRAY, COPY))
 defvjp_argnums(_operator, _operator_vjp)
 defjvp_argnums(_operator, _operator_jvp)
 
 
 def is_variable(leaf: Any) -> bool:
-    """Whether a leaf can have a derivative: a floating number or array, plain or traced."""
+    """Return True if a leaf can have a derivative: a floating number or array, plain or traced."""
     return isbox(leaf) or isinstance(leaf, (float, complex)) or getattr(getattr(leaf, "dtype", 0), "kind", "-") in "fc"
 
 
 def called(function: Callable, args: Sequence) -> Any:
-    """Return the rule or Operator of a recorded call ``function(*args)``; for functions of autograd `function`."""
+    """Return the rule or Operator of a recorded call ``function(*args)``, or `function` if it belongs to autograd."""
     if function in (_primitive, _operator, through):
         return args[0]
     return function

@@ -1,34 +1,38 @@
-"""Error control: as many steps as the tolerance needs, each compared with two of half its length.
+"""Error control: choose step lengths so that the error of each step, estimated by step doubling, meets the tolerance.
 
-A trial of length h is computed once whole, w, and once in two halves, f. Their difference is 2^p - 1 times the error of
-f; the result is f + (f - w) / (2^p - 1), one order better (local extrapolation). Crank-Nicolson returns f: where its
-steps ring, w has the opposite sign. The next length is the smaller of the one that the last error allows and the one
-that the trend of the last two predicts.
+A trial of length h is computed once by one whole step, with the result w, and once by two half steps, with the result
+f. The difference f - w is about 2^p - 1 times the error of f. The trial returns f + (f - w) / (2^p - 1), which is one
+order more accurate (local extrapolation). For Crank-Nicolson it returns f, because stiff components change their sign
+in each step and w has the wrong sign. The next length is the smaller one of two: the length that the last error allows,
+and the length predicted from the last two errors.
 
-Derivatives: where something fast happens at a time that depends on the parameters (a jump, an ignition), the derivative
-of the state at a fixed time is its speed there times the derivative of that time: huge for a while, and small again
-afterwards. With steps of fixed lengths the small remainder is lost. So lengths follow the state. With the speed f and
-the weights of the error norm, a half step of length h from the state u gets h + d,
+Derivatives. Let a fast change of the state (a jump, an ignition) occur at a time that depends on the parameters. The
+derivative of the state at a fixed time during this change is the product of its rate of change and the derivative of
+the time of the change. It is very large during the change and small afterwards, and with constant step lengths the
+small value is lost in the errors of the large one. Therefore step lengths get a derivative with respect to the state.
+With the rate f and the weights of the error norm, a half step of length h from the state u gets the length h + d,
 
     d = -q <f, u - u*> / <f, f>,     q = a / (a + SLACK),     a = h |f|,
 
-where u* is the same state as data: d is 0, and its derivative takes the state back to the plane through u* across the
-flow. The sum of all d so far is given back, in proportion to the lengths, over a last stretch of the interval that is
-as long as its speed allows. For a rate that is continuous no choice of d changes the limit of the derivative.
-Where it jumps, at a time or with the state, all of them converge to a derivative without the term of the jump: see
-discontinuities.py, which refuses these, and interruptions.py, which has the term.
+where u* is the value of u treated as a constant. So d is 0, but has a derivative, which moves the perturbed state back
+to the plane through u* perpendicular to f. To end at the same time, the sum of all d is subtracted again over the last
+part of the interval, in proportion to the step lengths. This part starts where it is long and the rate in it is small.
+If the rate is continuous, the choice of d does not change the limit of the derivative for small tolerances. If it
+jumps, at a time or on a surface of the state, the limit lacks the contribution of the jump for every choice of d:
+discontinuities.py detects jumps and raises an error, interruptions.py computes the contribution.
 
-Two perturbed solutions have the same states. The first has the derivative of f + (w - e) (f - w), a little less
-extrapolated than the solution itself: where both end, their difference is e times the contribution of the
-extrapolation. The input of the second gets errors of the size of the tolerance: where terms cancel so that they matter,
-their difference is large. Tangents start in all three, and cotangents arrive from all three. The error of the
-derivative is the sum of both differences, and the derivative of the solution itself is returned. `perturb` and
-`evaluate` are each other's transposes in this sense, so it holds in every mode and order. One perturbed solution with
-both changes would be cheaper, but near a change of sign either hides the other: where two intervals met in the middle
-of a jump, derivatives that were wrong by 69 % passed.
+The error of a derivative is estimated by two perturbed solutions. Their states equal those of the solution, only their
+derivatives differ. The first one has the derivative of f + (weight - EPSILON) (f - w), a slightly smaller
+extrapolation; at the end it differs from the solution by EPSILON times the contribution of the extrapolation. In the
+second one the input is perturbed by relative errors of the size of the tolerance; the difference is large if terms
+cancel so that these errors matter. The error estimate is the sum of both differences. The derivative of the solution
+itself is returned. `perturb` and `evaluate` are used in forward mode and, with their roles exchanged as transposes of
+each other, in reverse mode, and thus for derivatives of every order. One perturbed solution with both changes would be
+cheaper, but one change could cancel the other: at the boundary of two intervals in the middle of a jump, derivatives
+with an error of 69 % were accepted.
 
-The values of all states are known when the derivative is taken. So the tape records their deviations, which are 0 and
-have the derivative.
+The values of all states are known when the derivative is computed. So the tape records only their deviations from
+these values, which are 0 and have a derivative.
 
 References
 ----------
@@ -66,18 +70,19 @@ if TYPE_CHECKING:
 __all__ = ["AcceptedStep", "Adaptive", "FlatDeviation", "inner_product", "relative_sizes"]
 
 FITTING = "; give one number, or a tree like the state"  # advice about a floor
-# Of one change of the length.
+# Safety factor, least and largest ratio of successive step lengths.
 SAFETY = 0.9
 SMALLEST = 0.2
 LARGEST = 5.0
-QUIET = 1e-2  # share of the tolerance below which an error shows no trend
-FLOOR = 0.1  # share of the largest entry of an array to which errors of small entries are compared
-LEAST = 1e-15  # share of the time so far below which no step is tried: its end would be rounded to its start
-TINY = 1e-25  # share of the interval, for the first step
-CAREFUL = 1e-3  # longest first step, as a share, where the rate takes the time: it may be at rest at the start alone
-MOST = 100_000  # trials in one interval
-WINDOW = 1000  # trials after which the pace is compared with that needed for the rest
-FAR = 10  # times MOST: trials that the rest would need, from which on the interval is given up
+# Lengths and times are fractions of the interval.
+QUIET = 1e-2  # smaller errors (in units of the tolerance) are replaced by this value to predict the next length
+FLOOR = 0.1  # default floor of errors: this fraction of the largest entry of an array
+LEAST = 1e-15  # least length of a step relative to the time so far; a shorter step would be lost to rounding
+TINY = 1e-25  # least length of the first step
+CAREFUL = 1e-3  # longest first step if the rate depends on the time, as it may be small at the start only
+MOST = 100_000  # largest number of trials in one interval
+WINDOW = 1000  # number of trials after which the progress is checked
+FAR = 10  # stop with an error if at the present progress the rest would need this many times MOST trials
 
 QUADRATURE = {  # nodes and weights by order
     1: ((0.5,), (1.0,)),
@@ -85,14 +90,14 @@ QUADRATURE = {  # nodes and weights by order
     3: ((0.0, 0.25, 0.5, 0.75, 1.0), (3 / 42, 16 / 42, 4 / 42, 16 / 42, 3 / 42)),
     4: ((0.0, 0.25, 0.5, 0.75, 1.0), (7 / 90, 32 / 90, 12 / 90, 32 / 90, 7 / 90)),
 }
-SLACK = 0.05  # relative change of the state in a half step at which its length follows the flow by half
-EPSILON = 1e-3  # share of the extrapolation that the first perturbed solution lacks
-LESS = (0.0, EPSILON, 0.0)  # how much less the solution and both perturbed ones are extrapolated
-UNCERTAIN = 6.0  # largest error of a derivative without extrapolation, in units of tolerance^(p / (p + 1))
-TIMES = 10.0  # error of a derivative in units of the tolerance: aim with extrapolation, limit without
-STEEP = 0.1  # relative uncertainty of the rate of change of an event, from which on it grazes its surface
-ROUNDING = 1e-12  # of the largest first derivative, below which a second one is 0 to rounding
-SHARE = 1e-4  # of the input: errors of derivatives that are smaller are relative to it
+SLACK = 0.05  # relative change of the state in a half step for which the factor q of d is 1/2
+EPSILON = 1e-3  # reduction of the weight of the extrapolation in the first perturbed solution
+LESS = (0.0, EPSILON, 0.0)  # this reduction for the solution and for both perturbed solutions
+UNCERTAIN = 6.0  # with extrapolation: largest error of a derivative, in units of tolerance^(p / (p + 1))
+TIMES = 10.0  # ratio of the largest error of a derivative to the relative perturbation of the input
+STEEP = 0.1  # relative uncertainty of the rate of change of an event above which its time has no derivative
+ROUNDING = 1e-12  # a second derivative below this fraction of the largest first derivative is rounding
+SHARE = 1e-4  # errors of derivatives smaller than this fraction of the input are relative to the fraction
 
 
 class AcceptedStep(NamedTuple):
@@ -101,9 +106,10 @@ class AcceptedStep(NamedTuple):
     Attributes
     ----------
     length, done : float
-        Shares of the interval: of the step, and before it.
+        Length of the step, and the time from the start of the interval to the step, as fractions of the interval.
     u, middle, new : tree
-        The states before it, between its halves, and after it; of radau: flat, the stages, flat.
+        The states before the step, between its halves, and after it. For radau `u` and `new` are flat arrays, and
+        `middle` holds the stages.
     """
 
     length: float
@@ -120,9 +126,9 @@ class Adaptive(Scheme):
     ----------
     scheme : Scheme
     tolerance : float
-        Of the error of two half steps, relative to |u| + floor, root mean square over all entries.
+        Largest error of two half steps, relative to |u| + floor, as root mean square over all entries.
     floor : None, number, or tree like the state
-        None: for each array of the state a tenth of its largest entry.
+        None: a tenth of the largest entry of each array of the state.
     max_step : float, optional
         Longest step.
 
@@ -131,9 +137,9 @@ class Adaptive(Scheme):
     compared : int
         Order of the error that is controlled.
     taken : list of float
-        Lengths of the accepted steps in the last interval, as shares of it.
+        Lengths of the accepted steps in the last interval, as fractions of the interval.
     weight : float
-        Of the extrapolation, 1 / (2^p - 1), or 0.
+        Weight of the extrapolation: 1 / (2^p - 1), or 0 for none.
     """
 
     window = WINDOW
@@ -163,7 +169,7 @@ class Adaptive(Scheme):
         return self._state_after(arguments, isbox)
 
     def _state_after(self, arguments: tuple, has_derivative: Callable[[Any], bool]) -> Any:
-        """Return the state after the interval; `has_derivative`: of a leaf of the arguments."""
+        """Return the state after the interval; ``has_derivative(leaf)`` is True for differentiated arguments."""
         is_traced = any(map(isbox, leaves(arguments)))
         path, _, self.taken = self.steps_over(untraced(arguments), is_traced)
         if is_traced:
@@ -180,13 +186,17 @@ class Adaptive(Scheme):
         arguments : tuple
             (u, params, t, h), plain.
         keeps_all : bool
-            Whether all steps are returned; else the last one alone.
+            Whether all steps are returned; otherwise only the last one.
         detector : EventDetector, optional
-            Looks for events in each step.
+            Locates events in each step.
 
         Returns
         -------
-        (list of AcceptedStep, Event or None, list of the lengths of all steps)
+        path : list of AcceptedStep
+        event : Event or None
+            The event at the end of the path.
+        lengths : list of float
+            The lengths of all steps.
         """
         path: deque = deque(maxlen=None if keeps_all else 1)
         lengths = []
@@ -203,7 +213,7 @@ class Adaptive(Scheme):
                 event = crossing.event
             path.append(step)
             lengths.append(step.length)
-            if keeps_all and inspector:  # beyond an event the rate is evaluated at its surface
+            if keeps_all and inspector:
                 inspector.search(step)
             if event:
                 break
@@ -224,20 +234,21 @@ class Adaptive(Scheme):
 
     @property
     def quadrature(self) -> tuple[Sequence[float], Sequence[float]]:
-        """Return nodes and weights of an extrapolated step for a rate that depends on the time alone."""
+        """Return nodes and weights of the quadrature formula that a step is for a rate that depends on time only."""
         if not self.weight:
             return (0.0, 0.5, 1.0), (0.25, 0.5, 0.25)
         return QUADRATURE[self.compared]
 
     @property
     def follows_path(self) -> bool:
-        """Return whether the integral of the rate along the path predicts the step: not where it is stiff."""
+        """Return whether the integral of the rate along the path approximates the step, as for explicit schemes."""
         return isinstance(self.scheme, Explicit)
 
     def inspector(self, arguments: tuple) -> RateInspector | None:
-        """Return what looks for jumps of the rate; None where it has none: an operator, and a constant source.
+        """Return an object that detects jumps of the rate.
 
-        None also for distributed fields, which it would have to gather.
+        Return None if the rate cannot jump (an operator and a constant source), and for distributed fields, which the
+        detection would have to gather.
         """
         problem = self.scheme.problem
         if problem.rate is None and not problem.source_takes_time:
@@ -247,14 +258,14 @@ class Adaptive(Scheme):
         return RateInspector(self, *arguments[1:])
 
     def inner_state(self, step: AcceptedStep) -> tuple[Any, float]:
-        """Return a state inside a step, in the form that steps have, and the share of the step at which it is."""
+        """Return a state inside a step, in the form of `AcceptedStep.u`, and its position as a fraction of the step."""
         return step.middle, 0.5
 
     def _refuse_jump(self, time: float, is_in_time: bool) -> None:
         cure = f"breaks=[{time:.6g}], or breaks=lambda params: [...] where it moves"
         if not is_in_time:
             cure = "events=lambda u, params, t: ... with a function that is 0 there"
-            if self.takes_time:  # close to a state of 0 the two are hard to tell apart
+            if self.takes_time:  # for states close to 0 a jump in time may be mistaken for a jump with the state
                 cure += f", or breaks=[{time:.6g}] if it jumps at that time in every state"
         raise DerivativeError(
             f"the rate of {self.name} jumps at t = {time:.9g}, and the derivative of steps across it lacks the term of "
@@ -282,20 +293,20 @@ class Adaptive(Scheme):
         ----------
         path : list of AcceptedStep
         starts : list of tuples
-            (u, params, t, h) of each solution: of equal value, with derivatives of their own.
+            (u, params, t, h) of each solution. Their values are equal, their derivatives differ.
         event : Event or None
-            At the end of the path.
+            The event at the end of the path.
         """
         _, params, t, h = untraced(starts[0])
         slopes = self._length_slopes(path, params, t, h, event)
         return [self._replayed(path, slopes, less, event, *start) for less, start in zip(LESS, starts, strict=True)]
 
     def tree(self, u: Any) -> Any:
-        """Return the state of a step as the user knows it."""
+        """Convert a state of a step to the tree that the user passes and gets."""
         return u
 
     def rounded(self, u: Any) -> Any:
-        """Return the state at the end of an interval."""
+        """Convert the state at the end of an interval to the dtypes of the user's state."""
         return u
 
     def rate(self, u: Any, params: Any, t: Any) -> Any:
@@ -303,7 +314,7 @@ class Adaptive(Scheme):
         return self.problem(u, params, t)
 
     def partial_step(self, step: AcceptedStep, arguments: tuple, length: float) -> AcceptedStep | None:
-        """Return the step from the same state with another length, a share of the interval; None if there is none."""
+        """Repeat a step with another length (a fraction of the interval); return None if the trial fails."""
         _, params, t, h = arguments
         middle, new, _ = self._trial(step.u, params, later(t, step.done * h), length, h)
         if new is None:
@@ -313,9 +324,10 @@ class Adaptive(Scheme):
     # ------------------------------------------------------------ error control
 
     def check_tolerance(self, u: Any) -> None:
-        """Refuse a floor that does not fit the state, and a tolerance below its rounding: steps would shrink to zero.
+        """Raise an error for a floor that does not fit the state, and for a tolerance below the rounding of its dtype.
 
-        The tolerance is recorded: a check of a gradient compares its gap with it.
+        With such a tolerance step lengths would shrink to zero. The tolerance is also recorded in the counters, as
+        `check.gradient` compares the difference that it finds with the tolerance.
         """
         thread.controlled += 1
         note(self.name, "tolerance", self.tolerance)
@@ -340,12 +352,12 @@ class Adaptive(Scheme):
         length = self._first_length(u, params, t, h)
         longest = self.max_step / h
         done = 0.0
-        done_at_window = 0.0  # at the end of the last window of trials
+        done_at_window = 0.0  # value of `done` at the last check of the progress
         count = 0
         last = None  # length and error of the last accepted step
         most = LARGEST
         power = -1 / (self.compared + 1)
-        left_zero = None  # the place at which a refused step would have changed an array that is 0
+        left_zero = None  # value of `done` at which a rejected step would have changed an array that is 0
         for trial in range(1, MOST + 1):
             rest = 1.0 - done
             length = self._allowed(min(length, longest), rest)
@@ -370,7 +382,7 @@ class Adaptive(Scheme):
                 error = max(error, QUIET)
                 if done == 1.0:
                     return
-                if last is not None:  # errors continue to grow at the same pace
+                if last is not None:  # assume that errors continue to grow at the same rate
                     last_length, last_error = last
                     change = min(change, change * length / last_length * (error / last_error) ** power)
                 last = length, error
@@ -379,7 +391,7 @@ class Adaptive(Scheme):
             else:
                 least = 0.0
             length *= float(np.clip(change, least, most))
-            # the step after a refused one does not become longer
+            # The step after a rejected one must not be longer than this one.
             if is_accepted:
                 most = LARGEST
             else:
@@ -402,7 +414,7 @@ class Adaptive(Scheme):
         )
 
     def _leaves_zero(self, u: Any, new: Any) -> bool:
-        """Whether a step starts to change an array that is 0, whose errors are relative to its size alone."""
+        """Return True if a step changes an array that is 0 and has no floor: its errors are relative to this change."""
         for before, after, floor in zip(leaves(u), leaves(new), self._floors(u), strict=True):
             is_zero = np.max(np.abs(before), initial=0.0) == 0
             if floor is None and is_zero and np.max(np.abs(after), initial=0.0) != 0:
@@ -410,7 +422,7 @@ class Adaptive(Scheme):
         return False
 
     def _first_length(self, u: Any, params: Any, t: Any, h: Any) -> float:
-        """Return a first length from the size of the rate: one that changes the state by a hundredth."""
+        """Return the first step length, which changes the state by about a hundredth of its size."""
         size = _largest_entry(u)
         speed = _largest_entry(self.problem(u, params, t))
         if not np.isfinite(speed):
@@ -424,7 +436,7 @@ class Adaptive(Scheme):
         return min(max(1e3 * TINY, length), CAREFUL if self.problem.timed else 1.0)
 
     def _allowed(self, length: float, rest: float) -> float:
-        """Return a length of at most the rest of the interval, and not slightly less."""
+        """Limit a length to the rest of the interval, and avoid a very short last step."""
         if self.dyadic:
             return 2.0 ** float(np.floor(np.log2(min(length, rest))))
         if length > 0.99 * rest:
@@ -441,8 +453,8 @@ class Adaptive(Scheme):
         scheme = self.scheme
         middle_time = later(t, half)
         try:
-            with np.errstate(all="ignore"):  # a step that is too long is refused in any case
-                # An inspector needs the rates at the start and in the middle, too: explicit steps begin with them.
+            with np.errstate(all="ignore"):  # overflow in a step that is too long leads to its rejection below
+                # The inspector also needs the rates at the start and in the middle, which explicit steps evaluate.
                 if inspector is not None and isinstance(scheme, Explicit):
                     first = inspector.rate_at_state(u, t)
                     middle = scheme(u, params, t, half, first)
@@ -469,11 +481,11 @@ class Adaptive(Scheme):
         return fine
 
     def _floors(self, u: Any) -> list:
-        """Return a floor for each array of the state; a number or None may stand for a whole branch."""
+        """Return the floor of each array of the state; a number or None may stand for a whole branch."""
         return paired(self.floor, u, "floor", advice=FITTING, prefix=is_uniform)
 
     def sizes(self, *states: Any) -> list:
-        """Return |u| + floor, to which errors are compared, for each array; the larger of several states."""
+        """Return for each array |u| + floor, the unit of errors, where |u| is the largest of several states."""
         columns = zip(*map(leaves, states), strict=True)
         sizes = []
         for column, floor in zip(columns, self._floors(states[0]), strict=True):
@@ -511,7 +523,7 @@ class Adaptive(Scheme):
         return anp.array([end.deviation(new) for new, _ in ends])
 
     def section(self, u: Any, rates: Sequence, half: float) -> tuple[list, float]:
-        """Return the derivative of d in each array of the state, and the speed: share of the state's size per time."""
+        """Return the derivative of d with respect to each array of the state, and the relative speed |f|."""
         sizes = [np.where(size > 0, size, np.inf) for size in self.sizes(u)]
         count = max(sum(size.size for size in sizes), 1)
         rows = [np.conj(rate / size) / size / count for rate, size in zip(rates, sizes, strict=True)]
@@ -520,14 +532,15 @@ class Adaptive(Scheme):
         return [-half / (speed * half + SLACK) / (speed or 1.0) * row for row in rows], speed
 
     def _length_slopes(self, path: list, params: Any, t: Any, h: Any, event: Event | None) -> tuple[list, float]:
-        """Return the derivatives of the lengths d.
+        """Return the derivatives of the changes d of the step lengths.
 
         Returns
         -------
         rows : list
-            For each step the derivatives of d at both halves; None where the sum of all d is given back.
+            For each step the derivatives of d in both halves; None for the last steps, in which the sum of all d is
+            subtracted again.
         rest : float
-            The time of these last steps.
+            Total length of these last steps.
         """
         rows: list = []
         speeds = []
@@ -540,7 +553,7 @@ class Adaptive(Scheme):
             second, _ = self.section(step.middle, rates, half)
             rows.append((first, second))
             speeds.append(speed)
-        if event:  # its time is free: nothing is given back
+        if event:  # the time of an event is not fixed, so that the sum of all d is not subtracted
             return [*rows, None], np.inf
         rest = h * (1.0 - np.array([step.done for step in path]))
         fastest = np.maximum.accumulate(speeds[::-1])[::-1]  # from each step on
@@ -550,13 +563,13 @@ class Adaptive(Scheme):
     def _replayed(
         self, path: list, slopes: tuple, less: float, event: Event | None, u: Any, params: Any, t: Any, h: Any
     ) -> tuple[Any, Any]:
-        """Run the accepted steps again, with derivatives; return the state and the time of the event.
+        """Run the accepted steps again, with derivatives; return the last state and the time of the event or None.
 
-        Each new state has its known value. `less`: how much less the steps are extrapolated.
+        Each new state gets the value of the accepted step. `less` reduces the weight of the extrapolation.
         """
         rows, rest = slopes
         shift: Any = 0.0  # the sum of all d
-        returned: Any = 0.0  # the share of it that a time unit gives back
+        returned: Any = 0.0  # in the last steps: the amount subtracted per unit of time
         for step, row in zip(path, rows, strict=True):
             half = 0.5 * step.length * h
             start = later(later(t, step.done * h), shift)
@@ -604,13 +617,13 @@ class Adaptive(Scheme):
         if not less:
             self._check_transversal(event, step, plain_point, slope, 2.0 * half)
         change: Any = 0.0
-        for _ in traces_of(leaves(point)):  # each iteration makes the derivative of one more order exact
+        for _ in traces_of(leaves(point)):  # each Newton iteration makes the derivatives of one more order exact
             residual = value(point, change)
             change = change - (residual - plain(residual)) / slope
         return advanced(point, change)
 
     def _check_transversal(self, event: Event, step: AcceptedStep, start: tuple, slope: float, length: Any) -> None:
-        """Refuse the derivative of an event where the solution, to the tolerance, only touches the surface."""
+        """Raise DerivativeError if the solution only touches the surface of an event, up to the tolerance."""
         _, params, t = start
         u = self.tree(step.u)
         of_state, of_time = event.gradient(u, unsided(params), t)
@@ -618,7 +631,10 @@ class Adaptive(Scheme):
         self.check_steep(event, self.tree(step.new), params, t + length, slope, (slope - before) / length)
 
     def check_steep(self, event: Event, u: Any, params: Any, t: Any, slope: float, curvature: Any) -> None:
-        """Refuse an event whose rate of change `slope`, with the derivative `curvature`, is zero to the tolerance."""
+        """Raise DerivativeError if the rate of change of an event is zero up to the tolerance.
+
+        `slope` is the rate of change, and `curvature` its derivative with respect to time.
+        """
         of_state, _ = event.gradient(u, unsided(params), t)
         sizes = flatten(u)[1](Adaptive.sizes(self, u))
         uncertain = self.tolerance * inner_product(mapped(_magnitude, of_state), sizes)
@@ -632,8 +648,8 @@ class Adaptive(Scheme):
     def perturbed_solutions(self, count: int) -> tuple[Callable, Callable]:
         """Return the functions `perturb` and `evaluate` of plain arrays, for a number of steps.
 
-        `perturb` returns the deviations with which the solution and two perturbed ones begin; `evaluate` returns the
-        deviation of the solution at the end, and refuses it if the perturbed ones differ too much.
+        `perturb` returns the initial deviations of the solution and of two perturbed solutions. `evaluate` returns the
+        final deviation of the solution, and raises DerivativeError if those of the perturbed ones differ too much.
         """
         share = self.compared / (self.compared + 1)
         if self.weight:
@@ -655,7 +671,7 @@ class Adaptive(Scheme):
             derivative, *perturbed = ends
             size = max(np.max(np.abs(derivative), initial=0.0), SHARE * scale)
             error = np.max(sum(np.abs(other - derivative) for other in perturbed), initial=0.0) / unit
-            # An input that is not finite is named where it arises.
+            # If the input is not finite, another check names the call that produced it.
             if error <= limit * size or not np.isfinite(scale):
                 return derivative.copy()
             if size < ROUNDING * largest:
@@ -664,7 +680,7 @@ class Adaptive(Scheme):
                     "cannot tell from an error: the result does not depend on it to second order, as that of a ball "
                     "before its first bounce; leave it out, or take fixed steps"
                 )
-            # Without extrapolation errors fall more slowly than the tolerance: a smaller one is refused all the more.
+            # Without extrapolation the error decreases more slowly than the tolerance, so a smaller one does not help.
             if self.weight:
                 cure = "give a smaller floor or tolerance"
             else:
@@ -686,9 +702,9 @@ class FlatDeviation(TreeStructure):
     ----------
     tree : tree
     has_derivative : callable
-        Whether a leaf has a derivative.
+        ``has_derivative(leaf)``: whether a leaf has a derivative.
     sizes : list
-        For each leaf the unit of each entry; 1 in place of 0.
+        For each leaf the units of its deviations; 1 is used in place of 0.
     """
 
     def __init__(self, tree: Any, has_derivative: Callable[[Any], bool], sizes: Sequence) -> None:
@@ -704,7 +720,7 @@ class FlatDeviation(TreeStructure):
         self.space = Space(None, parts=shapes)
 
     def deviation(self, tree: Any) -> Any:
-        """Return the deviations of a tree, flat."""
+        """Return the deviations of a tree as a flat array."""
         parts = []
         for leaf, value, unit in zip(self.variables(tree, "rate"), self.values, self.units, strict=True):
             part = replicated(_deviation(leaf, value) / unit)
@@ -733,7 +749,7 @@ def _deviation(leaf: Any, value: Any) -> Any:
 
 
 def _with_values(tree: Any, values: Any) -> Any:
-    """Return a tree with other values, which are nearly the same, and its own derivative."""
+    """Replace the values of a tree by others that differ by rounding, and keep its derivatives."""
     return mapped(lambda leaf, value: leaf - plain(leaf) + value if isbox(leaf) else value, tree, values)
 
 
@@ -754,13 +770,13 @@ def _largest_entry(tree: Any) -> float:
 
 
 def inner_product(cotangent: Any, tangent: Any) -> float:
-    """Return the real inner product of two trees; None in the first one counts as 0."""
+    """Return the real inner product of two trees; None in the first tree counts as 0."""
     pairs = zip(leaves(cotangent), leaves(tangent), strict=True)
     return float(sum(np.sum(np.real(row * rate)) for row, rate in pairs if row is not None))
 
 
 def relative_sizes(leaf: Any) -> Any:
-    """Return the unit of relative changes of each entry: the entry itself, and where it is 0, the largest one."""
+    """Return the unit of relative changes of each entry: its magnitude or, if this is 0, the largest magnitude."""
     if is_variable(leaf):
         size = np.abs(leaf)
     else:
