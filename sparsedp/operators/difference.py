@@ -1,4 +1,4 @@
-"""Differences on the staggered grid: gradient, divergence, flux, laplacian, curl, upwind."""
+"""Difference operators on the staggered grid: gradient, divergence, flux, laplacian, curl, upwind."""
 
 from __future__ import annotations
 
@@ -26,17 +26,19 @@ __all__ = ["curl", "divergence", "flux", "gradient", "laplacian", "upwind"]
 def gradient(
     grid: Grid, boundary: Any = neumann, solid: ArrayLike | None = None, solid_boundary: Any = neumann
 ) -> Operator:
-    """Return the gradient from cells to faces: the slope (u[i] - u[i - 1]) / d[i] on every face.
+    """Return the gradient operator from cells to faces, (u[i] - u[i - 1]) / d[i] on every face.
+
+    Here d[i] is the distance between the centres of the two cells.
 
     Parameters
     ----------
     grid : Grid
     boundary : condition, or dict of conditions
-        Applied on the wall faces with value 0; `lift` adds other values.
+        Boundary condition on the walls of the grid, with boundary value 0; add other values by `lift`.
     solid : bool array, shape `grid.shape`, optional
-        Cells that are not part of the domain. A face between two solid cells gets 0.
+        True for cells that are not part of the domain. On a face between two solid cells the gradient is 0.
     solid_boundary : condition
-        Applied with value 0 on every face between a solid and an open cell.
+        Boundary condition, with boundary value 0, on every face between a solid cell and a cell of the domain.
 
     Returns
     -------
@@ -48,9 +50,9 @@ def gradient(
     ShapeError
         If `solid` has another shape than the grid.
     TypeError
-        If `grid` is no Grid, `solid` not boolean, or `solid_boundary` not one condition.
+        If `grid` is not a Grid, `solid` is not boolean, or `solid_boundary` is not a single condition.
     ValueError
-        If `boundary` names an axis that is periodic or that the grid lacks.
+        If `boundary` names an axis that is periodic or that the grid does not have.
 
     See Also
     --------
@@ -58,8 +60,10 @@ def gradient(
 
     Notes
     -----
-    Order 2 inside on uniform grids and on smooth maps of them. Transpose: with volumes V, W and
-    inner faces I, V D I = -(W G I)^T. Null space: constants, when all sides are neumann or periodic.
+    The gradient is second-order accurate on interior faces of uniform grids, and of grids whose spacing varies
+    smoothly. Let V and W be the diagonal matrices of cell and face volumes, D the divergence, G the gradient, and I the
+    `interior` operator on faces. Then V D I = -(W I G)^T. If all walls are neumann or periodic, the null space of G
+    consists of the constant fields.
 
     Examples
     --------
@@ -75,7 +79,8 @@ def gradient(
     slope = to_faces("gradient", grid, [slopes(grid, axis, sides[axis]) for axis in range(grid.dim)])
     if solid is None:
         return slope
-    # The faces of solid cells are closed; unless the condition is neumann, the slope there is one-sided.
+    # Set the slope to 0 on all faces of solid cells, then add the one-sided slope that the condition implies (0 for
+    # neumann) on the faces between a solid cell and a cell of the domain.
     below, above = solid_faces(grid, check_solid(grid, solid))
     structure = compose(Mask(~(below | above)), slope.structure)
     if solid_boundary.a:
@@ -87,7 +92,7 @@ def gradient(
 
 
 def divergence(grid: Grid) -> Operator:
-    """Return the divergence from faces to cells: the net outflow per volume, sum of (v[i + 1] - v[i]) / h[i].
+    """Return the divergence operator from faces to cells, the sum over the axes of (v[i + 1] - v[i]) / h[i].
 
     Parameters
     ----------
@@ -101,7 +106,7 @@ def divergence(grid: Grid) -> Operator:
     Raises
     ------
     TypeError
-        If `grid` is no Grid.
+        If `grid` is not a Grid.
 
     See Also
     --------
@@ -109,7 +114,8 @@ def divergence(grid: Grid) -> Operator:
 
     Notes
     -----
-    Exact for the finite-volume balance on any grid: sum(volumes * D(v)) is the flow through the walls.
+    The discrete divergence theorem holds exactly on any grid: sum(grid.volumes * D(v)) is the net outflow through the
+    walls.
 
     Examples
     --------
@@ -124,20 +130,20 @@ def divergence(grid: Grid) -> Operator:
 
 
 def flux(grid: Grid, cells: Any) -> Operator:
-    """Return the outflow through the sides of a box per time, from a face field to a number.
+    """Return the operator that maps a velocity on faces to the net outflow from a set of cells, a scalar.
 
     Parameters
     ----------
     grid : Grid
     cells : slices or bool array
-        The cells of the box: one slice for each axis, ``(slice(4, 8), slice(2, 6))`` (with plain NumPy
-        ``np.s_[4:8, 2:6]``), or any set of cells as an array of shape `grid.shape`.
+        The set of cells: either one slice for each axis, such as ``(slice(4, 8), slice(2, 6))`` or
+        ``np.s_[4:8, 2:6]``, or a boolean array of shape `grid.shape`.
 
     Returns
     -------
     Operator
-        in: faces [velocity]; out: shape () [velocity length^(dim - 1)]. Sum of area times velocity over the
-        sides, outwards; equals the sum of volume times divergence over the cells.
+        in: faces [velocity]; out: shape () [velocity length^(dim - 1)]. The result is the sum of face area times
+        outward velocity over the boundary of the set. It equals the sum of volume times divergence over its cells.
 
     Raises
     ------
@@ -146,7 +152,7 @@ def flux(grid: Grid, cells: Any) -> Operator:
     TypeError
         If the array is not boolean.
     ValueError
-        If there is not one slice of neighbouring cells for each axis.
+        If `cells` is not one slice for each axis, or if a slice has a step other than 1.
 
     See Also
     --------
@@ -178,9 +184,8 @@ def laplacian(
     Parameters
     ----------
     grid : Grid
-    boundary : condition, or dict of conditions
-    solid : bool array, shape `grid.shape`, optional
-    solid_boundary : condition
+    boundary, solid, solid_boundary
+        As for `gradient`.
 
     Returns
     -------
@@ -198,9 +203,10 @@ def laplacian(
 
     Notes
     -----
-    Order 2 inside; next to a wall the truncation error is of order 1 (neumann) or 0 (dirichlet),
-    yet solutions are of order 2. The values in solid cells do not matter; the result there is the
-    flux into the solid, and solves skip these cells.
+    The truncation error is of order 2 inside the domain, and of order 1 (neumann) or 0 (dirichlet) next to a wall;
+    solutions of Poisson problems are nevertheless second-order accurate. Values of the field in solid cells have no
+    effect on the other cells. The result in a solid cell is the net flux through its faces to cells of the domain;
+    linear solves exclude solid cells.
 
     Examples
     --------
@@ -215,7 +221,9 @@ def laplacian(
 
 
 def curl(grid: Grid) -> Operator:
-    """Return the curl from nodes (a stream function, 2-D) or edges (3-D) to faces; its divergence is exactly 0.
+    """Return the curl operator from nodes (a stream function, in 2-D) or edges (in 3-D) to faces.
+
+    The divergence of the result is 0 up to rounding.
 
     Parameters
     ----------
@@ -225,8 +233,9 @@ def curl(grid: Grid) -> Operator:
     Returns
     -------
     Operator
-        in: nodes or edges [unit]; out: faces [unit / length]. In 2-D v_x = d psi/dy, v_y = -d psi/dx, with psi of
-        the shape ``grid.nodes.shape``: n + 1 nodes along an axis of n cells, n along a periodic one.
+        in: nodes or edges [unit]; out: faces [unit / length]. In 2-D the result is v_x = d psi/dy and
+        v_y = -d psi/dx, for a stream function psi of shape ``grid.nodes.shape``. An axis of n cells has n + 1 nodes,
+        or n if it is periodic.
 
     Raises
     ------
@@ -260,21 +269,23 @@ def curl(grid: Grid) -> Operator:
 
 
 def upwind(grid: Grid, axis: int | str = 0, direction: int = 1, boundary: Any = neumann) -> Operator:
-    """Return the one-sided slope on cells, on the side that the wind comes from.
+    """Return the first-order upwind derivative along one axis, from cells to cells.
 
     Parameters
     ----------
     grid : Grid
     axis : int or "x", "y", "z"
     direction : 1 or -1
-        Sign of the velocity: 1 takes (u[i] - u[i - 1]) / d, -1 takes (u[i + 1] - u[i]) / d.
+        Sign of the velocity: 1 gives (u[i] - u[i - 1]) / d, and -1 gives (u[i + 1] - u[i]) / d, where d is the distance
+        between the two cell centres.
     boundary : condition, or dict of conditions
-        Defines the slope on wall faces. Values on the walls are added by `lift`: see its example.
+        Boundary condition that defines the slope on walls, with boundary value 0. The documentation of `lift` shows in
+        an example how other values are added.
 
     Returns
     -------
     Operator
-        in: cells [unit]; out: cells [unit / length]. Order 1.
+        in: cells [unit]; out: cells [unit / length].
 
     Raises
     ------
@@ -292,7 +303,8 @@ def upwind(grid: Grid, axis: int | str = 0, direction: int = 1, boundary: Any = 
     >>> upwind(Grid(3, periodic=True))(np.array([1.0, 2.0, 4.0]))
     array([-3.,  1.,  2.])
 
-    A steady sweep w du/dx = 1 in a wind w that differs from cell to cell, with the derivative in the wind:
+    Solve the steady advection problem w du/dx = 1 with a variable velocity w, and differentiate the solution with
+    respect to w:
 
     >>> from sparsedp import dirichlet, grad, implicit, neumann
     >>> slope = upwind(Grid(3), boundary={"x": (dirichlet, neumann)})

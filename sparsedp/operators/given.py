@@ -1,4 +1,4 @@
-"""Operators from a matrix, a LinearOperator, or two functions."""
+"""Operators defined by the user: from a matrix, a LinearOperator, or two functions."""
 
 from __future__ import annotations
 
@@ -30,21 +30,20 @@ __all__ = ["check_operator", "from_functions", "from_linear_operator", "from_mat
 
 
 def check_operator(name: str, op: Any) -> None:
-    """Raise TypeError if an argument is not an Operator, or a function does not support where its fields are stored."""
+    """Raise TypeError if `op` is not an Operator, or if the function `name` does not support its backend."""
     check_type(name, op, Operator, "an Operator", "dp.from_matrix(...) first")
     op.backend.check(name)
 
 
 def from_matrix(matrix: ArrayLike, domain: Any = None, codomain: Any = None, name: str = "matrix") -> Operator:
-    """Return an Operator in explicit form from its matrix.
+    """Return the Operator with a given matrix, in explicit form.
 
     Parameters
     ----------
     matrix : scipy.sparse matrix or array, or 2-D ndarray, shape (codomain.size, domain.size)
-        Any format, real or complex. Copied; entries of other precision than float32, float64, complex64 and complex128
-        are rounded to double precision.
+        Any sparse format, real or complex. The matrix is copied. Its entries are converted to double precision.
     domain, codomain : Space, int or tuple of int, optional
-        Default: flat spaces of the matrix's sizes.
+        Default: spaces of flat arrays with as many entries as the matrix has columns and rows.
     name : str
 
     Returns
@@ -54,9 +53,9 @@ def from_matrix(matrix: ArrayLike, domain: Any = None, codomain: Any = None, nam
     Raises
     ------
     TypeError
-        If the matrix does not hold numbers, or is a masked array.
+        If the entries of the matrix are not numbers, or if it is a masked array.
     ShapeError
-        If the matrix is not 2-D or does not fit the spaces.
+        If the matrix is not 2-D, or its shape does not match the spaces.
     NonFiniteError
         If an entry is NaN or infinite.
 
@@ -66,7 +65,7 @@ def from_matrix(matrix: ArrayLike, domain: Any = None, codomain: Any = None, nam
 
     Notes
     -----
-    Complex numbers: see docs/guides/complex_numbers.md.
+    For complex matrices see docs/guides/complex_numbers.md.
 
     Examples
     --------
@@ -96,7 +95,7 @@ def from_matrix(matrix: ArrayLike, domain: Any = None, codomain: Any = None, nam
 
 
 def _rows(name, matrix):
-    """Return nested lists as an array."""
+    """Return the matrix as an array; raise ShapeError for nested lists whose rows have different lengths."""
     try:
         return np.asarray(matrix)
     except ValueError:
@@ -116,16 +115,16 @@ def from_linear_operator(linop: Any, domain: Any = None, codomain: Any = None, n
     Returns
     -------
     Operator
-        In matrix-free form.
+        An operator in matrix-free form.
 
     Raises
     ------
     TypeError
-        If `linop` has no shape or no matvec.
+        If `linop` has no attribute `shape` or `matvec`.
     ShapeError
-        If the operator does not fit the spaces.
+        If the shape of `linop` does not match the spaces.
     DerivativeError
-        On use of `.T`, if the LinearOperator has no rmatvec.
+        When the transpose `.T` is applied, if `linop` has no rmatvec.
 
     See Also
     --------
@@ -154,7 +153,7 @@ def _product(linop, x):
 
 
 def _transposed_product(linop, name, g):
-    """Return A^T g, from SciPy's product with the conjugate transpose."""
+    """Return A^T g, computed as conj(A^H conj(g)) because SciPy's rmatvec is the product with A^H."""
     try:
         return np.conj(np.asarray(linop.rmatvec(np.conj(g.reshape(-1)))))
     except (NotImplementedError, TypeError, AttributeError):
@@ -169,34 +168,34 @@ def from_functions(
     name: str = "operator",
     dtype: DTypeLike = float,
 ) -> Operator:
-    """Return an Operator from two functions, the product and the transposed product.
+    """Return an Operator defined by two functions, which compute its product and its transposed product.
 
     Parameters
     ----------
     forward : callable
-        ``forward(u)``, linear: takes an array of shape `domain.shape`, returns an array of shape `codomain.shape`.
+        A linear function ``forward(u)`` from arrays of shape `domain.shape` to arrays of shape `codomain.shape`.
     transpose : callable or None
-        ``transpose(g)``, the plain transpose: sum(g * forward(u)) == sum(transpose(g) * u).
-        None if it is not known; then only `op(u)` works.
+        ``transpose(g)``, the plain transpose without conjugation: sum(g * forward(u)) == sum(transpose(g) * u).
+        If it is None, the operator can be applied, but `op.T` and derivatives cannot.
     domain, codomain : Space, int or tuple of int
     name : str
     dtype : float or complex
-        complex if the functions return complex values for real fields, or real ones for complex fields, as a real FFT
-        and its inverse do. Then the real parts of the two sums are equal, for all complex g.
+        Use complex if the functions return complex values for real fields, or real values for complex fields, as a real
+        FFT and its inverse do. Then the real parts of the two sums above must be equal for all complex g.
 
     Returns
     -------
     Operator
-        In matrix-free form. `dp.check.operator(op)` tells whether the two functions agree.
+        An operator in matrix-free form. `dp.check.operator(op)` tests whether the two functions agree.
 
     Raises
     ------
     TypeError
-        If a function is not callable, or a space is missing.
+        If `forward` or `transpose` is not callable, or a space is None.
     ShapeError
-        On use, if a function returns an array of another shape.
+        When the operator is applied, if a function returns an array of another shape.
     DerivativeError
-        On use of the transpose when there is none.
+        When the transpose is applied, if `transpose` is None.
 
     See Also
     --------
@@ -204,7 +203,7 @@ def from_functions(
 
     Notes
     -----
-    Complex numbers: see docs/guides/complex_numbers.md.
+    For complex fields see docs/guides/complex_numbers.md.
 
     Examples
     --------
@@ -224,7 +223,7 @@ def from_functions(
 
 
 def _space(space, size):
-    """Return an argument `domain` or `codomain` as a Space; None is a flat space of this size."""
+    """Convert an argument `domain` or `codomain` to a Space; None stands for flat arrays of the given size."""
     if isinstance(space, Space):
         return space
     return Space(size if space is None else space)

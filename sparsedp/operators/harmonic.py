@@ -1,11 +1,12 @@
-"""The harmonic average of a coefficient: nonlinear, therefore a differentiable rule and not an Operator.
+"""The harmonic average of a coefficient. It is nonlinear, so it is a differentiable function and not an Operator.
 
-On the face between cells l and r, with the shares w_l = h_l / (h_l + h_r), w_r = 1 - w_l:
+On the face between cells l and r of widths h_l and h_r, with w_l = h_l / (h_l + h_r) and w_r = 1 - w_l:
 
     k_f = k_l k_r / (w_l k_r + w_r k_l),   dk_f/dk_l = w_l (k_r / den)^2,   dk_f/dk_r = w_r (k_l / den)^2.
 
-This is the flux-exact conductivity of two layers in series (Patankar, Numerical Heat Transfer and
-Fluid Flow, 1980). Where both are 0 the ratios are taken as 1, their value on k_l = k_r.
+Here den is the denominator of k_f. This is the conductivity of two layers in series, with which the flux is exact for
+a piecewise constant coefficient (Patankar, Numerical Heat Transfer and Fluid Flow, 1980). If k_l and k_r are both 0,
+the ratios k_l / den and k_r / den are 0 / 0; they are set to 1, which is their value for all k_l = k_r > 0.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ __all__ = ["harmonic_average"]
 
 
 def harmonic_average(grid: Grid) -> Callable:
-    """Return the function from a cell coefficient to its harmonic average on faces, differentiable.
+    """Return a differentiable function that maps a coefficient on cells to its harmonic average on faces.
 
     Parameters
     ----------
@@ -36,18 +37,19 @@ def harmonic_average(grid: Grid) -> Callable:
     Returns
     -------
     callable
-        in: k on cells, finite and >= 0 [unit]; out: faces [unit]. A wall face takes the value of its cell.
+        A function of k on cells, finite and >= 0 [unit]. It returns values on faces [unit]; a wall face has the value
+        of its cell.
 
     Raises
     ------
     ShapeError
-        On use, if the coefficient has another shape.
+        When the function is called, if the coefficient has another shape than the grid.
     TypeError
-        On use, if a coefficient is complex.
+        When the function is called, if the coefficient is complex.
     ValueError
-        On use, if a coefficient is negative.
+        When the function is called, if a value is negative.
     NonFiniteError
-        On use, if a coefficient is NaN or infinite.
+        When the function is called, if a value is NaN or infinite.
 
     See Also
     --------
@@ -79,7 +81,7 @@ def harmonic_average(grid: Grid) -> Callable:
 
 
 def _lower_share(grid, axis):
-    """Return w_l of the module on the faces across an axis, in a shape that broadcasts."""
+    """Return w_l (see the module docstring) on the faces perpendicular to an axis, broadcastable to their shape."""
     low = cell_beside(grid, axis, False).matrix @ grid.widths[axis]
     high = cell_beside(grid, axis, True).matrix @ grid.widths[axis]
     shape = [1] * grid.dim
@@ -88,7 +90,7 @@ def _lower_share(grid, axis):
 
 
 def _pair_rule(share):
-    """Return the differentiable rule of the formula of the module, for fixed shares of the lower cell."""
+    """Return the differentiable function k_f(k_l, k_r) of the module docstring, given w_l as `share`."""
 
     def ratios(low, high):
         total = share * high + (1 - share) * low

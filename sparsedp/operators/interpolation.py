@@ -17,10 +17,10 @@ __all__ = ["linear_weights"]
 
 
 def linear_weights(grid: Grid, axis: int, x: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Return the cells between which coordinates along an axis are, and the weight of the upper one.
+    """Return, for each coordinate along an axis, the cells below and above it and the weight of the upper cell.
 
-    Between a wall and the first centre the line through the two nearest centres is continued, so linear
-    fields are reproduced up to the wall. An axis of one cell is constant.
+    Between a wall and the nearest cell centre, values are extrapolated from the two nearest centres, so that linear
+    fields are reproduced up to the wall. On an axis of one cell the field is constant.
 
     Parameters
     ----------
@@ -32,8 +32,9 @@ def linear_weights(grid: Grid, axis: int, x: NDArray) -> tuple[NDArray, NDArray,
     Returns
     -------
     lower, upper : int arrays, shape (m,)
+        Indices of the cells.
     weight : array, shape (m,)
-        Of the upper cell.
+        Weight of the upper cell; the lower cell has 1 - weight.
 
     Raises
     ------
@@ -54,7 +55,7 @@ def linear_weights(grid: Grid, axis: int, x: NDArray) -> tuple[NDArray, NDArray,
         index = np.zeros(x.shape, dtype=np.int64)
         return index, index, np.zeros(x.shape)
     centres = grid.coordinates(axis)
-    if periodic:  # the last cell is beside the first one, and the first beside the last
+    if periodic:  # add a copy of the last cell before the first, and of the first after the last
         x = start + np.mod(x - start, extent)
         centres = np.concatenate([centres[-1:] - extent, centres, centres[:1] + extent])
     lower = np.clip(np.searchsorted(centres, x, side="right") - 1, 0, centres.size - 2)

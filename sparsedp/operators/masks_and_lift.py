@@ -1,4 +1,4 @@
-"""Walls, obstacles and pointwise factors: lift, mask, interior, identity, diagonal."""
+"""Operators for boundary values, masks and pointwise multiplication: lift, mask, interior, identity, diagonal."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ __all__ = ["diagonal", "identity", "interior", "lift", "mask"]
 
 
 def lift(grid: Grid, boundary: Any) -> Operator:
-    """Return the part B of a gradient on faces that depends on the boundary values: G(u) + B(values).
+    """Return the operator B that adds nonzero boundary values to a gradient G: the gradient is G(u) + B(values).
 
     Parameters
     ----------
     grid : Grid
     boundary : condition, or dict of conditions
-        The same as for the gradient. dirichlet: the value of u [unit]; neumann: the outward slope
-        [unit / length]; robin: the right-hand side of a u + b du/dn = value.
+        The conditions that G was built with. The boundary values are u [unit] for dirichlet, du/dn [unit / length] for
+        neumann, and the right-hand side of a u + b du/dn = value for robin.
 
     Returns
     -------
     Operator
-        in: one flat array of wall values, x-lower, x-upper, y-lower, ... (periodic axes have none);
-        ``op.domain.join(...)`` builds it from one array (in 2-D: the values along the wall) or number for each wall.
-        out: faces [unit / length].
+        in: one flat array of the values on all walls, in the order lower x, upper x, lower y, ... without periodic
+        axes; out: faces [unit / length]. ``op.domain.join(...)`` builds the flat array. Its arguments are one array or
+        number for each wall; in 2-D the array has one entry for each cell along the wall.
 
     Raises
     ------
@@ -51,8 +51,8 @@ def lift(grid: Grid, boundary: Any) -> Operator:
 
     Notes
     -----
-    With walls of values v the equation -D (G u + B v) = b is solved by ``solve(b + D(B(v)))``,
-    solve = inverse(-D @ G); with a coefficient, by ``solve(k, b + D(k * B(v)))``.
+    The equation -D (G u + B v) = b with boundary values v is solved by ``solve(b + D(B(v)))``, where
+    ``solve = inverse(-D @ G)``. With a coefficient k and an `elliptic_solver`, it is ``solve(k, b + D(k * B(v)))``.
 
     Examples
     --------
@@ -60,8 +60,8 @@ def lift(grid: Grid, boundary: Any) -> Operator:
     >>> lift(Grid(3), dirichlet)(np.array([1.0, 5.0]))
     array([-2.,  0.,  0., 10.])
 
-    With `upwind`, whose slope in a cell is taken from its face on the side of the wind, the wall value is added through
-    these faces. Here du/dx = 1 with u = 2 at the lower end:
+    `upwind` takes the slope of a cell from its upstream face, so that the boundary values are added on these faces.
+    The following solves du/dx = 1 with u = 2 at the lower end:
 
     >>> from sparsedp import inverse, neumann, upwind
     >>> grid, sides = Grid(4, size=1.0), {"x": (dirichlet, neumann)}
@@ -81,7 +81,7 @@ def lift(grid: Grid, boundary: Any) -> Operator:
 
 
 def mask(space: Space, keep: ArrayLike) -> Operator:
-    """Return the operator that keeps a field where `keep` is true, and is exactly 0 elsewhere.
+    """Return the operator that sets a field to 0 where `keep` is False, even if the field is NaN or infinite there.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def mask(space: Space, keep: ArrayLike) -> Operator:
 
 
 def interior(grid: Grid, solid: ArrayLike | None = None) -> Operator:
-    """Return the operator on faces that is 0 on walls and on faces of solid cells, and the identity elsewhere.
+    """Return the operator that sets a face field to 0 on walls and on all faces of solid cells.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def interior(grid: Grid, solid: ArrayLike | None = None) -> Operator:
 
 
 def identity(space: Space) -> Operator:
-    """Return the identity on a space; its result is a new array.
+    """Return the identity operator on a space. Its result is a copy of the field.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def identity(space: Space) -> Operator:
     Raises
     ------
     TypeError
-        If `space` is no Space.
+        If `space` is not a Space.
 
     See Also
     --------
@@ -177,7 +177,7 @@ def identity(space: Space) -> Operator:
 
 
 def diagonal(space: Space, values: ArrayLike) -> Operator:
-    """Return pointwise multiplication by constant values.
+    """Return the operator that multiplies a field elementwise by constant values.
 
     Parameters
     ----------
@@ -191,13 +191,13 @@ def diagonal(space: Space, values: ArrayLike) -> Operator:
     Raises
     ------
     ShapeError
-        If the values do not fit.
+        If the values cannot be broadcast to `space.shape`.
     NonFiniteError
         If a value is NaN or infinite.
     TypeError
         If `space` is not a Space, or the values are not numbers.
     DerivativeError
-        If the values are traced: an Operator is constant; write ``values * u``.
+        If autograd traces the values, because an Operator is constant; write ``values * u`` instead.
 
     See Also
     --------
@@ -205,7 +205,7 @@ def diagonal(space: Space, values: ArrayLike) -> Operator:
 
     Notes
     -----
-    Complex numbers: see docs/guides/complex_numbers.md.
+    For complex values see docs/guides/complex_numbers.md.
 
     Examples
     --------
@@ -236,14 +236,14 @@ def _check_space(space, name):
 
 
 def check_solid(grid: Grid, solid: ArrayLike | None) -> NDArray:
-    """Return the argument `solid` as a boolean array of the shape of the grid; None is False everywhere."""
+    """Return the argument `solid` as a boolean array of the shape of the grid; None means no solid cells."""
     if solid is None:
         return np.zeros(grid.shape, bool)
     return _boolean(solid, grid.cells, "solid")
 
 
 def _boolean(flags, space, name):
-    """Return a boolean array on a space."""
+    """Return an argument as a boolean array of the shape of a space; raise if it is anything else."""
     if isbox(flags):
         raise DerivativeError(f"{name} needs a constant boolean array, got a traced one; take it from plain numbers")
     flags = np.asarray(flags)
@@ -253,7 +253,7 @@ def _boolean(flags, space, name):
 
 
 def region_of(grid: Grid, cells: Any) -> NDArray:
-    """Return a set of cells, given as one slice for each axis or as a boolean array, as a boolean array."""
+    """Return a boolean array of cells, given one slice for each axis or a boolean array."""
     if not isinstance(cells, (slice, tuple)):
         return _boolean(cells, grid.cells, "cells")
     box = cells if isinstance(cells, tuple) else (cells,)
@@ -267,14 +267,14 @@ def region_of(grid: Grid, cells: Any) -> NDArray:
 
 
 def _is_run(side):
-    """Return whether an entry is a slice of consecutive cells, between integers."""
+    """Return whether an entry is a slice with step 1 and integer (or no) ends."""
     if not isinstance(side, slice) or side.step not in (None, 1):
         return False
     return all(end is None or hasattr(end, "__index__") for end in (side.start, side.stop))
 
 
 def solid_faces(grid: Grid, solid: NDArray) -> tuple[NDArray, NDArray]:
-    """Return for each face whether the cell below, and whether the cell above, is in a set of cells.
+    """Return for each face whether its lower cell and whether its upper cell is solid.
 
     Parameters
     ----------
@@ -284,7 +284,7 @@ def solid_faces(grid: Grid, solid: NDArray) -> tuple[NDArray, NDArray]:
     Returns
     -------
     below, above : bool arrays, shape (faces.size,)
-        False beyond a wall, where there is no cell.
+        False on the outer side of a wall, where there is no cell.
     """
     below = []
     above = []

@@ -1,4 +1,4 @@
-"""Operators between places of a grid: average, sample, restrict, prolong, component."""
+"""Interpolation and transfer between locations of a grid: average, sample, restrict, prolong, component."""
 
 from __future__ import annotations
 
@@ -29,25 +29,26 @@ __all__ = ["average", "component", "prolong", "restrict", "sample"]
 
 
 def average(grid: Grid, boundary: Any = neumann) -> Operator:
-    """Return linear interpolation from cells to faces, between the two cells of a face.
+    """Return the operator that interpolates linearly from cells to faces.
 
     Parameters
     ----------
     grid : Grid
     boundary : condition, or dict of conditions
-        At a wall: the value that the condition with value 0 implies (neumann: the value of the cell).
+        Boundary condition, with boundary value 0, that determines the values on walls. With neumann a wall face has the
+        value of its cell.
 
     Returns
     -------
     Operator
-        in: cells [unit]; out: faces [unit]. Linear fields are reproduced between cells.
+        in: cells [unit]; out: faces [unit]. Exact for linear fields on faces between two cells.
 
     Raises
     ------
     TypeError
-        If `grid` is no Grid, or a condition is no Condition.
+        If `grid` is not a Grid, or a condition is not a Condition.
     ValueError
-        If `boundary` names an axis that is periodic or that the grid lacks.
+        If `boundary` names an axis that is periodic or that the grid does not have.
 
     See Also
     --------
@@ -63,19 +64,19 @@ def average(grid: Grid, boundary: Any = neumann) -> Operator:
 
 
 def sample(grid: Grid, points: ArrayLike) -> Operator:
-    """Return the values of a cell field at points, by linear interpolation between cell centres.
+    """Return the operator that evaluates a cell field at points, by linear interpolation between cell centres.
 
     Parameters
     ----------
     grid : Grid
     points : array, shape (m, dim) [length]
-        One point for each row; in 1-D also of shape (m,). Points must lie in the box; a periodic
-        axis takes any coordinate.
+        One point for each row; on a 1-D grid the shape (m,) is also allowed. Points must lie in the grid; along a
+        periodic axis any coordinate is allowed.
 
     Returns
     -------
     Operator
-        in: cells [unit]; out: shape (m,) [unit]. Order 2; linear fields exact.
+        in: cells [unit]; out: shape (m,) [unit]. Second-order accurate, and exact for linear fields.
 
     Raises
     ------
@@ -84,7 +85,7 @@ def sample(grid: Grid, points: ArrayLike) -> Operator:
     NonFiniteError
         If a coordinate is NaN or infinite.
     ValueError
-        If a point lies outside the box.
+        If a point lies outside the grid.
 
     See Also
     --------
@@ -125,24 +126,25 @@ def sample(grid: Grid, points: ArrayLike) -> Operator:
 
 
 def restrict(grid: Grid, factor: int | Sequence[int]) -> Operator:
-    """Return the mean over blocks of cells, weighted by volume, from cells to cells of a coarser grid.
+    """Return the operator that maps a cell field to a coarser grid by volume-weighted means over blocks of cells.
 
     Parameters
     ----------
     grid : Grid
         The fine grid.
     factor : int or tuple of int
-        Number of cells along each axis that form one coarse cell; must divide the shape.
+        Number of cells along each axis that form one coarse cell. It must divide the number of cells.
 
     Returns
     -------
     Operator
-        in: cells [unit]; out: cells of the coarse grid (``op.codomain.grid``) [unit]. Conserves the integral.
+        in: cells [unit]; out: cells of the coarse grid, which is ``op.codomain.grid`` [unit]. The integral of the field
+        is conserved.
 
     Raises
     ------
     ShapeError
-        If the factor is not a whole number >= 1 that divides the shape.
+        If a factor is not an integer >= 1 that divides the number of cells.
 
     See Also
     --------
@@ -164,29 +166,29 @@ def restrict(grid: Grid, factor: int | Sequence[int]) -> Operator:
 
 
 def prolong(grid: Grid, factor: int | Sequence[int], interpolation: str = "constant") -> Operator:
-    """Return interpolation from cells of a coarser grid to cells, the counterpart of `restrict`.
+    """Return the operator that interpolates a cell field from a coarser grid, the counterpart of `restrict`.
 
     Parameters
     ----------
     grid : Grid
         The fine grid.
     factor : int or tuple of int
-        Number of cells along each axis that form one coarse cell; must divide the shape.
+        Number of cells along each axis that form one coarse cell. It must divide the number of cells.
     interpolation : "constant" or "linear"
-        constant: each block has the coarse value; restrict @ prolong is the identity, and the
-        integral is conserved. linear: order 2, exact for linear fields.
+        "constant": all fine cells of a coarse cell get its value, so that restrict @ prolong is the identity and the
+        integral of the field is conserved. "linear": second-order accurate, and exact for linear fields.
 
     Returns
     -------
     Operator
-        in: cells of the coarse grid (``op.domain.grid``) [unit]; out: cells [unit].
+        in: cells of the coarse grid, which is ``op.domain.grid`` [unit]; out: cells [unit].
 
     Raises
     ------
     ShapeError
-        If the factor is not a whole number >= 1 that divides the shape.
+        If a factor is not an integer >= 1 that divides the number of cells.
     ValueError
-        If `interpolation` is another word.
+        If `interpolation` is neither "constant" nor "linear".
 
     See Also
     --------
@@ -215,7 +217,7 @@ def prolong(grid: Grid, factor: int | Sequence[int], interpolation: str = "const
 
 
 def _coarse(grid, factor):
-    """Return a coarser grid, and the number of cells of each axis that form one of its cells."""
+    """Return the coarser grid, and for each axis the number of fine cells in a coarse cell."""
     factors = per_axis(factor, grid.shape, "factor")
     are_positive_integers = all(is_whole(f, 1) and np.asarray(f).dtype.kind in "iu" for f in factors)
     if not are_positive_integers or any(n % f for n, f in zip(grid.shape, factors, strict=True)):
@@ -227,7 +229,9 @@ def _coarse(grid, factor):
 
 
 def component(grid: Grid, axis: int | str) -> Operator:
-    """Return one component of a face field in its own shape; the transpose sets the other components to 0.
+    """Return the operator that extracts one component of a face field, as an array of shape `grid.face_shape(axis)`.
+
+    The transpose is a face field whose other components are 0.
 
     Parameters
     ----------
