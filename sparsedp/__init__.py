@@ -1,14 +1,14 @@
 """Differentiable physics on grids: sparse operators, adjoint solvers, time steps, optimizers, gradient checks.
 
-    import autograd.numpy as np  # NumPy whose functions are recorded for derivatives
+    import autograd.numpy as np  # NumPy functions that autograd can differentiate
     import sparsedp as dp
 
-``dir(dp)`` lists the public names, ``help(dp.transport)`` explains one: shapes, units, errors, an example.
-docs/guides shows how they work together, examples/ applies them to problems.
+``dir(dp)`` lists the public names. ``help(dp.transport)`` shows the documentation of a name, with shapes, units, errors
+and an example. docs/guides shows how to combine the functions, and examples/ contains complete programs.
 
-Names are imported when they are first used: ``import sparsedp`` alone loads no other module.
-A new public name needs an entry in ``_PUBLIC_NAMES`` and one in ``__init__.pyi``, which type checkers read. A renamed
-name also needs an entry in ``_DEPRECATED`` and an alias in ``__init__.pyi``.
+Names are imported on first use: ``import sparsedp`` alone loads no other module of the package.
+A new public name needs an entry in ``_PUBLIC_NAMES`` and an entry in ``__init__.pyi``, which type checkers read. A
+renamed name also needs an entry in ``_DEPRECATED`` and an alias in ``__init__.pyi``.
 """
 
 from importlib import import_module as _import_module
@@ -57,7 +57,7 @@ _PUBLIC_NAMES = {
     "parallel.scenes": "ensemble",
     "parallel.distribute": "distribute gather",
 }
-_DEPRECATED = {  # an old name: the name that replaces it, and the version that removes the old one
+_DEPRECATED = {  # old name: (the name that replaces it, the version in which the old name is removed)
     "adopt": ("from_blackbox", "0.5"),
     "exponential": ("matrix_exponential", "0.5"),
     "function": ("matrix_function", "0.5"),
@@ -152,7 +152,7 @@ _SUGGESTIONS = {  # names that users of other libraries may try, and what to wri
     "zeros": "numpy.zeros(grid.shape): fields are plain arrays",
 }
 _PUBLIC_PACKAGES = ("check", "errors", "interop", "network", "report")
-_CALLED_BY_MISTAKE = ("advection", "optimize")  # internal; the error of a call names the function
+_CALLED_BY_MISTAKE = ("advection", "optimize")  # internal packages; the error of a call names the right function
 _MODULE_OF = {name: module for module, names in _PUBLIC_NAMES.items() for name in names.split()}
 
 __all__ = sorted([*_MODULE_OF, *_PUBLIC_PACKAGES])
@@ -162,7 +162,7 @@ def __getattr__(name: str) -> _Any:
     if name in _DEPRECATED:
         new, removal = _DEPRECATED[name]
         _import_module(f"{__name__}._utils.calls").warn_deprecated(f"{__name__}.{name}", f"{__name__}.{new}", removal)
-        return getattr(_import_module(__name__), new)  # not stored, so that each use warns
+        return getattr(_import_module(__name__), new)  # not stored in globals(), so that each use warns
     if name in _MODULE_OF:
         value = getattr(_import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
         if type(value) is _FunctionType:
@@ -174,14 +174,14 @@ def __getattr__(name: str) -> _Any:
         try:
             value = metadata.version(__name__)
         except metadata.PackageNotFoundError:
-            value = "0+unknown"  # run from a tree that was never installed
+            value = "0+unknown"  # run from a source tree that is not installed
     else:
         if name in _SUGGESTIONS:
             hint = f"; write {_SUGGESTIONS[name]}"
         else:
             hint = _import_module(f"{__name__}._utils.calls").advice_near(name, __all__)
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
-    globals()[name] = value  # later look-ups find it there
+    globals()[name] = value  # later look-ups do not call this function again
     return value
 
 

@@ -1,7 +1,7 @@
-"""The command line: ``python -m sparsedp`` with demo, check, report, compile or ranks.
+"""The command line: ``python -m sparsedp`` with the commands demo, check, report, compile and ranks.
 
-Exit codes of check and report: 0 agrees, 1 disagrees, 3 inconclusive, 2 the input was refused or a file cannot be
-written, 130 interrupted.
+Exit codes of check and report: 0 the gradient agrees, 1 it disagrees, 3 the result is inconclusive, 2 the input is
+invalid or a file cannot be written, 130 the command was interrupted.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
-REFUSED = 2  # exit code of a bad input, the same as argparse's
-INTERRUPTED = 130  # exit code after Ctrl-C, the same as a shell's
-LONGEST_WORD = 200  # letters of a name that a message shows
+REFUSED = 2  # exit code for invalid input, the same as that of argparse
+INTERRUPTED = 130  # exit code after Ctrl-C, the same as that of a shell
+LONGEST_WORD = 200  # longer words, such as paths, are shortened in messages
 EXIT_CODES = {"agrees": 0, "disagrees": 1, "inconclusive": 3}
 COMPILED_MODULES = [
     "sparsedp.kernels.elimination",
@@ -37,57 +37,57 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Parameters
     ----------
     arguments : sequence of str, optional
-        Default: those of the process.
+        Command-line arguments. Default: those of the process.
 
     Returns
     -------
     int
-        Exit code: 0 done or agrees, 1 failed or disagrees, 2 the input was refused or a file cannot be written,
-        3 inconclusive, 130 interrupted.
+        Exit code: 0 success or "agrees", 1 failure or "disagrees", 2 invalid input or a file that cannot be written,
+        3 "inconclusive", 130 interrupted.
     """
     try:
         options = _parser().parse_args(arguments)
         code = options.run(options)
-        print(end="", flush=True)  # an output that cannot be written must be known before the exit code
+        print(end="", flush=True)  # flush: a failure to write must be raised before the exit code is returned
         return code
     except KeyboardInterrupt:
         return refuse("interrupted; there is no result", INTERRUPTED)
     except (OSError, UnicodeEncodeError) as error:
         return _refuse_output(error)
-    except (ValueError, ImportError) as error:  # the message says what is wrong with the input
+    except (ValueError, ImportError) as error:  # raised for invalid input; the message explains it
         return refuse(error)
 
 
 def _refuse_output(error: OSError | UnicodeEncodeError) -> int:
-    """Say that a file or the output cannot be written."""
+    """Print that a file or the standard output cannot be written, and return the exit code."""
     place = getattr(error, "filename", None)
     reason = getattr(error, "strerror", None)
     if place is None:
-        sys.stdout = open(os.devnull, "w")  # Python flushes again at its end, which would change the exit code
+        sys.stdout = open(os.devnull, "w")  # the flush at exit would fail and change the exit code
     advice = "" if "; " in (reason or "") else "; make room, or write elsewhere"
     return refuse(f"{place or 'the output'} cannot be written: {reason or error}{advice}")
 
 
 class Parser(argparse.ArgumentParser):
-    """An ArgumentParser that answers a wrong command line with one sentence."""
+    """An ArgumentParser that prints one sentence for an invalid command line, without the usage text."""
 
     def error(self, message: str) -> NoReturn:
-        """Print the message and exit."""
+        """Print the message, refer to --help, and exit."""
         self.exit(refuse(f"{message}; see {self.prog} --help"))
 
 
 def refuse(reason: object, code: int = REFUSED) -> int:
-    """Print a reason on one line of stderr and return the exit code."""
+    """Print an error message on one line of stderr and return the exit code."""
     words = []
     for word in str(reason).split():
         words.append(word if len(word) <= LONGEST_WORD else f"{word[: LONGEST_WORD // 2]}...")
-    with contextlib.suppress(OSError):  # if stderr is broken too, the exit code has to suffice
+    with contextlib.suppress(OSError):  # if stderr cannot be written either, only the exit code reports the error
         print("sparsedp:", *words, file=sys.stderr)
     return code
 
 
 def _parser() -> Parser:
-    """Return the parser of the command line."""
+    """Return the parser of command-line arguments."""
     parser = Parser(prog="python -m sparsedp", description="Sparse differentiable physics.")
     subparsers = parser.add_subparsers(required=True, metavar="command")
     for name, command in COMMANDS.items():
@@ -98,12 +98,13 @@ def _parser() -> Parser:
     return parser
 
 
-# ---------------------------------------------------------------- commands: options to exit code
-# Modules are imported inside, so that --help and a wrong command line load nothing.
+# ---------------------------------------------------------------- commands
+# Each takes the options and returns an exit code. It imports the modules that it needs itself, so that --help and an
+# invalid command line load none.
 
 
 def run_check(options: argparse.Namespace) -> int:
-    """Audit the gradient of a loss in a file."""
+    """Check the gradient of a loss that is defined in a file."""
     from sparsedp.check.gradient_check import gradient
     from sparsedp.report.scene_file import guarded, load_scene
 
@@ -115,7 +116,7 @@ def run_check(options: argparse.Namespace) -> int:
 
 
 def run_report(options: argparse.Namespace) -> int:
-    """Write the report on a loss in a file."""
+    """Write the report on a loss that is defined in a file."""
     from sparsedp.report.scene_file import free_folder, load_scene
     from sparsedp.report.scene_report import PAGES, write_report
 
@@ -126,7 +127,7 @@ def run_report(options: argparse.Namespace) -> int:
 
 
 def run_compile(_: argparse.Namespace) -> int:
-    """Compile all loops; the exit code is 1 if one does not compile."""
+    """Compile all loops; return 1 if a loop cannot be compiled."""
     from sparsedp import kernels
     from sparsedp._utils.progress import bar
     from sparsedp.kernels import team
@@ -137,7 +138,7 @@ def run_compile(_: argparse.Namespace) -> int:
         importlib.import_module(name)
     print(f"compiling {len(team.loops)} loops, those that are not on disk yet", flush=True)
     start = time.perf_counter()
-    loops = bar(team.loops, needed=False, unit="loop", leave=False, disable=None)  # None: a bar on a terminal only
+    loops = bar(team.loops, needed=False, unit="loop", leave=False, disable=None)  # None: only on a terminal
     if not all(loop.compiled is not None for loop in loops):
         print("these loops do not work here; NumPy is used")
         return 1
@@ -146,7 +147,7 @@ def run_compile(_: argparse.Namespace) -> int:
 
 
 def run_ranks(_: argparse.Namespace) -> int:
-    """Print what of MPI and PETSc is installed; the exit code is 1 if fields cannot lie on several processes."""
+    """Print whether MPI and PETSc are installed; return 1 if fields cannot be distributed over several processes."""
     from sparsedp.parallel.selftest import report
 
     line = ""
@@ -156,7 +157,7 @@ def run_ranks(_: argparse.Namespace) -> int:
 
 
 def run_demo(options: argparse.Namespace) -> int:
-    """Run the demo."""
+    """Run the demo; return 1 if a result is wrong."""
     from sparsedp.report.demo import story, terrain
     from sparsedp.report.scene_file import claim_folder, free_folder
 
@@ -169,7 +170,7 @@ def run_demo(options: argparse.Namespace) -> int:
 
 
 class Command(NamedTuple):
-    """A command: what it runs, its description, and the names of its arguments."""
+    """A command: the function that runs it, its description, and the names of its arguments."""
 
     run: Callable[[argparse.Namespace], int]
     description: str
@@ -180,31 +181,33 @@ ARGUMENTS: dict[str, Any] = {
     "scene": {"help": "FILE.py, FILE.py:loss or FILE.py:loss:start; by default the names are loss, and start or x"},
     "--input": {"type": Path, "metavar": "FILE", "help": "a 2-D field as .npy, .npz or .png (default: terrain)"},
     "--size": {"type": int, "default": 64, "metavar": "N", "help": "cells along the longest side (default: 64)"},
-    "--out": {"type": Path, "metavar": "DIR", "help": "where the results go (default: a new folder sparsedp-...)"},
+    "--out": {"type": Path, "metavar": "DIR", "help": "folder for the results (default: a new folder sparsedp-...)"},
     "--force": {"action": "store_true", "help": "overwrite results of an earlier run"},
-    "--quick": {"action": "store_true", "help": "two directions only, for a loss that takes minutes"},
+    "--quick": {"action": "store_true", "help": "check two directions only, for a loss that takes minutes"},
 }
 COMMANDS = {
     "demo": Command(
         run_demo,
-        "find the hidden ground under a real terrain from well readings, by adjoint optimization",
+        "recover an unknown ground, whose field is a real terrain, from well readings by adjoint optimization",
         ("--input", "--size", "--out", "--force"),
     ),
     "check": Command(
         run_check,
-        "audit the gradient of a loss in a file. Exit code: 0 agrees, 1 disagrees, 3 inconclusive, 2 refused, "
+        "check the gradient of a loss in a file. Exit code: 0 agrees, 1 disagrees, 3 inconclusive, 2 invalid input, "
         "130 interrupted",
         ("scene", "--quick"),
     ),
     "report": Command(
         run_report,
-        "audit, plan, certificate, error against run time and stress of a loss in a file, in one folder; the file may "
-        "hold dicts of arguments, work_precision_options and stress_options. Exit code as check",
+        "write a report on a loss in a file into a folder: gradient check, plan, certificate, error against run time, "
+        "stress tests; the file may define dicts of arguments, work_precision_options and stress_options. Exit code as "
+        "check",
         ("scene", "--out", "--force"),
     ),
-    "compile": Command(run_compile, "compile all loops for this machine now, not at their first use"),
+    "compile": Command(run_compile, "compile all loops for this machine now instead of at their first use"),
     "ranks": Command(
-        run_ranks, "what of MPI and PETSc is here, and a test by two processes. Exit code: 0 works, 1 does not"
+        run_ranks,
+        "print whether MPI and PETSc are installed, and test them with two processes. Exit code: 0 works, 1 does not",
     ),
 }
 

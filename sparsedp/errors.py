@@ -1,7 +1,7 @@
 """The errors and warnings of this library.
 
-Every error also derives from a built-in exception, so that ``except ValueError`` works too. A message says what was
-given, what is expected and what to write instead.
+Every error class also derives from a built-in exception, so that for example ``except ValueError`` catches it too. An
+error message states what was given, what is expected and what to write instead.
 """
 
 from __future__ import annotations
@@ -31,29 +31,29 @@ class ShapeError(SparsedpError, ValueError):
 
 
 class NonFiniteError(SparsedpError, ValueError):
-    """A field or a parameter holds NaN or infinity, or a result cannot be represented."""
+    """A field or a parameter holds NaN or infinity, or a result overflows."""
 
 
 class UnstableStepError(SparsedpError, ValueError):
-    """A time step is larger than the scheme allows."""
+    """A time step is too large for the stability of the scheme."""
 
 
 class DerivativeError(SparsedpError, TypeError):
-    """A derivative does not exist, or a rule returned one of the wrong form."""
+    """A derivative does not exist, or a user-defined rule returned a derivative of the wrong shape or type."""
 
 
 class GrowthWarning(UserWarning):
-    """A gradient through many steps grew so much that it is of little use, although it is exact."""
+    """A gradient through many time steps is exact, but grew so much that it is of little use."""
 
 
 class BudgetWarning(UserWarning):
-    """A run would take a third of the time with at most twice its memory budget."""
+    """With at most twice the memory budget, the run would take only a third of the time."""
 
 
 class NonFiniteGradientWarning(UserWarning):
     """A returned derivative holds NaN or infinity; the message names the call that caused it.
 
-    `grad`, `value_and_grad`, `vjp`, `jvp` and `hvp` warn. Turn it into an error by
+    `grad`, `value_and_grad`, `vjp`, `jvp` and `hvp` issue this warning. To raise an error instead, call
     ``warnings.filterwarnings("error", category=sparsedp.errors.NonFiniteGradientWarning)``.
     """
 
@@ -64,9 +64,9 @@ class ConvergenceError(SparsedpError, RuntimeError):
     Attributes
     ----------
     info : SolveInfo or None
-        The record of the solve: status word, iterations, residual.
+        The record of the solve: status, iterations, residual.
     best : ndarray or None
-        The best iterate.
+        The best iterate that was computed.
     """
 
     def __init__(self, message: str, info: Any = None, best: Any = None):

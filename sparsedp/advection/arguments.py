@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["ROUNDING", "check_array", "check_numbers", "check_stability", "check_step", "flatten_array"]
 
 FLOAT = np.dtype(float)
-ROUNDING = 8 * EPS  # a CFL number of exactly 1 leaves a weight of about -1e-16
+ROUNDING = 8 * EPS  # tolerance: with a CFL number of exactly 1 the weight is about -1e-16 instead of 0
 
 
 def check_step(name: str, dt: Any) -> float:
@@ -30,7 +30,7 @@ def check_step(name: str, dt: Any) -> float:
 
 
 def flatten_array(name: str, argument: str, value: Any, shapes: Sequence[tuple[int, ...]]) -> Any:
-    """Return an array of one of the shapes as a flat contiguous float64 array; a traced array stays traced."""
+    """Return an array of one of the given shapes as a flat contiguous float64 array; a traced array stays traced."""
     if type(value) is np.ndarray and value.shape in shapes and value.dtype == FLOAT and value.flags.c_contiguous:
         return value.reshape(-1)
     check_array(name, argument, value, shapes)
@@ -70,7 +70,7 @@ def _shape(name: str, argument: str, value: Any) -> tuple[int, ...]:
 
 
 def check_numbers(settings: TransportSettings, u: NDArray, v: NDArray, inflow: NDArray) -> None:
-    """Raise NonFiniteError for NaN and infinity, with the argument, the first index and the count."""
+    """Raise NonFiniteError, with the first index and the count, if an argument holds NaN or infinity."""
     name = f"transport {settings.scheme}"
     check_finite(name, np.reshape(u, settings.space.shape), "needs a finite field")
     check_finite(name, v, "needs a finite velocity", settings.velocity_place)
@@ -78,7 +78,7 @@ def check_numbers(settings: TransportSettings, u: NDArray, v: NDArray, inflow: N
 
 
 def check_stability(settings: TransportSettings, dt: float, rate: NDArray, limit: float) -> None:
-    """Raise UnstableStepError if ``limit - dt * rate``, a bound of the weight of the old value, is negative somewhere.
+    """Raise UnstableStepError if ``limit - dt * rate``, a bound of the weight of the old value, is negative anywhere.
 
     Parameters
     ----------
@@ -86,9 +86,9 @@ def check_stability(settings: TransportSettings, dt: float, rate: NDArray, limit
     dt : float
         Time step [time].
     rate : array
-        Sum of the Courant numbers of each point, divided by dt [1 / time].
+        The CFL number of each point, divided by dt [1 / time]; see `transport`.
     limit : float
-        Largest stable sum of the Courant numbers.
+        Largest stable CFL number.
     """
     if settings.unstable == "allow":
         return

@@ -1,9 +1,10 @@
-"""The control volumes of an Eulerian transport scheme, as the tables that the loops over their sides read.
+"""The control volumes of an Eulerian transport scheme, stored as tables for the loops over their sides.
 
-A component of the field lives on a lattice of points with one control volume each: the cells of the grid, or the faces
-across one axis (half a cell at a wall). Along each axis, side f lies between the points f - 1 and f. A bounded axis has
-one side more than points, including both walls; a periodic axis has as many sides as points. Points, velocities on
-sides and inflow values at walls are numbered one after the other, for all axes and components.
+The points of a component of the field are the centres of the cells, or the faces across one axis. Each point has a
+control volume: the cell, or the volume between the neighbouring cell centres (half a cell at a wall). Along each axis,
+side f lies between the points f - 1 and f. A bounded axis has one more side than points, because both walls are sides;
+a periodic axis has as many sides as points. Points, velocities on sides and inflow values at walls are each numbered
+consecutively over all axes and components.
 """
 
 from __future__ import annotations
@@ -41,20 +42,20 @@ __all__ = ["Component", "Sides", "components"]
 
 
 class Sides(NamedTuple):
-    """The sides of all points of a component along an axis: lower sides in row 0, upper sides in row 1.
+    """The sides of all points of a component along an axis: lower sides are in row 0, upper sides in row 1.
 
     Attributes
     ----------
     beyond : int array
-        The point on the other side; at a wall the point itself.
+        Index of the neighbouring point beyond the side; at a wall the point itself.
     speed : int array
         Index of the velocity.
     wall : int array
-        Index of the inflow value; -1 where none is given.
+        Index of the inflow value; -1 if the side has none.
     at_wall : bool array
         Whether the side is a wall.
     column : int array, one entry for each point
-        Its column in the table of lengths.
+        The column of the point in the table of lengths.
     """
 
     beyond: NDArray[np.int64]
@@ -70,9 +71,10 @@ class Component(NamedTuple):
     Attributes
     ----------
     field, inflow, speed : slice
-        Its entries in the flat field, in the inflow values and in the velocity.
+        The range of its entries in the flat field, in the inflow values and in the velocity.
     free : bool array, shape (2 dim, points) or (2 dim, 0)
-        For each side (lower and upper, axis by axis) whether it is open at the points; no columns if all are.
+        Whether the sides of the points are open: a row for the lower and a row for the upper side along each axis. No
+        columns if all sides are open.
     table : array
         Inverse lengths and distances; see `sparsedp.kernels.fluxes`.
     axes : int array
@@ -96,7 +98,7 @@ class Component(NamedTuple):
 
     def run(self, loop: Any, *args: Any) -> None:
         """Run a compiled loop, a `Kernel`, over all tiles."""
-        work = self.points * len(self.axes)  # each axis is a pass: 512^2 cells pay for two threads
+        work = self.points * len(self.axes)  # one pass for each axis; two threads pay from 512^2 cells on
         loop.run(self.tiles, work, kernels.threads(), *args)
 
     def sides(self, axis: int) -> Sides:
@@ -105,7 +107,7 @@ class Component(NamedTuple):
 
 
 def components(settings: TransportSettings, limited: bool) -> list[Component]:
-    """Return all components of the transported field; `limited`: whether the scheme has limited slopes."""
+    """Return all components of the transported field. `limited` states whether the scheme has limited slopes."""
     result: list[Component] = []
     field_start = inflow_start = speed_start = 0
     solid_points = settings.solid_points
@@ -161,7 +163,7 @@ def components(settings: TransportSettings, limited: bool) -> list[Component]:
 
 
 def _sides(row: NDArray[np.int64], points: NDArray[np.int64]) -> Sides:
-    """Return the sides along an axis, from its row of properties and the numbers of all points."""
+    """Return the sides of the given points along an axis, whose row of properties is `row`."""
     n = row[N]
     stride = row[STRIDE]
     sign = np.array([[-1], [1]])  # lower and upper
@@ -183,11 +185,12 @@ def _sides(row: NDArray[np.int64], points: NDArray[np.int64]) -> Sides:
 
 
 def _lengths(grid: Grid, axis: int, staggered: bool, at_points: bool, limited: bool) -> NDArray[np.float64]:
-    """Return the table of an axis, one row for each position along it, or a single row if all are equal.
+    """Return the table of lengths of an axis: one row for each position along it, or a single row if all are equal.
 
-    The columns are the inverse lengths of `sparsedp.kernels.fluxes` (OWN, THEIRS) and, if `limited`, the distances.
-    Lengths are the widths of control volumes, infinite where there is none. With a velocity at points and without
-    slopes they are the distances between points, and at a wall the width of the control volume.
+    The columns are the inverse lengths of `sparsedp.kernels.fluxes` (OWN, THEIRS) and, if `limited`, the distances to
+    the neighbours. The lengths are the widths of the control volumes (infinite if a width is 0). If the velocity is
+    given at points and the scheme has no slopes, they are the distances between points instead; at a wall they remain
+    the width of the control volume.
     """
     cells = grid.widths[axis]
     spacings = grid.spacings(axis)
@@ -215,7 +218,7 @@ def _lengths(grid: Grid, axis: int, staggered: bool, at_points: bool, limited: b
     else:
         lengths = [widths, widths, np.roll(widths, 1), np.roll(widths, -1)]
     columns = [1.0 / length for length in lengths]
-    if limited:  # the distances to both neighbours, or to the walls, over half a width
+    if limited:  # the distances to both neighbours, or to the walls, divided by half the width
         if not periodic:
             gaps[[0, -1]] /= 2  # `below` and `above` are views
         columns += [2 * below / widths, 2 * above / widths]

@@ -1,16 +1,16 @@
-"""Departure points: where the content of each point comes from in a step along the velocity.
+"""Departure points: the position from which the value of each point is transported in a step.
 
 With s = dt / spacing, the departure point of point i is, in index coordinates,
 
     euler:     i - s w(i)
     midpoint:  i - s m,    m = w at i - (s / 2) w(i), linear between points.
 
-For euler the velocity used along the step is w itself. For midpoint, with the interpolation I at i - (s / 2) w, the
-cotangent of w is
+For euler the velocity along the step is w itself. For midpoint it is m. Let I be the interpolation at i - (s / 2) w; it
+depends on w too, so that the cotangent of w is
 
-    g_w = I^T g_m + (gradient of I w in w) g_m.
+    g_w = I^T g_m + (derivative of I w with respect to the positions) g_m.
 
-Everything depends on s w alone: the derivative in dt is the derivative in w along w / dt.
+Departure points depend on the product s w only. The derivative in dt is therefore the derivative in w along w / dt.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Trajectory"]
 
-EMPTY = np.empty(0)  # no inflow values
+EMPTY = np.empty(0)  # the inflow values of a velocity: it has none
 
 
 class Trajectory:
-    """The paths of the points of a component in a signed step along their velocities.
+    """The displacement from each point of a component to its departure point, for a signed time step.
 
     Parameters
     ----------
@@ -45,12 +45,12 @@ class Trajectory:
     Attributes
     ----------
     displacement : Displacement
-        Displacements of the departure points.
+        Displacements of the departure points from the points.
     """
 
     def __init__(self, interpolant: Interpolant, w: NDArray, step: float) -> None:
         self.interpolant = interpolant
-        self._half_way: list[InterpolatedComponent] = []  # for midpoint: each velocity component half way
+        self._half_way: list[InterpolatedComponent] = []  # for midpoint: the velocity components at the midpoints
         if interpolant.half_way is not None:
             first_half = Trajectory(interpolant.half_way, w, 0.5 * step)
             self._half_way = [first_half.at_departure_points(row, EMPTY) for row in w]
@@ -58,11 +58,11 @@ class Trajectory:
         self.displacement = interpolant.coordinates.displacement(w, step)
 
     def at_departure_points(self, u: NDArray, inflow: NDArray) -> InterpolatedComponent:
-        """Return a field at the departure points."""
+        """Return the object that interpolates a field at the departure points."""
         return InterpolatedComponent(self.interpolant, self.displacement, u, inflow)
 
     def vjp(self, g: NDArray) -> None:
-        """Replace the cotangent of the velocity used along the step by the cotangent of w, in place."""
+        """Replace g, the cotangent of the velocity along the step, by the cotangent of w, in place."""
         if not self._half_way:
             return
         given = g.copy()
@@ -74,7 +74,7 @@ class Trajectory:
         g += through_points
 
     def jvp(self, dw: NDArray) -> NDArray:
-        """Return the tangent of the velocity used along the step for the tangent of w."""
+        """Return the tangent of the velocity along the step for the tangent dw of w."""
         if not self._half_way:
             return dw
         return np.stack([row.jvp(dv, EMPTY, dw) for row, dv in zip(self._half_way, dw, strict=True)])

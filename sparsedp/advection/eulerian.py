@@ -1,20 +1,20 @@
-r"""Eulerian schemes, which sum fluxes through the sides of cells: upwind, van Leer, and others of `SCHEMES`.
+r"""Eulerian schemes, which sum fluxes through the sides of control volumes: upwind, van Leer, others in `SCHEMES`.
 
-Upwind (donor cell), first order: the value at a side is the value of the cell that the flow comes from.
+Upwind (donor cell), first order: the value at a side is the value of the upstream point.
 
 Van Leer, second order where the field is smooth: let A and B be the differences of u to the points below and above,
 q = A / (A + B), h the width, d the distances to both neighbours, c = 2 d_below / h and e = 2 d_above / h. If A and B
-have the same sign, the value at a side differs from the value at its point by
+have the same sign, the value at a side differs from the value at the upstream point by
 
     s = (A + B) R(q),   R = q (1 - q) (q e^2 + (1 - q) c^2) / (q^2 e^2 + (c + e - 2) c e q (1 - q) + (1 - q)^2 c^2)
 
-(equal cells: A B / (A + B), half the harmonic mean); otherwise s = 0. A step is the mean of the field and the result of
-two Euler steps (SSP-RK2). The Courant numbers of all sides of a point must not sum to more than 1/2: then there are no
-new extrema (TVD in 1-D). If one of A and B is 0, the derivative of s is the mean of both one-sided derivatives, as it
-is for a velocity of 0; if both are 0, it is 0.
+(for equal cells A B / (A + B), half the harmonic mean); otherwise s = 0. The result of a step is the mean of the old
+field and the result of two Euler steps (SSP-RK2). If the CFL number of every point (see `transport`) is at most 1/2, no
+new extrema arise (TVD in 1-D). Derivatives at kinks: if one of A and B is 0, the derivative of s is the mean of
+both one-sided derivatives, and if both are 0, it is 0. The derivative in a velocity of 0 is also the mean.
 
-The compiled loops of `sparsedp.kernels.fluxes` compute a step and its cotangents. `SparseReference` replaces them where
-numba is missing or a value is traced, and computes tangents and matrices.
+The compiled loops of `sparsedp.kernels.fluxes` compute a step and its cotangents. `SparseReference` replaces them if
+numba is not available or a value is traced; it also computes tangents and matrices.
 
 References
 ----------
@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Eulerian"]
 
-EMPTY = np.zeros(0)  # in place of an array that is not wanted
+EMPTY = np.zeros(0)  # stands for a result that is not requested
 
 
 class Eulerian(TransportMethod):
@@ -70,7 +70,7 @@ class Eulerian(TransportMethod):
 
     @cached_property
     def reference(self) -> SparseReference:
-        """The same scheme by sparse matrices."""
+        """The same scheme implemented by sparse matrices."""
         return SparseReference(self.settings, self.scheme, self.walls.size, self.interpolation)
 
     @cached_property
@@ -100,7 +100,10 @@ class Eulerian(TransportMethod):
         return out
 
     def _unread_sum(self, v: NDArray, inflow: NDArray) -> float:
-        """Return the sum of the values that the loops may skip: inflow at closed walls, velocities inside the solid."""
+        """Return the sum of the values that the loops may not read: inflow at closed walls, velocity in the solid.
+
+        The sum is used to detect NaN and infinity among them.
+        """
         if inflow.size:
             total = inflow.sum()
         else:
@@ -137,7 +140,7 @@ class Eulerian(TransportMethod):
         cotangents: dict[int, Any] = {FIELD: of_field, INFLOW: of_inflow, VELOCITY: None}
         if of_velocity.size:
             cotangents[VELOCITY] = self.interpolate_velocity_vjp(of_velocity)
-        # The loops do not count what interpolation and slopes add.
+        # The count of non-finite values in the loops omits the contributions of interpolation and slopes.
         counted = self.accumulates and not (self.scheme.limiter and of_field_wanted)
         finite = counted and isfinite(of_inflow.sum()) and not invalid
         return tuple(cotangents[num] for num in nums), finite
@@ -153,9 +156,9 @@ class Eulerian(TransportMethod):
         of_field_wanted: bool,
         of_velocity_is_set: bool,
     ) -> tuple[NDArray, NDArray, float]:
-        """Return the cotangents of u and inflow, and how many computed cotangents are not finite.
+        """Return the cotangents of u and inflow, and the number of computed cotangents that are not finite.
 
-        The cotangent of w is set in `of_velocity` if `of_velocity_is_set`, else added to it.
+        `of_velocity` is set to the cotangent of w if `of_velocity_is_set`; otherwise the cotangent is added to it.
         """
         stages: list[_Stage] = []
         for keep in self.scheme.stages:
@@ -166,7 +169,7 @@ class Eulerian(TransportMethod):
                 self._loops.stage(last.x, last.slopes, w, dt, inflow, u, last.keep, x)
             stages.append(_Stage(x, self._loops.slopes(x, inflow, partials=True), keep))
         of_inflow = np.zeros(inflow.size)
-        of_first_field = None  # the share that the means of later stages give to u directly
+        of_first_field = None  # cotangent of u from its direct use in the means of later stages
         invalid = 0.0
         while stages:
             x, slopes, keep = stages.pop()
@@ -193,14 +196,14 @@ class Eulerian(TransportMethod):
         return self.reference.jvp(tangents, u, v, dt, inflow)
 
     def matrix(self, v: NDArray, dt: float) -> sp.csr_array:
-        """Return the step as a matrix on u."""
+        """Return the matrix of the step, which maps u to the next field for an inflow of 0."""
         check_numbers(self.settings, np.zeros(self.settings.space.size), v, np.zeros(self.walls.size))
         check_stability(self.settings, dt, self.reference.rate(v), self.scheme.max_courant)
         return self.reference.matrix(v, dt)
 
 
 class _Stage(NamedTuple):
-    """A stage of a step: the field before it, its slopes, and the share of the first field in the mean after it."""
+    """A stage of a step: the field x before it, the slopes of x, and the weight of the first field in its mean."""
 
     x: NDArray
     slopes: list
@@ -213,12 +216,12 @@ def _has_compiled_loops() -> bool:
 
 
 class CompiledLoops:
-    """The loops of `sparsedp.kernels.fluxes` on all components of a field, for velocities on their sides or in cells.
+    """Calls the loops of `sparsedp.kernels.fluxes` for all components of a field.
 
     Parameters
     ----------
     reference : SparseReference
-        The same scheme by sparse matrices; it holds the tables of the components.
+        The same scheme implemented by sparse matrices, which holds the tables of the components.
     """
 
     def __init__(self, reference: SparseReference) -> None:
@@ -234,9 +237,9 @@ class CompiledLoops:
         self._no_slopes = [self._empty_slopes(component, 0, 0) for component in self.components]
 
     def slopes(self, u: NDArray, inflow: NDArray, partials: bool) -> list:
-        """Return for each component its limited slopes and their derivatives in a and b.
+        """Return, for each component, its limited slopes and their derivatives in a and b.
 
-        The derivatives are empty without `partials`; a first-order scheme has no slopes either.
+        The derivatives are empty if `partials` is False. For a first-order scheme the slopes are empty too.
         """
         if self.slope_loop is None:
             return self._no_slopes
@@ -291,7 +294,7 @@ class CompiledLoops:
         Returns
         -------
         float
-            Number of points with a weight below the stable limit or a result that is not finite.
+            Number of weights below the stability limit plus the number of results that are not finite.
         """
         total = 0.0
         for part, (values, _) in zip(self.components, slopes, strict=True):
@@ -314,16 +317,16 @@ class CompiledLoops:
         of_w: NDArray,
         of_w_is_set: bool,
     ) -> float:
-        """Pull the cotangent of u + dt du/dt back.
+        """Compute the cotangents of u, inflow and w from g, the cotangent of u + dt du/dt.
 
         `of_u` is set to the cotangent of u. The cotangent of the inflow is added to `of_inflow`. `of_w` is set to the
-        cotangent of w if `of_w_is_set`; otherwise the cotangent is added. An empty array leaves a part out. The
-        derivatives in `slopes` are overwritten.
+        cotangent of w if `of_w_is_set`; otherwise the cotangent is added to it. If `of_u` or `of_w` is empty, this
+        cotangent is not computed. The derivatives in `slopes` are overwritten.
 
         Returns
         -------
         float
-            Number of values of `of_u` (without what the slopes add) and `of_w` that are not finite.
+            Number of values of `of_u` (before the contribution of the slopes) and `of_w` that are not finite.
         """
         total = 0.0
         for part, (values, partials) in zip(self.components, slopes, strict=True):

@@ -1,7 +1,8 @@
-"""Ghost cells around a component of a field, and solid cells that are filled from the fluid around them.
+"""Ghost cells around a component of a field, and solid cells that are filled with values of the fluid around them.
 
-Beyond a wall the field continues with the value of the nearest point (neumann) or with the inflow value (dirichlet),
-which applies from one spacing beyond the last point. A periodic axis wraps. Where two axes meet, the later one decides.
+Ghost cells beyond a wall have the value of the nearest point (neumann) or the inflow value (dirichlet); the first of
+them is one spacing beyond the last point. On a periodic axis they have the values of the other end. A ghost cell beyond
+the ends of two axes is set by the condition of the later axis.
 """
 
 from __future__ import annotations
@@ -30,21 +31,21 @@ __all__ = ["ghost_sources", "solid_filling"]
 def ghost_sources(
     settings: TransportSettings, number: int, points: Points, closed: bool
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the ghost cells of a component and, for each of them, the sample whose value it repeats.
+    """Return the indices of the ghost cells of a component and, for each of them, of the sample with the same value.
 
     Parameters
     ----------
     settings : TransportSettings
     number : int
-        Number of the component.
+        Index of the component.
     points : Points
     closed : bool
-        Whether no inflow value is used.
+        If True, no inflow values are used: ghost cells beyond walls have the value of the nearest point.
 
     Returns
     -------
     ghosts, sources : int arrays
-        Numbers of samples: first the field with its ghost cells, then the inflow values.
+        Indices of samples. The samples are the field with its ghost cells, followed by the inflow values.
     """
     sides = settings.sides
     samples = np.arange(points.samples).reshape(points.padded)
@@ -67,10 +68,10 @@ def ghost_sources(
 
 
 def solid_filling(grid: Grid, solid: NDArray[np.bool_]) -> sp.csr_array:
-    """Return the matrix on cell fields that keeps fluid cells and fills the solid cells from them.
+    """Return the matrix on cell fields that keeps the values of fluid cells and fills the solid cells.
 
-    A solid cell gets the mean of its neighbours that are fluid or already filled, layer by layer inwards. A neumann
-    wall has the same effect.
+    The solid is filled in layers, from the fluid inwards: a cell gets the mean of its neighbours that are fluid or
+    filled before. Like a neumann wall, this extends the values of the fluid beyond its boundary.
     """
     adjacency = reduce(
         lambda first, second: sp.kronsum(second, first, "csr"), [_neighbours(grid, axis) for axis in range(grid.dim)]
@@ -89,7 +90,7 @@ def solid_filling(grid: Grid, solid: NDArray[np.bool_]) -> sp.csr_array:
 
 
 def _neighbours(grid: Grid, axis: int) -> sp.csr_array:
-    """Return the adjacency matrix of the cells along an axis; at a wall a cell is also its own neighbour."""
+    """Return the adjacency matrix of the cells along an axis; a cell at a wall is also adjacent to itself."""
     below = cell_beside(grid, axis, False).matrix
     above = cell_beside(grid, axis, True).matrix
     return below.T @ above + above.T @ below

@@ -1,15 +1,15 @@
-"""Index coordinates: the displacement of a departure point, counted in points, from a velocity and a step.
+"""Index coordinates: positions measured in point indices, and the displacement of departure points in them.
 
-The departure point of point i is i - scale d in index coordinates. On cells of equal width, d is the velocity and
-scale = step / spacing. On other cells let x(q) be the interpolant of the positions of the points (linear or
-Catmull-Rom, as for the field), and q(x) its inverse. Then scale = 1 and
+The departure point of point i has the index coordinate i - scale d. On cells of equal width, d is the velocity and
+scale = step / spacing. Otherwise let x(q) be the interpolant of the positions of the points at index q (linear or
+Catmull-Rom, as for the field), and q(x) its inverse. Then scale = 1 and, with the velocity m,
 
     d_i = i - q(x_i - step m_i),    derivative of d_i in m_i = step q',
 
-so that a field linear in x is transported exactly. For linear interpolation q is piecewise linear, and its slope jumps
-at the points: the derivative there is the mean of both sides, each the slope of the field times the slope of q. For
-cubic interpolation q is smooth, and monotone if neighbouring distances differ by at most a factor of 5.
-Beyond a wall the points continue at a distance of the width of the last cell.
+so that a field that is linear in x is transported exactly. For linear interpolation q is piecewise linear, and its
+slope jumps at the points. The derivative there is the mean of two one-sided derivatives, each of which is the slope of
+the field times the slope of q on that side. For cubic interpolation q is smooth, and monotone if neighbouring distances
+differ by at most a factor of 5. Beyond a wall, the distance between points is the width of the last cell.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
 __all__ = ["Displacement", "IndexCoordinates"]
 
-LAYERS = 4  # points beyond each end
-STEEPEST = 5.0  # ratio of neighbouring distances up to which a Catmull-Rom curve is monotone
-NEWTON_STEPS = 50  # at most; about five are needed
-BLOCK = 1 << 13  # points at a time: intermediate arrays stay in the cache
+LAYERS = 4  # number of additional points beyond each end
+STEEPEST = 5.0  # largest ratio of neighbouring distances for which a Catmull-Rom curve is monotone
+NEWTON_STEPS = 50  # upper limit; about five are needed
+BLOCK = 1 << 13  # number of points processed at a time, so that intermediate arrays stay in the cache
 
 
 class Displacement(NamedTuple):
@@ -41,10 +41,10 @@ class Displacement(NamedTuple):
     ----------
     values : array, shape (axes, points)
     scale : array, shape (axes,)
-        The departure point of a point is point - scale * values.
+        The departure point of point i is at i - scale * values.
     slopes : array, shape (0, 1 or 2, axes, points)
-        Derivatives of `values` in the velocity. Empty where they are 1 (cells of equal width); two if they may jump:
-        above and below the departure point.
+        Derivatives of `values` in the velocity. Empty if they are 1 (cells of equal width). Two arrays if the
+        derivative may jump at the departure point: from above and from below.
     """
 
     values: NDArray
@@ -53,13 +53,13 @@ class Displacement(NamedTuple):
 
 
 class IndexCoordinates:
-    """Index coordinates of a component of the field.
+    """The index coordinates for one component of the field.
 
     Parameters
     ----------
     settings : TransportSettings
     number : int
-        Number of the component.
+        Index of the component.
     interpolation : "linear" or "cubic"
     """
 
@@ -106,16 +106,16 @@ class IndexCoordinates:
 
 
 class PointsOfAxis:
-    """The points along an axis, and the index coordinate of a position among them.
+    """The points along an axis, and the map from positions to index coordinates.
 
     Parameters
     ----------
     gaps : array
         Distances between the points, including LAYERS points beyond each end.
     period : int or None
-        Number of points in a period.
+        Number of points in a period; None if the axis is not periodic.
     cubic : bool
-        Whether the position between the points is a Catmull-Rom curve, else piecewise linear.
+        Whether x(q) is a Catmull-Rom curve; if False, it is piecewise linear.
     """
 
     def __init__(self, gaps: NDArray, period: int | None, cubic: bool) -> None:
@@ -126,7 +126,7 @@ class PointsOfAxis:
         self.tangents = np.gradient(self.knots)  # slopes of the cubic at the points
 
     def index_of(self, x: NDArray) -> tuple[NDArray, ...]:
-        """Return the index coordinates of positions and their slopes in x: one, or two where it may jump."""
+        """Return the index coordinates of positions x and their derivative: one array, or two if it may jump."""
         turns: NDArray | int = 0
         if self.period is None:
             x = np.clip(x, self.knots[0], self.knots[-1])
@@ -157,11 +157,11 @@ def _check_monotone(scheme: str, gaps: NDArray) -> None:
 
 
 def _inverse_of_cubic(target: NDArray, gap: NDArray, first: NDArray, last: NDArray) -> tuple[NDArray, NDArray]:
-    """Return t where a cubic has the value `target`, and the slope of t there.
+    """Return the t at which a cubic has the value `target`, and the derivative of t in `target`.
 
-    The cubic increases from 0 at t = 0 to `gap` at t = 1, with the slopes `first` and `last`. Newton's method starts
-    at the inflection point. From there the curvature has one sign, so the steps overshoot at most once, and the ends of
-    the gap are the only bounds that they need.
+    The cubic increases from 0 at t = 0 to `gap` at t = 1, with the slopes `first` and `last` there. Newton's method
+    starts at the inflection point. On each side of it the curvature has one sign, so that the iteration overshoots at
+    most once and converges without other bounds than 0 <= t <= 1.
     """
     square = 3 * gap - 2 * first - last
     cube = first + last - 2 * gap
@@ -170,7 +170,7 @@ def _inverse_of_cubic(target: NDArray, gap: NDArray, first: NDArray, last: NDArr
         return np.maximum((3 * cube * t + 2 * square) * t + first, EPS * gap)
 
     with np.errstate(divide="ignore", invalid="ignore"):
-        t = np.fmin(np.fmax(-square / (3 * cube), 0.0), 1.0)  # 0 also where the cubic is a straight line
+        t = np.fmin(np.fmax(-square / (3 * cube), 0.0), 1.0)  # fmax also maps the NaN of a straight line to 0
     for _ in range(NEWTON_STEPS):
         previous = t
         t = np.clip(t - (((cube * t + square) * t + first) * t - target) / slope(t), 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""A component of a field between its points: padded with ghost cells, interpolated at departure points, transposed."""
+"""Interpolation of a component of a field at departure points, with ghost cells, and its derivatives."""
 
 from __future__ import annotations
 
@@ -31,16 +31,18 @@ class Interpolant:
     ----------
     settings : TransportSettings
     number : int
-        Number of the component.
+        Index of the component.
     closed : bool
-        Use linear interpolation, and repeat the nearest value beyond walls. The velocity is interpolated like this.
+        If True, interpolate linearly and use the value of the nearest point beyond walls, without inflow values and
+        without filling the solid. The velocity is interpolated in this way.
 
     Attributes
     ----------
     span : slice
-        Entries of the component in the flat field.
+        Range of the entries of the component in the flat field.
     half_way : Interpolant or None
-        Interpolant of the velocity half way to a departure point; None if points keep their own velocity (euler).
+        Interpolant of the velocity at the midpoint of the path to a departure point. None for euler, which uses the
+        velocity at the point itself.
     """
 
     def __init__(self, settings: TransportSettings, number: int, closed: bool = False) -> None:
@@ -60,12 +62,12 @@ class Interpolant:
         self._inside = tuple(slice(PAD, PAD + n) for n in self.points.shape)
         self._ghosts, self._sources = ghost_sources(settings, number, self.points, closed)
         self._filling: sp.csr_array | None = None
-        if settings.of == "cells" and settings.solid is not None and not closed:  # faces keep their value
+        if settings.of == "cells" and settings.solid is not None and not closed:  # faces of solids keep their value
             self._filling = solid_filling(settings.grid, settings.solid)
             self._filling_transpose = sp.csr_array(self._filling.T)
 
     def fill_solid(self, u: NDArray) -> NDArray:
-        """Return the component with solid cells filled from the fluid."""
+        """Return the component with its solid cells filled; see `solid_filling`."""
         if self._filling is None:
             return u
         return self._filling @ u
@@ -76,7 +78,7 @@ class Interpolant:
             of_u[:] = self._filling_transpose @ of_u
 
     def filled_matrix(self, matrix: sp.csr_array) -> sp.csr_array:
-        """Return the product of a matrix with the matrix of `fill_solid`."""
+        """Return the product ``matrix @ F`` with the matrix F of `fill_solid`."""
         if self._filling is None:
             return matrix
         return matrix @ self._filling
@@ -91,7 +93,10 @@ class Interpolant:
         return samples
 
     def pad_vjp(self, samples: NDArray, of_u: NDArray, of_inflow: NDArray) -> None:
-        """Pull a cotangent of the samples back: set `of_u` and add to `of_inflow`. The cotangent is overwritten."""
+        """Apply the transpose of `pad` to a cotangent of the samples: set `of_u` and add to `of_inflow`.
+
+        The cotangent `samples` is overwritten.
+        """
         cells = self.points.samples
         np.add.at(samples, self._sources, samples[self._ghosts])
         of_u.reshape(self.points.shape)[...] = samples[:cells].reshape(self.points.padded)[self._inside]
@@ -106,7 +111,7 @@ class InterpolatedComponent:
     interpolant : Interpolant
     displacement : Displacement
     u : array
-        The component, flat.
+        The component as a flat array.
     inflow : array
         All inflow values.
     """
@@ -120,7 +125,7 @@ class InterpolatedComponent:
 
     @cached_property
     def samples(self) -> NDArray:
-        """The component with its ghost cells, and the inflow values."""
+        """The filled component with its ghost cells, followed by the inflow values."""
         return self.interpolant.pad(self.interpolant.fill_solid(self.u), self.inflow)
 
     def with_field(self, u: NDArray, inflow: NDArray) -> InterpolatedComponent:
@@ -130,7 +135,7 @@ class InterpolatedComponent:
     def value(self, out: NDArray | None = None, bounds: NDArray = interpolation_weights.NO_BOUNDS) -> NDArray:
         """Return the values at the departure points.
 
-        `bounds` is filled with the least and the greatest sample of the cells around them, if it has room.
+        If `bounds` is not empty, it is set to the least and the greatest sample of the cell of each departure point.
         """
         if out is None:
             out = buffers.empty((self.points.size,), float)
@@ -144,9 +149,9 @@ class InterpolatedComponent:
         of_inflow: NDArray,
         of_samples: tuple[NDArray, NDArray] | None = None,
     ) -> None:
-        """Pull a cotangent of the values back: set `of_u` and add to `of_inflow`.
+        """Compute the cotangents of u and inflow from the cotangent g of the values: set `of_u`, add to `of_inflow`.
 
-        `of_samples` is a pair (numbers of samples, their cotangents), which are pulled back too.
+        `of_samples` is a pair (indices of samples, cotangents of these samples) with further contributions.
         """
         samples = buffers.empty((self.points.samples + self.inflow.size,), float)
         samples[:] = 0.0
@@ -158,11 +163,11 @@ class InterpolatedComponent:
         self.interpolant.fill_solid_vjp(of_u)
 
     def velocity_slopes(self, g: NDArray, out: NDArray) -> NDArray:
-        """Set `out` (axis, point) to g times the derivative of the values in the velocity used along the step."""
+        """Set `out` (axis, point) to g times the derivative of the values in the velocity along the step."""
         values, scale, slopes = self.displacement
         if not len(slopes):
             return interpolation_weights.interpolate(self.points, self.samples, values, scale, out, g)
-        # Move a point at which the slope jumps to the side that the slope belongs to.
+        # If the slope jumps at a departure point, move the point slightly to the side for which the slope is valid.
         nudge = 32 * EPS * max(self.points.shape) * (slopes[0] != slopes[-1])
         total = 0.0
         for slope, shift in zip(slopes, (-nudge, nudge)):
@@ -172,16 +177,16 @@ class InterpolatedComponent:
         return np.divide(total, len(slopes), out=out)
 
     def jvp(self, du: NDArray, dinflow: NDArray, dw: NDArray | None) -> NDArray:
-        """Return the tangent of the values for tangents of u, inflow and the velocity used along the step."""
+        """Return the tangent of the values for tangents of u, inflow and the velocity along the step."""
         total = self.with_field(du, dinflow).value()
         if dw is None:
             return total
         return total + np.sum(self.velocity_slopes(np.ones(total.size), np.empty(dw.shape)) * dw, axis=0)
 
     def matrix(self) -> sp.csr_array:
-        """Return the matrix on u whose product is the values for inflow 0."""
+        """Return the matrix that maps u to the values, for an inflow of 0."""
         n = self.points.size
-        # The field of the numbers of points gives for each sample its source; n stands for inflow.
+        # Padding the array of point indices gives, for each sample, the point that it repeats; n stands for inflow.
         sources = self.interpolant.pad(np.arange(n), np.full(self.inflow.size, n)).astype(int)
         values, scale, _ = self.displacement
         total = sum(

@@ -1,14 +1,17 @@
-"""MacCormack transport: a semi-Lagrangian step, a step back, and half of the error between them added.
+"""MacCormack transport: a semi-Lagrangian step, corrected by half the error of stepping forward and back.
 
-With f = W u (looking back along the velocity) and b = V f (looking ahead along it),
+With the step f = W u and the step backwards in time b = V f,
 
     u' = f + (u - b) / 2,     clamped to the least and greatest sample of the cell around the departure point.
 
+The cotangents of f and u for a cotangent g of u' are
+
     g_f = c g - V^T (c g) / 2,    g_u = c g / 2 + W^T g_f + (cotangents of the bounds),    c = 1 where not clamped.
 
-A clamped value passes its cotangent on to the samples that equal the bound, in equal parts. Where the value equals a
-bound, the derivative is the mean of both sides: c = 1/2, and the other half goes to the bound. The scheme is of second
-order in space and time for smooth data; clamping lowers the order at extrema.
+The cotangent of a clamped value is distributed in equal parts over the samples that equal the bound. If the unclamped
+value equals a bound, the derivative is the mean of both one-sided derivatives: c = 1/2, and the other half of the
+cotangent goes to the samples of the bound. The scheme is second-order accurate in space and time for smooth data;
+clamping lowers the order at extrema.
 
 References
 ----------
@@ -35,16 +38,18 @@ __all__ = ["CorrectedStep", "MacCormack"]
 
 
 class _Clamped(NamedTuple):
-    """The points where the clamp acts."""
+    """The points at which the value is clamped or equals a bound."""
 
     points: NDArray
-    free_share: NDArray  # derivative of the result in the value before the clamp
-    samples: NDArray  # numbers of the samples of the cells around the departure points, a row for each corner
+    free_share: NDArray  # derivative of the result in the unclamped value
+    samples: NDArray  # indices of the samples of the cells around the departure points, a row for each corner
     sample_shares: NDArray  # derivatives of the result in these samples
 
 
 class CorrectedStep:
-    """The MacCormack step of one component of the field, with the methods of `ComponentStep`. `vjp` may run once.
+    """The MacCormack step of one component of the field, with the methods of `ComponentStep`.
+
+    `vjp` may be called only once, because it reuses the arrays of the step.
 
     Parameters
     ----------
@@ -53,7 +58,7 @@ class CorrectedStep:
         Velocities at the points.
     dt : float
     u : array
-        The component, flat.
+        The component as a flat array.
     inflow : array
         All inflow values.
     """
@@ -93,7 +98,7 @@ class CorrectedStep:
             out[:] = self.unclamped
 
     def vjp(self, g: NDArray, of_u: NDArray | None, of_inflow: NDArray, of_w: NDArray | None) -> None:
-        """Pull a cotangent back; see `ComponentStep.vjp`."""
+        """Compute the cotangents of u, inflow and w; see `ComponentStep.vjp`."""
         of_unclamped = buffers.empty(g.shape, float)
         of_unclamped[:] = g
         of_samples = None
@@ -129,7 +134,7 @@ class CorrectedStep:
 
 
 class MacCormack(SemiLagrangian):
-    """The MacCormack scheme; see the head of this module for its formulas."""
+    """The MacCormack scheme; the module docstring has its formulas."""
 
     options = ("interpolation", "backtrace", "clamp")
     linear = False

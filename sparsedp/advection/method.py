@@ -1,4 +1,4 @@
-"""What a transport scheme defines: plain functions of flat arrays, from which `rule` builds one differentiable rule."""
+"""Base class of the transport schemes, whose plain functions of flat arrays `rule` makes differentiable."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ class TransportMethod:
     ``forward(u, v, dt, inflow)``
         Return the field after one step.
     ``vjp(nums, g, u, v, dt, inflow)``
-        Return a tuple of the cotangents of the arguments `nums`, for the cotangent g of the result, and whether they
-        are known to be finite. Nothing else is computed.
+        Return a tuple of the cotangents of the arguments whose positions are in `nums`, for the cotangent g of the
+        result, and whether these cotangents are known to be finite. Other cotangents are not computed.
     ``jvp(tangents, u, v, dt, inflow)``
-        Return the tangent of the result; `tangents` is a dict {number of the argument: tangent}.
+        Return the tangent of the result; `tangents` is a dict {position of the argument: tangent}.
     ``matrix(v, dt)``
-        Return the step as a csr_array on `u` with inflow 0; only if `linear`.
+        Return the step as a csr_array that is applied to `u`, for an inflow of 0; only if `linear`.
 
-    All arrays are flat, contiguous and of float64. They may contain NaN and infinity: the methods themselves detect
-    them. `u` has ``settings.space.size`` entries, `v` is the velocity as the user gives it, ``dt > 0`` is a float
-    and `inflow` has ``walls.size`` entries.
+    All arrays are flat, contiguous and of dtype float64. They may contain NaN and infinity, which the methods must
+    detect themselves. `u` has ``settings.space.size`` entries, `v` is the velocity that the user passed, flattened,
+    ``dt > 0`` is a float and `inflow` has ``walls.size`` entries.
 
-    A step depends on the product of velocity and dt only. `vjp` and `jvp` are therefore never asked for a derivative
-    in dt; `rule` computes it from the derivative in the velocity.
+    A step depends only on the product of velocity and dt. `vjp` and `jvp` are therefore never called for a derivative
+    in dt: `rule` computes it from the derivative in the velocity.
 
     Parameters
     ----------
@@ -57,10 +57,10 @@ class TransportMethod:
     linear : bool
         Whether the step is linear in (u, inflow).
     accumulates : bool
-        Whether `vjp` takes a further argument `velocity_sum`, an array or None: it adds the cotangent of the velocity
-        to this array and returns the array.
+        Whether `vjp` has an additional argument `velocity_sum`, an array or None. If it is an array, `vjp` adds the
+        cotangent of the velocity to it in place, and returns this array as the cotangent.
     any_order : bool
-        Whether `vjp` and `jvp` take traced values, which gives derivatives of every order.
+        Whether `vjp` and `jvp` accept traced values, so that derivatives of every order exist.
     """
 
     options: tuple[str, ...] = ("form", "unstable")
@@ -81,7 +81,7 @@ class TransportMethod:
 
     @cached_property
     def interpolation(self) -> Operator | None:
-        """Operator from the given velocity to the points or sides that the scheme needs; None if they are the same."""
+        """Operator that interpolates the velocity to where the scheme needs it; None if it is given there."""
         return velocity_interpolation(self.settings)
 
     def interpolate_velocity(self, v: NDArray) -> NDArray:
@@ -98,7 +98,7 @@ class TransportMethod:
 
 
 class Identity(TransportMethod):
-    """The step on a grid without cells: it returns the field, for every scheme."""
+    """The method that replaces every scheme on a grid without cells: a step returns a copy of the field."""
 
     linear = True
     any_order = True

@@ -1,4 +1,4 @@
-"""The rule of a transport method on the tape: forward, all requested cotangents in one pass, tangents, second order."""
+"""The differentiation rule of a transport method: forward, cotangents, tangents, and second derivatives."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ARGUMENTS = ("u", "v", "dt", "inflow")
 
 
 def rule_of(method: TransportMethod) -> Rule:
-    """Return the differentiable rule of (u, v, dt, inflow) of a transport method."""
+    """Return a transport step as a differentiable function of (u, v, dt, inflow)."""
 
     def forward(u, v, dt, inflow):
         return _unflatten_result(u, method.forward(*_flatten(method, u, v, dt, inflow)), method.settings.space.shape)
@@ -47,7 +47,7 @@ def rule_of(method: TransportMethod) -> Rule:
             rules = zip(_linear_rules(method, nums, flat), flat_tangents.values(), strict=True)
             tangent = sum(pushforward(along) for (_, pushforward), along in rules)
         else:
-            if STEP in flat_tangents:  # a step depends on v dt alone
+            if STEP in flat_tangents:  # a step depends only on v dt
                 along_velocity = flat_tangents.pop(STEP) / flat[STEP] * flat[VELOCITY]
                 flat_tangents[VELOCITY] = flat_tangents.get(VELOCITY, 0.0) + along_velocity
             tangent = method.jvp(flat_tangents, *flat)
@@ -60,7 +60,7 @@ def rule_of(method: TransportMethod) -> Rule:
 
 
 def _pull(method: TransportMethod, nums: Sequence[int], args: tuple, g: Any, sums: tuple) -> list:
-    """Return the cotangents of the arguments `nums` in their shapes; see `Rule` for `sums`."""
+    """Return the cotangents of the arguments `nums`, in the shapes of these arguments; see `Rule` for `sums`."""
     flat = _flatten(method, *args)
     g = _flatten_tangent(FIELD, method, g)
     traced = type(g) is not np.ndarray or any(map(isbox, flat))
@@ -73,7 +73,7 @@ def _pull(method: TransportMethod, nums: Sequence[int], args: tuple, g: Any, sum
     else:
         cotangents, finite = _cotangents(method, nums, g, flat, velocity_sum)
         if velocity_sum is not None and not finite and not surely_finite(velocity_sum):
-            # The sum may have been infinite before: check the cotangent of this step alone.
+            # The sum may have been infinite before this step: check only the cotangent of this step.
             of_velocity = method.vjp((VELOCITY,), g, *flat)[0][0]
             _check_derivative(method, "the gradient in v", of_velocity, (g,))
     results = []
@@ -86,7 +86,7 @@ def _pull(method: TransportMethod, nums: Sequence[int], args: tuple, g: Any, sum
 
 
 def _velocity_sum(args: tuple, sums: Mapping[int, NDArray | None]) -> NDArray | None:
-    """Return the sum of the cotangents of the velocity so far as a flat array; None if a step cannot add to it."""
+    """Return the sum of the cotangents of the velocity so far, flat; None if a step cannot add to it in place."""
     total = sums.get(VELOCITY)
     if total is None or total.dtype != FLOAT or dtype_of(args[VELOCITY]) != FLOAT or not total.flags.c_contiguous:
         return None
@@ -98,7 +98,7 @@ def _cotangents(
 ) -> tuple[list, bool]:
     """Return the cotangents of the arguments `nums`, and whether they are known to be finite.
 
-    A step depends on v dt alone, so the cotangent of dt follows from the cotangent of the velocity.
+    A step depends only on v dt, so that the cotangent of dt follows from the cotangent of the velocity.
     """
     requested = tuple({VELOCITY if num == STEP else num for num in nums})
     if velocity_sum is None:
@@ -113,7 +113,7 @@ def _cotangents(
 
 
 def _check_derivative(method: TransportMethod, description: str, derivative: Any, given: Iterable) -> None:
-    """Raise if a derivative overflows, unless the cotangent or the tangents given to the step are not finite."""
+    """Raise if a derivative is not finite although all cotangents or tangents passed to the step are finite."""
     derivative = plain(derivative)
     if surely_finite(derivative) or not all(np.all(np.isfinite(plain(value))) for value in given):
         return
@@ -121,9 +121,10 @@ def _check_derivative(method: TransportMethod, description: str, derivative: Any
 
 
 def _linear_rules(method: TransportMethod, nums: Sequence[int], flat: tuple) -> list:
-    """Return for each argument the rules of its pullback and its pushforward, which do not depend on u and inflow.
+    """Return, for each argument, its pullback and its pushforward as differentiable linear rules.
 
-    A scheme that is linear in (u, inflow) has every derivative in these two as long as v and dt are constant.
+    They do not depend on u and inflow. If a scheme is linear in (u, inflow), and v and dt are constant, they therefore
+    give derivatives of every order in u and inflow.
     """
     constant = not isbox(flat[VELOCITY]) and not isbox(flat[STEP])
     if not (method.linear and constant and set(nums) <= {FIELD, INFLOW}):
@@ -146,7 +147,7 @@ def _linear_rules(method: TransportMethod, nums: Sequence[int], flat: tuple) -> 
 
 
 def _flatten(method: TransportMethod, u: Any, v: Any, dt: Any, inflow: Any) -> tuple[Any, Any, Any, Any]:
-    """Check the arguments of a step and return them as the method takes them."""
+    """Check the arguments of a step and return them as flat arrays and a float, as the method needs them."""
     if type(dt) is not float or not 0 < dt < np.inf:
         number = check_step(method.name, plain(dt))
         if isbox(dt):
@@ -159,7 +160,7 @@ def _flatten(method: TransportMethod, u: Any, v: Any, dt: Any, inflow: Any) -> t
 
 
 def _flatten_inflow(name: str, inflow: Any, walls: Space) -> Any:
-    """Return one inflow value for each place of the walls."""
+    """Return the inflow as a flat array with one value for each point at a wall."""
     if type(inflow) is float:
         return np.full(walls.size, inflow)
     if np.shape(inflow) == ():
@@ -188,7 +189,7 @@ def _flatten_tangent(num: int, method: TransportMethod, tangent: Any) -> Any:
 
 
 def _unflatten(value: Any, derivative: Any) -> Any:
-    """Return a flat derivative in the shape of a value; the sum over all walls if the value is one number."""
+    """Return a flat derivative in the shape of a value; if the value is a scalar, return the sum."""
     shape = np.shape(value)
     if shape:
         return derivative.reshape(shape)

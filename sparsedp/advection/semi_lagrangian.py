@@ -1,16 +1,18 @@
-"""Semi-Lagrangian transport: every point takes the value at its departure point.
+"""Semi-Lagrangian transport: the new value at a point is the interpolated value at its departure point.
 
-Let E be the field with ghost cells, m the velocity along which point i looks back and s = dt / spacing. Then
+Let E be the field with ghost cells, m_i the velocity from the departure point of point i to the point, and
+s = dt / spacing. Then
 
     u'_i     = sum over k of W_ik E_k,     W_ik = product over the axes of weights at i - s m_i
-    g_E      = W^T g,                      folded back onto u and inflow
+    g_E      = W^T g,                      from which `Interpolant.pad_vjp` computes the cotangents of u and inflow
     g_m      = -s g_i (gradient of the interpolant at i - s m_i)
-    tangent  = W dE + g_m(g = 1) . dm,
+    tangent  = W dE + g_m(g = 1) . dm.
 
-and `departure_points` leads from m on to the given velocity v. A step depends on v dt alone: g_dt = g_v . v / dt, and
-ddt acts like the tangent v ddt / dt of v. Linear weights have kinks at the points: the slope there is the mean of both
-sides. Cubic weights are those of Catmull and Rom (cubic convolution): third order in a step, hence at least second
-order at a fixed ratio of dt to spacing, and exact for quadratic fields away from walls.
+`departure_points` has the relation between m and the velocity v. A step depends only on v dt: therefore
+g_dt = g_v . v / dt, and a tangent ddt of dt has the effect of a tangent v ddt / dt of v. The linear interpolant has
+kinks at the points; its slope there is the mean of both one-sided slopes. The cubic weights are those of Catmull and
+Rom (cubic convolution). Their error is of third order in a step, hence of second order or better at a fixed ratio of dt
+to spacing, and they are exact for quadratic fields away from walls.
 
 References
 ----------
@@ -53,7 +55,7 @@ class ComponentStep:
         Velocities at the points.
     dt : float
     u : array
-        The component, flat.
+        The component as a flat array.
     inflow : array
         All inflow values.
     """
@@ -67,9 +69,9 @@ class ComponentStep:
         self.values.value(out)
 
     def vjp(self, g: NDArray, of_u: NDArray | None, of_inflow: NDArray, of_w: NDArray | None) -> None:
-        """Pull a cotangent back: set `of_u` and `of_w` and add to `of_inflow`.
+        """Compute cotangents from the cotangent g of the result: set `of_u` and `of_w`, and add to `of_inflow`.
 
-        None for `of_u` leaves out both field and inflow; None for `of_w` leaves out the velocity.
+        If `of_u` is None, those of u and inflow are not computed; if `of_w` is None, that of w is not computed.
         """
         if of_u is not None:
             self.values.vjp(g, of_u, of_inflow)
@@ -81,12 +83,12 @@ class ComponentStep:
         return self.values.jvp(du, dinflow, None if dw is None else self.back.jvp(dw))
 
     def matrix(self) -> sp.csr_array:
-        """Return the step as a matrix on u for inflow 0."""
+        """Return the matrix of the step, which maps u to the result for an inflow of 0."""
         return self.values.matrix()
 
 
 class SemiLagrangian(TransportMethod):
-    """The semi-Lagrangian scheme; see the head of this module for its formulas."""
+    """The semi-Lagrangian scheme; the module docstring has its formulas."""
 
     options: tuple[str, ...] = ("interpolation", "backtrace")
     linear = True
@@ -95,21 +97,21 @@ class SemiLagrangian(TransportMethod):
     def __init__(self, settings: TransportSettings) -> None:
         super().__init__(settings)
         self.components = [Interpolant(settings, number) for number in range(len(settings.space.parts))]
-        self.solid = settings.solid_points  # these points keep their value
+        self.solid = settings.solid_points  # mask of the points whose value does not change
 
     def _split_velocity(self, w: NDArray) -> list[NDArray]:
-        """Return for each component the velocities at its points, an array (axis, point)."""
+        """Return, for each component, the velocities at its points as an array (axis, point)."""
         dim = self.settings.grid.dim
         return [w[dim * c.span.start : dim * c.span.stop].reshape(dim, -1) for c in self.components]
 
     def _steps(self, u: NDArray, v: NDArray, dt: float, inflow: NDArray) -> Iterator[tuple[slice, Any]]:
-        """Yield for each component its entries in the field and its step."""
+        """Yield, for each component, the range of its entries in the field and its step."""
         velocities = self._split_velocity(self.interpolate_velocity(v))
         for component, w in zip(self.components, velocities, strict=True):
             yield component.span, self.component_step(component, w, dt, u[component.span], inflow)
 
     def _keep_solid(self, result: NDArray, u: NDArray) -> NDArray:
-        """Return a result in which the points inside the solid have the values of u."""
+        """Set the points of `result` inside the solid to the values of u, and return `result`."""
         if self.solid is not None:
             np.copyto(result, u, where=self.solid)
         return result
@@ -117,7 +119,7 @@ class SemiLagrangian(TransportMethod):
     def forward(self, u: NDArray, v: NDArray, dt: float, inflow: NDArray) -> NDArray:
         """Return the field after one step."""
         if not all(map(surely_finite, (u, v, inflow))):
-            check_numbers(self.settings, u, v, inflow)  # interpolation could hide them
+            check_numbers(self.settings, u, v, inflow)  # the result alone does not show all of them
         out = buffers.empty(u.shape, float)
         for span, step in self._steps(u, v, dt, inflow):
             step.value(out[span])
@@ -172,7 +174,7 @@ class SemiLagrangian(TransportMethod):
         return self._keep_solid(out, du)
 
     def matrix(self, v: NDArray, dt: float) -> sp.csr_array:
-        """Return the step as a matrix on u."""
+        """Return the matrix of the step, which maps u to the next field for an inflow of 0."""
         no_field = np.zeros(self.settings.space.size)
         no_inflow = np.zeros(self.walls.size)
         blocks = [step.matrix() for _, step in self._steps(no_field, v, dt, no_inflow)]

@@ -1,4 +1,4 @@
-"""The settings of a transport step, and the numbers of its arguments."""
+"""The settings of a transport step, and the positions of its arguments."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ class TransportSettings:
     sides : tuple
         For each axis the conditions of its lower and its upper side, or None where the axis is periodic.
     velocity, of : "faces" or "cells"
-        Where the velocity and the transported field are given.
+        Whether the velocity and the transported field are given on faces or in cells.
     interpolation : "linear" or "cubic"
     form : "flux", "advective" or None
-        None for schemes without this choice.
+        None for schemes without this option.
     backtrace : "euler" or "midpoint"
     clamp : bool
     solid : bool array, shape ``grid.shape``, or None
@@ -86,11 +86,11 @@ class TransportSettings:
         return ((len(shape), *shape),)
 
     def velocity_place(self, index: int) -> str:
-        """Return the index of a flat entry of the velocity as the user sees it."""
+        """Return the text of the index of an entry of the velocity, in the shape that the user passed."""
         return place(index, self.velocity_shapes[-1])
 
     def field_place(self, index: int) -> str:
-        """Return the index of a flat entry of the field as the user sees it, with the component of a face field."""
+        """Return the text of the index of an entry of the field, for a face field with the name of the component."""
         offsets = self.space.offsets
         component = int(np.searchsorted(offsets, index, "right")) - 1
         text = place(index - offsets[component], self.space.parts[component])

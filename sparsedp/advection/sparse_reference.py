@@ -1,18 +1,19 @@
 """The Eulerian schemes as products with sparse matrices.
 
-These formulas run without numba and on traced values, give the matrix of a step, and are the reference for the tests of
-the compiled loops. They take about ten times as long, so both implementations stay.
+These formulas work without numba and with traced values, give the matrix of a step, and are the reference for the tests
+of the compiled loops. The compiled loops exist because they are about ten times as fast.
 
-All quantities stand on the lower or upper side of a point along an axis. Let C be the velocity times dt over the
-length there, H = 1, 1/2, 0 for C > 0, = 0, < 0, p = H C and m = (1 - H) C. Then
+All quantities belong to the lower or upper side of a point along an axis. Let C be the velocity there times dt over the
+length, H = 1, 1/2 or 0 for C > 0, C = 0 or C < 0, p = H C and m = (1 - H) C. Then
 
     u'     = (1 - sum of leaves) u + sum of enters
     leaves = p_lower - m_upper  [+ C_upper - C_lower in flux form]
     enters = p_lower (u_below + ahead_below) - m_upper (u_above - behind_above) - p_upper ahead - m_lower behind
 
-over the axes, where `ahead` and `behind` are what the limiter of a second-order scheme adds at the sides of a point.
-On the tape, H and the slopes of the limiter are constants. This is exact away from kinks, and gives the mean of both
-one-sided derivatives at rest. In a scheme with several stages each stage is averaged with the first field.
+where the sums are over the axes, and `ahead` and `behind` are the corrections that the limiter of a second-order scheme
+adds at the upper and the lower side of a point. For differentiation, H and the derivatives of the limiter are treated
+as constants. This is exact except at kinks; for a velocity of 0 it gives the mean of both one-sided derivatives. In a
+scheme with several stages, the result of a stage is averaged with the first field.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ __all__ = ["SparseReference"]
 
 
 class SparseReference:
-    """The formulas of this module, for plain and for traced flat arguments.
+    """The schemes by the formulas of the module docstring, for plain and for traced flat arguments.
 
     Parameters
     ----------
@@ -52,7 +53,7 @@ class SparseReference:
     inflow_size : int
         Number of inflow values.
     interpolation : Operator or None
-        From the given velocity to the sides or points.
+        Interpolates the velocity to the sides or points where the scheme needs it; None if it is given there.
     """
 
     def __init__(
@@ -123,19 +124,19 @@ class SparseReference:
         )
 
     def _courant_numbers(self, v: Any, dt: Any) -> tuple[Any, Any]:
-        """Return the velocity times dt over length, on the lower and the upper sides."""
+        """Return the velocity times dt / length on the lower and on the upper sides."""
         lower, upper = self._maps.speed
         return dt * lower(v), dt * upper(v)
 
     def _leaves(self, lower: Any, upper: Any, p_lower: Any, m_upper: Any) -> Any:
-        """Return the share of its value that leaves each point along each axis."""
+        """Return, for each point and axis, the fraction of the value that leaves the point."""
         leaves = p_lower - m_upper
         if self.flux_form:
             return leaves + upper - lower
         return leaves
 
     def _stage(self, u: Any, lower: Any, upper: Any, inflow: Any) -> Any:
-        """Return u + dt du/dt for Courant numbers on the lower and the upper sides."""
+        """Return u + dt du/dt for the Courant numbers on the lower and the upper sides."""
         maps = self._maps
         values = anp.concatenate([u, inflow])
         p_lower, m_lower = _by_direction(lower)
@@ -184,7 +185,7 @@ class SparseReference:
         return pullback(step, tuple(args[num] for num in nums))[1](g)
 
     def jvp(self, tangents: Mapping[int, Any], *args: Any) -> Any:
-        """Return the tangent of the result; `tangents` is a dict {number of the argument: tangent}."""
+        """Return the tangent of the result; `tangents` is a dict {position of the argument: tangent}."""
 
         def step(some):
             return self.step(*placed(args, tangents, some))
@@ -192,14 +193,14 @@ class SparseReference:
         return pushforward(step, tuple(args[num] for num in tangents), tuple(tangents.values()))[1]
 
     def rate(self, v: NDArray) -> NDArray:
-        """Return the sum of the Courant numbers of each point, divided by dt."""
+        """Return the CFL number of each point divided by dt."""
         lower, upper = self._courant_numbers(v, 1.0)
         p_lower, _ = _by_direction(lower)
         _, m_upper = _by_direction(upper)
         return self._maps.total(self._leaves(lower, upper, p_lower, m_upper))
 
     def matrix(self, v: NDArray, dt: float) -> sp.csr_array:
-        """Return the step as a matrix on u, for a scheme of first order."""
+        """Return the matrix of the step of a first-order scheme, which maps u to the next field."""
         lower, upper = self._courant_numbers(v, dt)
         p_lower, _ = _by_direction(lower)
         _, m_upper = _by_direction(upper)
@@ -211,18 +212,18 @@ class SparseReference:
 
 
 class _SideTable(NamedTuple):
-    """Arrays with a column for each point along each axis; their rows stand for the lower and the upper side."""
+    """Arrays with a column for each pair of a point and an axis; the rows are for the lower and the upper side."""
 
     points: NDArray  # index of the point itself, one row
     beyond: NDArray  # index of the value beyond the side, in (field, inflow)
-    slope: NDArray  # column whose slope acts at the side; -1 where there is none
+    slope: NDArray  # column of the neighbour whose slope is used at the side; -1 if there is none
     speed: NDArray  # index of the velocity
     weight: NDArray  # 1 / length, 0 on closed sides
     distances: NDArray  # c and e of the limiter
 
 
 class _Matrices(NamedTuple):
-    """Matrices to the sides of points, from the field, (field, inflow), slopes and the velocity; pairs: by side."""
+    """Matrices from the field, (field, inflow), slopes and velocity to the sides; a list has one for each side."""
 
     points: Any
     beyond: list
@@ -231,7 +232,7 @@ class _Matrices(NamedTuple):
 
 
 class _Maps(NamedTuple):
-    """The same as functions of plain and traced arrays; `total` sums over the sides of each point."""
+    """Products with the `_Matrices`, as functions of plain and traced arrays; `total` sums over the axes of a point."""
 
     points: Callable[[Any], Any]
     total: Callable[[Any], Any]
@@ -241,13 +242,13 @@ class _Maps(NamedTuple):
 
 
 def _by_direction(courant: Any) -> tuple[Any, Any]:
-    """Return p, the part of Courant numbers that is > 0, and m, the part that is < 0."""
+    """Return the positive part p and the negative part m of Courant numbers."""
     share = np.heaviside(plain(courant), 0.5)
     return courant * share, courant * (1.0 - share)
 
 
 def _selection(columns: NDArray, size: int, values: NDArray) -> sp.csr_array:
-    """Return the matrix with one entry in each row, none where the column is -1 or the value is 0."""
+    """Return the matrix with the entry `values[i]` in column `columns[i]` of row i; no entry if the column is -1."""
     keep = (columns >= 0) & (values != 0)
     places = np.flatnonzero(keep), columns[keep].astype(np.int32)
     return sp.csr_array((values[keep], places), (columns.size, size))

@@ -1,4 +1,4 @@
-"""transport: one time step of a field that is carried by a velocity."""
+"""transport: one time step of the advection of a field by a velocity."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ METHODS: dict[str, type[TransportMethod]] = {
     "semi_lagrangian": SemiLagrangian,
     "maccormack": MacCormack,
 }
-CHOICES = {  # the first one is the default
+CHOICES = {  # the accepted values of the options; the first one is the default
     "velocity": ("faces", "cells"),
     "of": ("cells", "faces"),
     "interpolation": ("linear", "cubic"),
@@ -72,41 +72,45 @@ def transport(
         scheme           order  time step               properties
         ===============  =====  ======================  ===========================================================
         upwind           1      CFL number at most 1    linear in u, conserves the sum, derivatives of every order
-        van_leer         2      CFL numbers sum to 1/2  limited slopes, two stages; 1 at extrema; first derivatives
-        semi_lagrangian  1      any                     linear in u, keeps constants, does not conserve the sum
-        maccormack       2      any                     semi_lagrangian and back, half of the error added
+        van_leer         2      CFL number at most 1/2  limited slopes, two stages; order 1 at extrema
+        semi_lagrangian  1      any                     linear in u, preserves constants, does not conserve the sum
+        maccormack       2      any                     semi_lagrangian, corrected by half the error of going back
         ===============  =====  ======================  ===========================================================
 
-        semi_lagrangian takes the value at the place where the content of a point comes from. maccormack is of order 2
-        in time if v is the mean of the velocities at both ends of the step, and of order 1 if v is the velocity at one
-        end. Both work on cells of any width. They have first derivatives; in u alone, semi_lagrangian has derivatives
-        of every order.
+        The CFL number of a point is the sum of |v| dt / h over its sides through which the flow leaves (form "flux") or
+        enters (form "advective"). semi_lagrangian interpolates u at the departure point of each point, the position at
+        distance v dt upstream. maccormack is of order 2 in time if v is the mean of the velocities at the beginning and
+        at the end of the step, and of order 1 if v is one of these velocities. Both schemes work on cells of any width.
+        Except upwind, all schemes have first derivatives only; in u alone, semi_lagrangian has derivatives of every
+        order.
     boundary : condition, or dict of conditions
-        Where the velocity points inwards, dirichlet brings in `inflow` and neumann the value of the point at the wall.
-        Where it points outwards, the field leaves in both cases. A closed wall has a velocity of 0.
-        semi_lagrangian, maccormack: these values apply from one spacing beyond the last point outwards.
+        Values that enter where the velocity points inwards: for dirichlet `inflow`, for neumann the value of the point
+        at the wall. Where the velocity points outwards, both conditions let the field leave. For a closed wall, set
+        the velocity to 0. semi_lagrangian and maccormack use these values from one spacing beyond the last point on.
     velocity : "faces" or "cells"
         "faces": v is a flat face field. "cells": v has the shape (dim, *grid.shape), in 1-D also grid.shape.
     of : "cells" or "faces"
-        Whether u is a cell field or a flat face field, each component of which is transported. For a face field the
-        velocity is interpolated to the control volumes of the faces (half cells at walls): linearly between cells, as
-        the mean inside a cell, and as the mean weighted with the widths of both half cells along a side.
+        Whether u is a cell field or a flat face field. Of a face field each component is transported. The velocity is
+        then interpolated to the control volumes of the faces (half cells at walls): linearly between cell centres, by
+        the mean of both faces at a cell centre, and by the mean weighted with the widths on sides in two cells.
     interpolation : "linear" or "cubic"
         For semi_lagrangian and maccormack. linear: order 1, no new extrema. cubic (Catmull-Rom): order 2 to 3 where the
-        field is smooth, small new extrema; widths of neighbouring cells may differ by a factor of at most 5.
+        field is smooth, may create small new extrema; distances of neighbouring points may change by a factor of at
+        most 5.
     form : "flux" or "advective", optional
         For upwind and van_leer. flux: du/dt = -div(v u), conserves the sum of u times volume. advective: du/dt =
         -v . grad u, preserves constants. Default: flux for a velocity on faces, advective for one on cells.
     backtrace : "euler" or "midpoint"
-        For semi_lagrangian and maccormack: whether departure points lie along the velocity at the point itself or
-        along the velocity half way.
+        For semi_lagrangian and maccormack: the velocity that determines a departure point. euler: the velocity at the
+        point itself. midpoint: the velocity half-way along the path.
     clamp : bool
-        For maccormack: whether to clamp to the least and greatest sample of the cell around the departure point.
+        For maccormack: whether to clamp the result to the least and greatest value of u at the corners of the cell
+        around the departure point, so that there are no new extrema.
     solid : bool array, shape grid.shape, optional
-        Nothing passes through a face that touches a solid cell, and values in solid cells do not change.
-        semi_lagrangian, maccormack: for its fluid neighbours a solid cell has the mean of its fluid neighbours.
+        Solid cells. There is no flux through their faces, and their values do not change. semi_lagrangian and
+        maccormack, when they interpolate u, replace the value of a solid cell by the mean of its fluid neighbours.
     unstable : "raise" or "allow"
-        For upwind and van_leer: what to do if a point would get a negative weight (CFL number above 1).
+        For upwind and van_leer: whether to raise UnstableStepError if the CFL number exceeds the limit of the scheme.
 
     Returns
     -------
@@ -118,12 +122,12 @@ def transport(
     Raises
     ------
     ValueError
-        If an option has none of the values above or is not used by the scheme, or if a condition is neither dirichlet
-        nor neumann. On use: if dt <= 0.
+        If an option has another value than those above or is not used by the scheme, or if a condition is neither
+        dirichlet nor neumann. On use, if dt <= 0.
     UnstableStepError
-        On use, if the step is larger than the scheme allows.
+        On use, if dt is too large for the stability of the scheme.
     NonFiniteError, ShapeError, TypeError
-        On use, if u, v or inflow hold NaN or infinity, have a wrong shape, or are not real numbers.
+        On use, if u, v or inflow hold NaN or infinity, have a wrong shape, or are not real, respectively.
     DerivativeError
         If `solid` is traced.
 
@@ -133,7 +137,7 @@ def transport(
 
     Notes
     -----
-    Options by scheme. The first value is the default; an option that the scheme does not use is refused.
+    Options by scheme. The first value is the default. An option that the scheme does not use raises ValueError.
 
     =============  =========================  ===========================
     option         values                     schemes
@@ -147,9 +151,9 @@ def transport(
     clamp          True, False                maccormack
     =============  =========================  ===========================
 
-    Limiters and clamps (van_leer, and maccormack unless clamp=False) have kinks in u where neighbours are equal, for
-    example where a field is 0. The derivative there is one of several possible ones, and `check.gradient` returns
-    "inconclusive".
+    Limiters and clamps (van_leer, and maccormack unless clamp=False) have kinks in u where neighbouring values are
+    equal, for example where a field is 0. The derivative there is one of several one-sided derivatives or their mean,
+    and `check.gradient` returns "inconclusive".
 
     References
     ----------
@@ -178,7 +182,7 @@ def transport(
         unstable=unstable,
     )
     for name, choice in choices.items():
-        advice = "; write backtrace= or clamp=" if name == "form" else ""  # their names before version 0.2
+        advice = "; write backtrace= or clamp=" if name == "form" else ""  # form= before version 0.2
         check_choice(f"{name}= of transport", choice, CHOICES[name], advice)
         if choice != CHOICES[name][0] and name not in ("velocity", "of", *options):
             raise ValueError(f"transport {scheme} does not use {name}; leave it out")
@@ -217,7 +221,7 @@ def _sides(grid: Grid, boundary: Any) -> tuple:
 
 
 def method_and_rule(settings: TransportSettings) -> tuple[TransportMethod, Any]:
-    """Return the scheme, and the differentiable rule of a step."""
+    """Return the scheme, and a step of it as a differentiable function."""
     if settings.grid.cells.size:
         method = METHODS[settings.scheme](settings)
     else:
@@ -226,7 +230,7 @@ def method_and_rule(settings: TransportSettings) -> tuple[TransportMethod, Any]:
 
 
 class Transport(Frozen, Reconstructible):
-    """One time step of transport, ``move(u, v, dt, inflow=0.0)``, built by `transport`. Frozen.
+    """One time step of transport, ``move(u, v, dt, inflow=0.0)``, as `transport` returns it. Immutable.
 
     Parameters
     ----------
@@ -236,7 +240,7 @@ class Transport(Frozen, Reconstructible):
     ----------
     settings : TransportSettings
     method : TransportMethod
-        The scheme; its plain functions of flat arrays.
+        The scheme, as plain functions of flat arrays.
     """
 
     settings: TransportSettings
@@ -263,18 +267,18 @@ class Transport(Frozen, Reconstructible):
 
     @property
     def walls(self) -> Space:
-        """Space of the inflow values; ``move.walls.join(...)`` builds them from one array or number for each wall."""
+        """Space of the inflow values; ``move.walls.join(...)`` builds them from an array or number for each wall."""
         return self.method.walls
 
     def operator(self, v: ArrayLike, dt: float) -> Operator:
-        """Return the step as an explicit operator on u, for inflow values of 0.
+        """Return the step for a constant velocity as an Operator with a matrix, for inflow values of 0.
 
         Parameters
         ----------
         v : array
-            As for the call [length / time].
+            Velocity, as for the call [length / time].
         dt : float
-            [time]
+            Time step > 0 [time].
 
         Returns
         -------
@@ -285,7 +289,7 @@ class Transport(Frozen, Reconstructible):
         ValueError
             If the scheme is not linear in u, or dt <= 0.
         DerivativeError
-            If v or dt are traced: an operator is constant.
+            If v or dt are traced, because an Operator must be constant.
 
         Examples
         --------
@@ -312,7 +316,7 @@ class Transport(Frozen, Reconstructible):
         return Operator(Matrix(self.method.matrix(flat, dt)), self.space, self.space, name)
 
     def __getattr__(self, name: str) -> Any:
-        advice = "; write lambda u, v: move(u, v, dt)" if name == "step" else ""  # before version 0.2
+        advice = "; write lambda u, v: move(u, v, dt)" if name == "step" else ""  # an attribute before version 0.2
         raise AttributeError(f"transport has no attribute {name!r}{advice}")
 
     def __repr__(self) -> str:

@@ -1,8 +1,9 @@
-"""Interpolation of the given velocity to where a transport scheme needs it: one sparse matrix for each block.
+"""Interpolation of the velocity to the points or sides where a transport scheme needs it.
 
-Between cell centres the interpolation is linear; at a wall it takes the value of the only cell. Inside a cell it is the
-mean of both faces. The control volume of a face covers half of two cells: the velocity through its sides is the mean of
-both cells weighted with their widths. A flow without divergence then preserves constants, on stretched grids too.
+Between cell centres the interpolation is linear; on a wall face it is the value of the adjacent cell. At a cell centre
+it is the mean of both faces. The control volume of a face consists of halves of two cells, and so do its sides along
+the axis of the face: the velocity through such a side is the mean of both cells weighted with their widths. A
+divergence-free flow then preserves constant fields, on stretched grids too.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ __all__ = ["velocity_interpolation"]
 
 
 def velocity_interpolation(settings: TransportSettings) -> Operator | None:
-    """Return the operator from the given velocity to all its components at each component of the field.
+    """Return the operator that interpolates all velocity components to the points of each component of the field.
 
     Parameters
     ----------
@@ -38,8 +39,8 @@ def velocity_interpolation(settings: TransportSettings) -> Operator | None:
     Returns
     -------
     Operator or None
-        The result is ordered by component of the field, then by axis. None where the given velocity is already at
-        the points or sides that the scheme needs.
+        Its result is ordered by component of the field, then by axis. None if the velocity is given at the points or
+        sides that the scheme needs.
     """
     grid = settings.grid
     one_component = settings.of == "cells" or (settings.at_points and grid.dim == 1)
@@ -72,9 +73,9 @@ def velocity_interpolation(settings: TransportSettings) -> Operator | None:
 
 
 def _factor_to_points(settings: TransportSettings, component: int | None, axis: int, along: int) -> Factor | None:
-    """Return the factor along one axis from velocity component `axis` to the points of a component of the field.
+    """Return the 1-D matrix along one axis from velocity component `axis` to the points of a component of the field.
 
-    `component` is None for cells; the result is None where nothing is interpolated along this axis.
+    `component` is None for a cell field. The result is None if no interpolation along this axis is needed.
     """
     on_faces = settings.velocity == "faces" and along == axis
     if on_faces == (along == component):
@@ -85,7 +86,7 @@ def _factor_to_points(settings: TransportSettings, component: int | None, axis: 
 
 
 def _factor_to_sides(settings: TransportSettings, component: int | None, axis: int, along: int) -> Factor | None:
-    """Return the same for the sides across `axis` of the control volumes of a component of the field."""
+    """Return the matrix of `_factor_to_points` for the sides across `axis` of the control volumes of the points."""
     grid = settings.grid
     on_faces = settings.velocity == "faces" and along == axis
     if along == component:
@@ -98,12 +99,12 @@ def _factor_to_sides(settings: TransportSettings, component: int | None, axis: i
 
 
 def _mean_of_cells(grid: Grid, axis: int) -> Factor:
-    """Return the factor from cells to faces by linear interpolation; a wall face gets the value of its cell."""
+    """Return the 1-D matrix from cells to faces of linear interpolation; a wall face gets the value of its cell."""
     return means(grid, axis, None if grid.periodic[axis] else (neumann, neumann))
 
 
 def _weighted_mean_of_cells(grid: Grid, axis: int) -> Factor:
-    """Return the factor from cells to faces by the mean weighted with the widths."""
+    """Return the 1-D matrix from cells to faces that computes the mean weighted with the cell widths."""
     below = cell_beside(grid, axis, False).matrix
     above = cell_beside(grid, axis, True).matrix
     widths = (below + above) @ sp.diags_array(grid.widths[axis])
@@ -111,7 +112,7 @@ def _weighted_mean_of_cells(grid: Grid, axis: int) -> Factor:
 
 
 def _to_sides_of_faces(grid: Grid, axis: int, on_faces: bool) -> Factor:
-    """Return the factor from faces, or from cells, to the sides of the control volumes of faces along their own axis.
+    """Return the 1-D matrix from faces, or from cells, to the sides of the control volumes of faces along their axis.
 
     These sides are the cell centres and, on a bounded axis, the walls.
     """
