@@ -1,17 +1,18 @@
-"""Instruments beside the core: pictures, certificates, measurements, and the demo.
+"""Plots, error estimates, measurements of work and run time, stress tests, and the demo.
 
-explain.py           explain: the work of one gradient, and the work that was skipped
-certificate.py       certify: the error that solves leave, from recorded solves
+explain.py           explain: count the work of one gradient, and list the work that was skipped
+certificate.py       certify: estimate the error of value and gradient due to inexact solves
 work_precision.py    work_precision: error against run time
-stress_table.py      stress: one word for each extreme case
-stress_cases.py      the table of those cases, and the functions that grade what comes out
-stability.py         the growth factor of a time step, and its map
-plots.py             pictures of fields and charts, files of a result; all of matplotlib
-scene_file.py        a scene in a file that is named on the command line
-scene_report.py      all instruments on it in one folder (the command `report`)
+stress_table.py      stress: run a loss for extreme parameter values, and grade each case
+stress_cases.py      the list of these cases, and the functions that grade their results
+stability.py         growth factors of a time step, and the stability map
+plots.py             plots of fields and results; the only module that imports matplotlib
+html_page.py         the report as an HTML page
+scene_file.py        load a loss and a point from a file that is named on the command line
+scene_report.py      write a report with all these results to a folder (the command `report`)
 demo/                the command `demo`
 
-It may import all packages; only __main__ and the public window import it.
+This package may import all other packages. Only __main__ and the top-level namespace of sparsedp import it.
 """
 
 from sparsedp._utils.calls import describe_module

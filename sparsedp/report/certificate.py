@@ -1,12 +1,14 @@
-"""The error that solves leave in value and gradient: estimated (`certify`), or as large as allowed (`certified`).
+"""The error of value and gradient due to inexact solves: `certify` estimates it, and `certified` controls it.
 
-A run of the loss records its solves, forward and adjoint. A second run starts each from its recorded solution x. With
-r = b - A x its residual, A^-1 r is its error; solved to the share s, it removes all but s of that error. Data b' that
-have changed a little are followed by solving for b' - A x; to follow the data and keep the error, the old residual is
-subtracted first: b' - A x - r. The difference of two such runs is the error of the first, up to s.
+A first run of the loss records all forward and adjoint solves. A second run corrects each recorded solution x. The
+error of x is A^-1 r with the residual r = b - A x. To solve this equation with relative tolerance s, and to add the
+result to x, reduces the error by the factor s. If the right-hand side has changed a little, to b', the correction
+solves for b' - A x instead. To keep the error of a solve and only update its right-hand side, the old residual is
+subtracted, so that the correction solves for b' - A x - r. The difference between a run with corrected errors and a
+run with kept errors is the error of the first run, up to the relative tolerance s.
 
-The value inside `minimize` is corrected by the sum of y . r over all solves, with the remaining forward residual r
-and the adjoint solution y, which is the derivative of the loss with respect to a residual.
+Inside `minimize`, the value is also corrected by the sum of y . r over all solves. Here r is the remaining forward
+residual, and y is the adjoint solution, which is the derivative of the loss with respect to the residual.
 
 References
 ----------
@@ -36,21 +38,21 @@ from sparsedp.solvers.scaling import length
 
 __all__ = ["Certificate", "Certified", "certified", "certify", "distance"]
 
-TARGET = 0.01  # error of the gradient that the advice is about
-SHARE = 0.01  # of its error that a corrected solution keeps
-ROUNDING_ERROR = 1e-13  # relative errors below this are those of rounding, not of solves
-LOOSEST_ADVICE = 0.1  # tolerance that is advised
+TARGET = 0.01  # default target of `certify`: relative error of the gradient
+SHARE = 0.01  # relative tolerance of a correction
+ROUNDING_ERROR = 1e-13  # relative errors below this are due to rounding, not to solves
+LOOSEST_ADVICE = 0.1  # largest tolerance that the advice suggests
 COLUMNS = ("solver", "rtol", "forward", "forward residual", "adjoint", "adjoint residual", "error")
 SMALLEST_SHARE = 0.05  # relative tolerance of a correction inside minimize
 LARGEST_SHARE = 0.5
-MOST_CORRECTIONS = 20  # of one evaluation
+MOST_CORRECTIONS = 20  # for one evaluation
 ROUNDING_OF_VALUE = 1e-14
 
 
 def distance(one: Any, other: Any, unit: Any = None) -> float:
-    """Return the Euclidean distance of two trees, relative to `unit`, by default the second tree.
+    """Return the Euclidean distance of two trees, divided by the norm of `unit` (default: of the second tree).
 
-    Leaves that are None count for nothing.
+    Leaves that are None are ignored.
     """
     advice = "; give compare=function(result, exact)"
     matched = paired(one, other, "result", " of work_precision", advice, shapes=True, error=ValueError)
@@ -60,11 +62,11 @@ def distance(one: Any, other: Any, unit: Any = None) -> float:
 
 # ---------------------------------------------------------------- recorded solves
 
-SolveKey = tuple[str, str, int]  # name of the solver, "forward" or "adjoint", and the number of the solve among these
+SolveKey = tuple[str, str, int]  # solver name, "forward" or "adjoint", and number of the solve
 
 
 class RecordedSolve(NamedTuple):
-    """One solve.
+    """The solution and the residual of one solve.
 
     Attributes
     ----------
@@ -73,7 +75,7 @@ class RecordedSolve(NamedTuple):
     size : float
         Norm of the right-hand side.
     rtol : float
-        The tolerance it was asked for.
+        The requested relative tolerance.
     iterative : bool
     """
 
@@ -90,24 +92,25 @@ def _always(key: SolveKey) -> bool:
 
 
 class RecordedSolves(dict[SolveKey, RecordedSolve]):
-    """The solves of a run by key; during the run, their observer.
+    """A dict of the recorded solves of a run. During the run, solvers call its methods to compute their solutions.
 
-    A root and its Jacobian have one name.
+    A nonlinear solve and the solves with its Jacobian are recorded under the same name.
 
     Parameters
     ----------
     earlier : dict, optional
-        Solves of an earlier run: each is the start of the same solve.
+        Solves of an earlier run. Each solve starts from the earlier solution with the same key.
     correct : callable or None
-        ``correct(key)``: whether the error of the solution is removed, or kept. Default: always removed.
-        None: the solutions are taken as they are, without a solve, and what was not recorded is solved to `share`.
+        ``correct(key)`` returns True if the error of the earlier solution is to be corrected, and False if it is to be
+        kept. By default all solutions are corrected. With None, earlier solutions are reused without a solve, and all
+        other solves are done with relative tolerance `share`.
     share : float
         Relative tolerance of each correction.
 
     Attributes
     ----------
     iterations : int
-        Of all solves of the run.
+        Number of iterations of all solves of the run.
     """
 
     def __init__(
@@ -127,7 +130,7 @@ class RecordedSolves(dict[SolveKey, RecordedSolve]):
         """Return function(x), with its solves recorded."""
         thread.solve_hooks.append(self)
         try:
-            with recording() as calls, unwarned():  # a second run would mix its solves with the recorded ones
+            with recording() as calls, unwarned():  # unwarned: its second run would record the solves twice
                 return function(x)
         finally:
             thread.solve_hooks.pop()
@@ -169,7 +172,7 @@ class RecordedSolves(dict[SolveKey, RecordedSolve]):
         return x
 
     def _next_key(self, name: str, kind: str) -> SolveKey:
-        """Return the key of a solve that begins."""
+        """Return the key of the next solve, and count it."""
         number = self._numbers[name, kind]
         self._numbers[name, kind] += 1
         return name, kind, number
@@ -181,7 +184,7 @@ class RecordedSolves(dict[SolveKey, RecordedSolve]):
         solve: Callable[[], NDArray[Any]],
         corrected: Callable[[NDArray[Any], Any], NDArray[Any]],
     ) -> NDArray[Any]:
-        """Return the solution of ``solve()``, or the earlier one, ``corrected(x, residual to keep)``."""
+        """Return ``solve()`` if there is no earlier solution, else the earlier one, corrected as `correct` decides."""
         earlier = self.earlier.get(key)
         if earlier is None or earlier.x.size != size:
             return solve()
@@ -192,9 +195,9 @@ class RecordedSolves(dict[SolveKey, RecordedSolve]):
         return corrected(earlier.x, earlier.residual)
 
     def correction(self) -> float:
-        """Return the sum of y . r over the forward solves; 0 when there is one without its adjoint solve.
+        """Return the sum of y . r over all forward solves; 0 if a forward solve has no adjoint solve.
 
-        They are paired by order: the last solve of the forward pass is the first one of the backward pass.
+        Solves are paired by their order: the last solve of the forward pass is the first one of the backward pass.
         """
         products = [0.0]
         for (name, kind, number), solve in self.items():
@@ -211,29 +214,29 @@ class RecordedSolves(dict[SolveKey, RecordedSolve]):
 
 
 def certify(loss: Callable[[Any], Any], x: Any, target: float = TARGET) -> Certificate:
-    """Estimate the errors of value and gradient that inexact solves leave.
+    """Estimate the errors of value and gradient that are due to inexact solves.
 
     Parameters
     ----------
     loss : callable
-        ``loss(x) -> real scalar``, with any number of solves: `inverse`, `elliptic_solver`, `matrix_solver`,
-        `implicit`. Deterministic.
+        ``loss(x) -> real scalar``. It must be deterministic, and may contain any number of solves by `inverse`,
+        `elliptic_solver`, `matrix_solver` or `implicit`.
     x : array, number, or any nesting of them in tuples, lists and dicts
     target : float
-        Relative error of the gradient that the advice is about, 0 < target < 1.
+        Relative error of the gradient for which the advice is given, 0 < target < 1.
 
     Returns
     -------
     Certificate
-        `.value`, `.gradient` as the loss gives them; their estimated errors `.value_error` (absolute, with a sign) and
-        `.gradient_error` (relative to the norm of the gradient); `.corrected_value`, `.corrected_gradient`; `.causes`:
-        relative error of the gradient from the forward and from the adjoint solves; `.solves`: one dict for each
-        solver; `.advice`: one line. str() is the table.
+        It has the attributes `.value` and `.gradient`; their estimated errors `.value_error` (absolute, with sign) and
+        `.gradient_error` (relative to the norm of the gradient); `.corrected_value` and `.corrected_gradient`;
+        `.causes`, the relative errors of the gradient due to forward and due to adjoint solves; `.solves`, one dict for
+        each solver; and `.advice`, one sentence. str() returns a table.
 
     Raises
     ------
     ValueError
-        If `target` is not between 0 and 1. All that the loss raises passes through.
+        If `target` is not between 0 and 1. Exceptions of the loss are not caught.
 
     See Also
     --------
@@ -241,11 +244,13 @@ def certify(loss: Callable[[Any], Any], x: Any, target: float = TARGET) -> Certi
 
     Notes
     -----
-    Cost: one gradient, two loose correction solves (relative residual 1e-2) for each pair of solves, one more
-    forward correction for the value, one more adjoint correction for the split by cause, and for the split by solve
-    as many again where there are several solvers. Norm: Euclidean over all leaves. Errors of discretisation and of
-    rounding are not seen; below 1e-13 the estimate is rounding. A derivative or transpose that is wrong is not seen
-    either: `check.gradient` looks for those. A solve that is unrolled on the tape is exact by its own definition.
+    **Cost.** One gradient without corrections; then one run of the gradient, in which each solve is corrected with
+    relative tolerance 1e-2, and one such run to separate the causes; if there are several solvers, one such run for
+    each of them; and one run of the loss for the corrected value.
+
+    **Limits.** The norm is Euclidean over all leaves. The estimate does not contain errors of discretisation or of
+    rounding, and an estimate below 1e-13 is itself due to rounding. Wrong derivatives and wrong transposes are not
+    detected; use `check.gradient` for them. A solve whose iterations are recorded on the tape counts as exact.
 
     Examples
     --------
@@ -280,7 +285,7 @@ def certify(loss: Callable[[Any], Any], x: Any, target: float = TARGET) -> Certi
         if len(names) > 1:
             share = distance(corrected_gradient(partial(_is_of_solver, name)), gradient)
         rows.append(_row(name, share, solves))
-    # A value needs a second correction: the first one shows its error, the second one the error of the correction.
+    # The corrected value comes from a second correction, which also reduces the error that the first one left.
     best_value = RecordedSolves(corrected_solves).run(loss, x)
     return Certificate(
         value=value,
@@ -297,12 +302,12 @@ def certify(loss: Callable[[Any], Any], x: Any, target: float = TARGET) -> Certi
 
 
 def _is_of_solver(name: str, key: SolveKey) -> bool:
-    """Return whether a solve is one of a solver."""
+    """Return whether a key belongs to the solver with this name."""
     return key[0] == name
 
 
 def _row(name: str, error: float, solves: RecordedSolves) -> dict[str, Any]:
-    """Return what is known about one solver, from its solves forward and adjoint."""
+    """Return the row of one solver: numbers of forward and adjoint solves, their largest residuals, and the error."""
     own = [solve for key, solve in solves.items() if key[0] == name]
     row: dict[str, Any] = {
         "solver": name,
@@ -319,7 +324,7 @@ def _row(name: str, error: float, solves: RecordedSolves) -> dict[str, Any]:
 
 
 def _advice(error: float, causes: dict[str, float], rows: list[dict[str, Any]], target: float) -> str:
-    """Return one line: what to change for the target."""
+    """Return a sentence that says which tolerance to change to reach the target."""
     iterative = [row for row in rows if row["iterative"]]
     if not iterative:
         return "all solves are direct: nothing to change"
@@ -355,15 +360,16 @@ class Certificate(Result):
     causes : dict
         Relative error of the gradient from forward and from adjoint solves.
     solves, rows : list of dict
-        solver, rtol, error (its share), iterative, forward and adjoint (numbers of solves), their largest
-        relative residuals.
+        One dict for each solver: name, rtol, relative error of the gradient due to this solver, whether it is
+        iterative, numbers of forward and adjoint solves, and their largest relative residuals.
     advice : str
+        Which tolerance to change.
     """
 
     _plain = ("value", "corrected_value", "value_error", "gradient_error", "causes", "solves", "advice")
 
     def parts(self) -> list[str | Table]:
-        """Return errors of value and gradient, a row for each solver, the advice."""
+        """Return the errors of value and gradient, the table of solvers, and the advice."""
         causes = ", ".join(f"{error:.1e} from {name}" for name, error in self.causes.items())
         return [
             f"value {self.value:.9g}, off by about {self.value_error:.1e} (absolute); "
@@ -378,26 +384,27 @@ class Certificate(Result):
 
 
 def certified(fraction: float = 0.1, tolerance: float = 1e-8) -> Certified:
-    """Return a tolerance for `minimize` that also chooses how far solves go.
+    """Return a tolerance for `minimize` that also controls the accuracy of the solves in the loss.
 
     Parameters
     ----------
     fraction : float
-        Largest error of the gradient relative to itself, and of the value relative to its change
-        since the last step, 0 < fraction < 1.
+        Largest relative error of the gradient, and largest error of the value relative to its change since the last
+        step, 0 < fraction < 1.
     tolerance : float
-        As in `minimize`: converged when the norm of the gradient has fallen by this factor.
+        As in `minimize`: the run has converged when the norm of the gradient has decreased by this factor.
 
     Returns
     -------
     Certified
-        For one run: ``minimize(loss, start, tolerance=dp.certified(0.1))``. Afterwards `.iterations`, `.evaluations`
-        and `.passes` are the counts, str() says it all.
+        Use it for one run only: ``minimize(loss, start, tolerance=dp.certified(0.1))``. After the run, `.iterations`,
+        `.evaluations` and `.passes` are the counts of work, and str() summarizes them.
 
     Raises
     ------
     ValueError
-        If `fraction` or `tolerance` is out of range, or a gradient is given to `minimize`: its solves are not seen.
+        If `fraction` or `tolerance` is out of range. `minimize` raises it if it is called with a gradient, because the
+        solves of a given gradient cannot be controlled.
 
     See Also
     --------
@@ -405,8 +412,8 @@ def certified(fraction: float = 0.1, tolerance: float = 1e-8) -> Certified:
 
     Notes
     -----
-    The tolerances of the solvers themselves are not used. Methods that need more than value and gradient are not
-    supported.
+    The tolerances of the solvers themselves are ignored. Methods of `minimize` that need more than value and gradient
+    are not supported.
 
     Examples
     --------
@@ -420,23 +427,23 @@ def certified(fraction: float = 0.1, tolerance: float = 1e-8) -> Certified:
     (True, True)
     """
     fraction = check_number("fraction of certified", fraction, "between 0 and 1", "; write for example certified(0.1)")
-    if not (is_number(tolerance) and tolerance == np.inf):  # as in minimize: any gradient meets an infinite one
+    if not (is_number(tolerance) and tolerance == np.inf):  # infinity is allowed, as in minimize
         check_number("tolerance of certified", tolerance, ">= 0", "; the default is 1e-8")
     return Certified(fraction, float(tolerance))
 
 
 class Certified:
-    """A tolerance that takes part in the evaluations of `minimize`. Returned by `certified`, for one run.
+    """A tolerance for one run of `minimize` that controls the solves in each evaluation. Returned by `certified`.
 
-    An evaluation starts from the solutions of the last one and corrects them by loose solves until value and
-    gradient change by less than the allowed error. What it returns is the last corrected one: its error is about the
-    share that corrections leave, times the last change. The value is corrected by y . r, which leaves an error of
-    second order: a line search compares values that differ by little.
+    Each evaluation starts from the solutions of the previous evaluation. It corrects them by solves with a loose
+    tolerance until value and gradient change by less than the allowed error. The error of the last correction is about
+    the tolerance of the correction times the last change. The value is also corrected by y . r, so that its error is of
+    second order. This is necessary because a line search compares values that differ only a little.
 
     Attributes
     ----------
     evaluations, iterations, passes : int
-        Evaluations, iterations of all solves, and runs of the loss.
+        Numbers of evaluations, of iterations of all solves, and of runs of the loss.
     """
 
     def __init__(self, fraction: float, tolerance: float) -> None:
@@ -446,9 +453,9 @@ class Certified:
         self.evaluations = 0
         self.iterations = 0
         self.passes = 0
-        self._last_value: float | None = None  # of the last step
+        self._last_value: float | None = None  # value at the last step
         self._gradient: Any = None
-        self._solves: dict[SolveKey, RecordedSolve] = {}  # of the last evaluation
+        self._solves: dict[SolveKey, RecordedSolve] = {}  # solves of the last evaluation
 
     def __call__(self, record: Any, first: Any) -> bool:
         """Return whether the run has converged."""
@@ -456,7 +463,7 @@ class Certified:
         return record.gradient_norm <= self.tolerance * first.gradient_norm
 
     def inside(self, loss: Callable[[Any], Any], gradient: Any) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
-        """Return the loss and the gradient that `minimize` is to use, in this order at every point."""
+        """Return the loss and the gradient for `minimize`, which must call them in this order at every point."""
         if gradient is not None:
             raise ValueError("certified sees the solves of the loss, not of a gradient that is given; leave it out")
         value_and_gradient = value_and_grad(loss)
@@ -468,8 +475,9 @@ class Certified:
         return value, lambda x: self._gradient
 
     def _evaluate(self, value_and_gradient: Callable[[Any], Any], x: Any) -> tuple[float, Any]:
-        """Return value and gradient with corrected solves."""
-        # The first pass has no correction and takes no solve: the change by the next one tells its error.
+        """Return value and gradient, with solves corrected until both are accurate enough."""
+        # The first pass reuses the solutions of the last evaluation without solves. The change from this pass to the
+        # next one shows the error.
         value, gradient = self._pass(value_and_gradient, x, RecordedSolves(self._solves, None, self.share))
         self.evaluations += 1
         if not any(solve.iterative for solve in self._solves.values()):
@@ -484,7 +492,7 @@ class Certified:
         return value, gradient
 
     def _pass(self, value_and_gradient: Callable[[Any], Any], x: Any, solves: RecordedSolves) -> tuple[float, Any]:
-        """Run the loss once with these solves."""
+        """Run value and gradient once with `solves`, and keep them. The value is corrected by y . r."""
         value, gradient = solves.run(value_and_gradient, x)
         self._solves = dict(solves)
         self.passes += 1
@@ -492,7 +500,10 @@ class Certified:
         return value + solves.correction(), gradient
 
     def _is_close(self, value: float, gradient: Any, new_value: float, new_gradient: Any) -> bool:
-        """Return whether the error of the new value and gradient, share / (1 - share) times the change, is allowed."""
+        """Return whether the error of the new value and gradient is small enough.
+
+        The error is estimated by share / (1 - share) times the change by the last correction.
+        """
         remainder = self.share / (1.0 - self.share)
         if self._last_value is None:
             progress = abs(new_value)

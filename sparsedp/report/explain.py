@@ -1,4 +1,4 @@
-"""explain: the work of one run of a loss and its gradient, and the work it skipped. Counted, not estimated."""
+"""explain: count the work of one run of a loss and its gradient, and list the work that was skipped."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = ["Plan", "explain", "total"]
 
 EXTRAS = {"numba": "compiled kernels", "pyamg": "multigrid", "matplotlib": "pictures", "tqdm": "bars"}
 COLUMNS = ("forward", "vjp", "jvp", "solve", "adjoint", "setup", "reused", "iterations", "assembled")
-TOTALS = {  # name of a sum: kinds of calls
+TOTALS = {  # name of a total: the kinds of calls that it adds up
     "applications": ("forward", "vjp", "jvp"),
     "forward solves": ("solve",),
     "adjoint solves": ("adjoint",),
@@ -42,37 +42,37 @@ TOTALS = {  # name of a sum: kinds of calls
 
 @dataclass
 class _ForwardPass:
-    """What is known at the end of the forward pass."""
+    """Counts and times at the end of the forward pass."""
 
-    end: float  # when it ended [s]
+    end: float  # time at the end of the loss [s]
     nodes: int
     tape_bytes: int
     calls: Calls
-    resumed: float  # when the bytes were counted [s]
+    resumed: float  # time after the bytes on the tape were counted [s]
 
 
 def explain(loss: Callable[[Any], Any], x: Any, gradient: bool = True) -> Plan:
-    """Count the calls of one run of a loss and its gradient, and list the work that it skips.
+    """Count the work of one run of a loss and its gradient, and list the work that was skipped.
 
     Parameters
     ----------
     loss : callable
-        ``loss(x) -> real scalar``. It is called once, and its gradient is taken once.
+        ``loss(x) -> real scalar``. It is called once, with one backward pass.
     x : array, number, or any nesting of them in tuples, lists and dicts
     gradient : bool
-        False: only the value is computed, and nothing is taped.
+        If False, only the value is computed, and nothing is recorded on the tape.
 
     Returns
     -------
     Plan
-        str() is the plan. `.counts`: dict of calls by (name, kind), a kind that never happened counts 0;
-        `.totals`: dict of their sums in words; `.skipped`: list of sentences; `.rows`: one dict for each
-        operator, rule and solve; `.to_dict()`: all of it as plain data.
+        It has the attributes `.counts`, the numbers of calls by (name, kind), which are 0 for all other keys;
+        `.totals`, their totals by name; `.skipped`, a list of sentences; and `.rows`, one dict for each operator, rule
+        and solver. `.to_dict()` returns plain data, and str() returns a table.
 
     Raises
     ------
     DerivativeError
-        If x has no floating leaf. All that the loss raises passes through.
+        If `x` has no floating leaf. Exceptions of the loss are not caught.
     ShapeError
         If the loss is not a scalar.
 
@@ -82,14 +82,16 @@ def explain(loss: Callable[[Any], Any], x: Any, gradient: bool = True) -> Plan:
 
     Notes
     -----
-    Kinds: forward, vjp, jvp (applications of operators and rules); solve, adjoint (each solve), iterations,
-    setup, reused (solves that found their set-up ready), hierarchy, assembled (matrices that were built),
-    skipped (solves with nothing to solve); recomputed (steps of time loops). What was set up before the
-    loss ran is not counted: it is reused. Seconds are without those of the calls inside. What other threads do
-    meanwhile is not counted either, those that the loss starts included.
-    Bytes on the tape: all arrays that its nodes keep between the forward and the backward pass, each once.
-    Of distributed fields, exchanges between blocks and reductions to one number are counted, and the bytes of the
-    exchanges of all processes together; messages inside a linear solve are not. All processes have the same counts.
+    The kinds of calls are: forward, vjp and jvp (applications of operators and rules); solve and adjoint (forward and
+    adjoint solves); iterations (of solvers); setup and reused (solves that computed or reused a set-up); hierarchy
+    (multigrid hierarchies built); assembled (matrices built); skipped (solves with a zero right-hand side); recomputed
+    (time steps run again in the backward pass).
+
+    A set-up that was computed before the loss ran is counted as reused. The seconds of a call do not include the calls
+    inside it. Calls in other threads are not counted, not even in threads that the loss starts. The bytes on the tape
+    are those of all arrays that the tape keeps between the forward and the backward pass, each counted once. For
+    distributed fields, the counts include exchanges between ranks, their bytes (the sum over all ranks), and
+    reductions, but not the messages inside a linear solve. All ranks have the same counts.
 
     Examples
     --------
@@ -141,43 +143,46 @@ def explain(loss: Callable[[Any], Any], x: Any, gradient: bool = True) -> Plan:
 
 
 def total(calls: Any, *kinds: str) -> Any:
-    """Return the sum of the counts (or seconds) of these kinds over all names."""
+    """Return the sum of the counts (or seconds) of the given kinds over all names."""
     return sum(count for (_, kind), count in calls.items() if kind in kinds)
 
 
 class Plan(Result):
-    """The result of `explain`. Frozen.
+    """The result of `explain`. Immutable.
 
     Attributes
     ----------
     value : float
         The loss.
     counts : dict
-        Calls by (name, kind).
+        Number of calls by (name, kind).
     totals : dict
-        Their sums in words.
+        Sums of the counts, by name.
     skipped : list of str
+        Sentences about work that was not needed.
     rows : list of dict
-        name, form or method, counts and seconds of each operator, rule and solve, in the order of first use.
+        One dict for each operator, rule and solver, in the order of first use: name, counts, seconds, and the form of
+        the operator or the method of the solver.
     tape_nodes, tape_bytes : int
-        Calls that the tape holds after the forward pass, and bytes of the arrays they keep.
+        Number of calls on the tape after the forward pass, and bytes of the arrays that they keep.
     recomputation : float
-        Steps that ran, those run again included, over steps; 1.0 without time loops.
+        Number of time steps that were run, including recomputed ones, divided by the number of time steps; 1.0 if there
+        are no time loops.
     seconds : (float, float)
-        Forward with taping, backward.
+        Run times of the forward pass (with recording) and of the backward pass.
     """
 
     _plain = ("value", "totals", "skipped", "rows", "tape_nodes", "tape_bytes", "recomputation", "seconds")
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the plan as plain numbers, strings, lists and dicts; counts nested by name and kind."""
+        """Return the plan as plain numbers, strings, lists and dicts. Counts are nested by name and kind."""
         counts: dict[str, dict[str, int]] = {}
         for (name, kind), count in self.counts.items():
             counts.setdefault(name, {})[kind] = count
         return super().to_dict() | {"counts": counts}
 
     def parts(self) -> list[str | Table]:
-        """Return the sums, a row for each name, and what was skipped."""
+        """Return the title line, the table with one row for each name, the skipped work, and the totals."""
         forward, backward = self.seconds
         rows = [{name: value or None for name, value in row.items()} for row in self.rows]
         sums = ", ".join(f"{count} {name}" for name, count in self.totals.items() if count)
@@ -191,7 +196,7 @@ class Plan(Result):
 
 
 def _rows(calls: Calls) -> list[dict[str, Any]]:
-    """Return one dict for each name that was called, in the order of first use."""
+    """Return one dict for each operator, rule and solver that was called, in the order of first use."""
     rows = []
     for name in dict.fromkeys(name for name, _ in calls):
         counts = {kind: calls[name, kind] for kind in COLUMNS}
@@ -202,7 +207,7 @@ def _rows(calls: Calls) -> list[dict[str, Any]]:
 
 
 def _form_or_method(calls: Calls, name: str) -> str:
-    """Return the form of an operator, or the method of a solve with its reason."""
+    """Return the form of an operator, or the method of a solver and why it was chosen."""
     words = list(calls.notes.get((name, "method"), ()))
     for actor in calls.actors.get(name, {}).values():
         if hasattr(actor, "engine"):
@@ -213,7 +218,7 @@ def _form_or_method(calls: Calls, name: str) -> str:
 
 
 def _is_applied(actor: Any) -> bool:
-    """Return whether an actor is an operator that is applied, not solved with."""
+    """Return whether an object that was called is an operator, but not an inverse."""
     return isinstance(actor, Operator) and not hasattr(actor, "solver")
 
 
@@ -221,7 +226,7 @@ def _is_applied(actor: Any) -> bool:
 
 
 def _skipped_derivatives_of_x(x: Any, gradient: bool) -> Iterator[str]:
-    """Say which derivatives of the loss were not computed."""
+    """Yield sentences about derivatives of the loss that were not computed."""
     constants = sum(not is_variable(leaf) for leaf in leaves(x))
     if not gradient:
         yield "the gradient: not asked, nothing taped"
@@ -230,7 +235,7 @@ def _skipped_derivatives_of_x(x: Any, gradient: bool) -> Iterator[str]:
 
 
 def _skipped_work(calls: Calls, forward_calls: Calls, gradient: bool) -> Iterator[str]:
-    """Say which derivatives, matrices, hierarchies and solves were not needed."""
+    """Yield sentences about derivatives, matrices, hierarchies and solves that were not needed."""
     for (name, what), facts in calls.notes.items():
         if what == "not asked":
             yield f"derivative of {name} in {', '.join(map(str, facts))}: not asked"
@@ -255,15 +260,15 @@ def _skipped_work(calls: Calls, forward_calls: Calls, gradient: bool) -> Iterato
 
 
 def _skipped_pullbacks(calls: Calls, forward_calls: Calls) -> Iterator[str]:
-    """Say whose VJP was never called."""
+    """Yield a sentence about each operator or rule whose VJP was never called."""
     for name, kind in forward_calls:
-        transposed = calls[f"{name}.T", "forward"]  # a VJP of an operator that is not on a tape
+        transposed = calls[f"{name}.T", "forward"]  # counts transposes applied outside the tape
         if kind == "forward" and not calls[name, "vjp"] + calls[name, "jvp"] + transposed:
             yield f"VJP of {name}: never called, its argument does not depend on x ({calls[name, kind]} calls)"
 
 
 def _skipped_by_operator(calls: Calls, name: str, operator: Operator) -> Iterator[str]:
-    """Say what an operator did not assemble or compute."""
+    """Yield sentences about matrices that were not assembled and applications that were mere copies."""
     if operator.form == "matrix-free" and not calls[name, "assembled"]:
         yield f"matrix of {name}: not assembled, applied without one"
     if operator.structure.is_identity:
@@ -271,7 +276,7 @@ def _skipped_by_operator(calls: Calls, name: str, operator: Operator) -> Iterato
 
 
 def _skipped_by_solver(calls: Calls, name: str, solver: Any) -> Iterator[str]:
-    """Say what a solver did not build or solve."""
+    """Yield sentences about hierarchies, set-ups and adjoint solves that a solver did not need."""
     if not solver.engine.hierarchical:
         yield f"multigrid hierarchy for {name}: not built, {solver.engine.method} needs none"
     if not calls[name, "setup"]:
@@ -281,7 +286,7 @@ def _skipped_by_solver(calls: Calls, name: str, solver: Any) -> Iterator[str]:
 
 
 def _skipped_extras() -> Iterator[str]:
-    """Say which extras this process has not imported."""
+    """Yield a sentence about each optional library that this process has not imported."""
     for name, use in EXTRAS.items():
         if name not in sys.modules:
             if find_spec(name):

@@ -1,4 +1,4 @@
-"""The report as one page of HTML: it needs no other file and no network."""
+"""The report as one self-contained HTML page, which needs no other file and no network."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ figure { margin: 1rem 0; } img, svg { max-width: 100%; height: auto; } img { bac
 figcaption { font-size: 0.9rem; }
 """
 
-# A click on the name of a column sorts its table by it: numbers by size, words by letters, what is empty last.
+# A click on the header of a column sorts the table by this column. Empty cells are sorted last.
 SORTING = """
 for (const table of document.querySelectorAll("table")) {
   table.querySelectorAll("th").forEach((head, column) => {
@@ -56,7 +56,7 @@ for (const table of document.querySelectorAll("table")) {
 
 
 def section(title: str, result: Result, files: Sequence[Path], caption: str) -> str:
-    """Return a result as HTML with its picture, the PNG among its files or a plainer one, and a caption."""
+    """Return a result as HTML with a caption and a picture: the PNG among its files, or else a simple SVG."""
     picture = ""
     for path in files:
         if path.suffix == ".png":
@@ -77,9 +77,9 @@ def page(title: str, verdict: str, meaning: str, sections: Sequence[str], skippe
     Parameters
     ----------
     title, verdict, meaning : str
-        The meaning is a sentence about the verdict.
+        `meaning` is a sentence that explains the verdict.
     sections : sequence of str
-        From `section`.
+        Results of `section`.
     skipped : sequence of str
         Sentences about what was skipped.
     """

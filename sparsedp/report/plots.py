@@ -1,4 +1,4 @@
-"""Pictures of fields, charts of measurements. The only file of the package that imports matplotlib (extra `plot`)."""
+"""Plots of fields and of results. Only this module of sparsedp imports matplotlib (extra `plot`)."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ __all__ = [
     "write_result",
 ]
 
-MOST_ARROWS = 24  # along an axis of a face field
-MOST_MARKERS = 64  # points of a line that are marked
-LARGEST_FACTOR = 2.0  # growth factor at the red end of the colours
-MOST_TICKS = 6  # labels along a logarithmic axis; more overlap where three charts stand side by side
+MOST_ARROWS = 24  # largest number of arrows along an axis
+MOST_MARKERS = 64  # lines with more points have no markers
+LARGEST_FACTOR = 2.0  # growth factor at the red end of the colour map
+MOST_TICKS = 6  # labels along a logarithmic axis; more would overlap in three plots side by side
 
 
 def plot(
@@ -54,23 +54,24 @@ def plot(
     cmap: str = "viridis",
     at: str | None = None,
 ) -> Any:
-    """Draw a field on a grid: axis 0 is x, axis 1 is y, lengths are to scale.
+    """Plot a field on a grid. Axis 0 is x, axis 1 is y, and both have the same scale.
 
     Parameters
     ----------
     grid : Grid
     u : array, a field on cells, faces or nodes [unit]
-        1-D: a line. 2-D: a map; a face field is its magnitude, with arrows. 3-D: the three middle slices.
+        A 1-D field is plotted as a line, a 2-D field as a colour map, and a 3-D field as three slices through the
+        middle. Of a face field the magnitude is shown, and in 2-D also arrows.
     ax : matplotlib Axes, optional
-        Where to draw. Default: the current axes of pyplot.
+        Axes to draw on. Default: the current axes of pyplot.
     title, label : str, optional
-        Above the picture; beside the colour bar (in 1-D: the vertical axis).
+        Title of the plot, and label of the colour bar (in 1-D: of the vertical axis).
     limits : (float, float), optional
-        The values at the ends of the colour bar. Give two pictures the same limits to compare them.
+        The values at the ends of the colour bar. Use the same limits for plots that are to be compared.
     cmap : str
         Name of a matplotlib colour map.
     at : "cells", "faces" or "nodes", optional
-        Where the numbers live, when the shape alone does not tell (cells before faces before nodes).
+        The space of the field. Default: the first of these spaces whose shape matches.
 
     Returns
     -------
@@ -115,17 +116,17 @@ def plot(
     views = [(ax, values, [0, 1])]
     if grid.dim == 3:
         views = list(_middle_slices(grid, values, kind, ax))
-    # pcolormesh takes nodes, or the ends of cells
+    # pcolormesh needs the positions of the nodes, or the ends of the cells.
     if kind == "nodes":
         places = "nodes"
     else:
         places = "ends"
     for view, part, axes in views:
         lines = [grid.coordinates(axis, places) for axis in axes]
-        # pcolormesh has rows along y, so the array is transposed.
+        # pcolormesh expects rows along y, so the array is transposed.
         image = view.pcolormesh(*lines, part.T, shading="auto", vmin=low, vmax=high, cmap=cmap, rasterized=True)
         view.set(aspect="equal", xlabel=grid.axes[axes[0]], ylabel=grid.axes[axes[1]])
-    bar = ax.inset_axes((1.03, 0.0, 0.04, 1.0))  # as high as the map, whatever its shape
+    bar = ax.inset_axes((1.03, 0.0, 0.04, 1.0))  # as high as the plot, for every aspect ratio
     ax.figure.colorbar(image, cax=bar, label=label or "")
     if components and grid.dim == 2:
         strides = tuple(slice(n // MOST_ARROWS // 2, None, -(-n // MOST_ARROWS)) for n in grid.shape)
@@ -142,23 +143,23 @@ def animate(
     cmap: str = "viridis",
     rate: float = 12,
 ) -> None:
-    """Write frames of a field as an animated GIF.
+    """Write an animated GIF of a sequence of fields.
 
     Parameters
     ----------
     grid : Grid
     frames : sequence of arrays
-        Fields that `plot` draws.
+        Fields as for `plot`.
     path : str, Path or binary stream
     title, limits, cmap
-        As in `plot`; the limits hold for all frames.
+        See `plot`. The limits are the same for all frames.
     rate : float
-        Frames a second.
+        Frames per second.
 
     Raises
     ------
     ValueError
-        If there is no frame.
+        If `frames` is empty.
     ShapeError
         If a frame is not a field on the grid.
     ImportError
@@ -201,9 +202,10 @@ def animate(
 def _scalar_field(
     grid: Grid, u: NDArray[Any], at: str | None = None
 ) -> tuple[NDArray[Any], str, Sequence[NDArray[Any]]]:
-    """Return the numbers that a map shows, "cells" or "nodes", and the components of a face field.
+    """Return (values, kind, components): what is plotted, its space ("cells" or "nodes"), and a list of components.
 
-    A map of a face field shows its magnitude at the centres of the cells.
+    The values of a face field in 2-D or 3-D are its magnitude at the cell centres, and the components are its
+    components there. For other fields the list of components is empty.
     """
     kinds = [at] if at else ["cells", "faces", "nodes"]
     kind = next((kind for kind in kinds if u.shape == getattr(grid, kind).shape), None)
@@ -214,13 +216,13 @@ def _scalar_field(
         return u, kind, []
     if grid.dim == 1:
         return u, "nodes", []
-    inside = tuple(map(slice, grid.shape))  # the last face of a bounded axis has no neighbour beyond it
+    inside = tuple(map(slice, grid.shape))  # drop the wrapped mean at the last face of a bounded axis
     parts = [0.5 * (part + np.roll(part, -1, axis))[inside] for axis, part in enumerate(grid.split(u))]
     return reduce(np.hypot, parts), "cells", parts
 
 
 def _range(u: NDArray[Any]) -> tuple[float, float]:
-    """Return the least and the largest finite value; 0 and 1 without any."""
+    """Return the smallest and the largest finite value, or (0, 1) if there is no finite value."""
     finite = u[np.isfinite(u)]
     if finite.size:
         return (float(finite.min()), float(finite.max()))
@@ -228,7 +230,7 @@ def _range(u: NDArray[Any]) -> tuple[float, float]:
 
 
 def _middle_slices(grid: Grid, u: NDArray[Any], kind: str, ax: Any) -> Iterator[tuple[Any, NDArray[Any], list[int]]]:
-    """Yield axes, array and its two grid axes of the three middle slices of a 3-D field, side by side."""
+    """Yield (axes, array, two grid axes) for the three middle slices of a 3-D field, side by side."""
     ax.set_axis_off()
     for place, across in enumerate((2, 1, 0)):
         inset = ax.inset_axes((0.35 * place, 0.0, 0.25, 1.0))
@@ -241,7 +243,9 @@ def _middle_slices(grid: Grid, u: NDArray[Any], kind: str, ax: Any) -> Iterator[
 
 
 def unbeaten(points: Sequence[Any]) -> list[Any]:
-    """Return the tuples, each beginning with two costs, that no other one beats in both, by the first cost.
+    """Return the Pareto set of tuples whose first two entries are costs, sorted by the first cost.
+
+    A tuple is in the Pareto set if no other tuple is better in both costs.
 
     Examples
     --------
@@ -256,12 +260,12 @@ def unbeaten(points: Sequence[Any]) -> list[Any]:
 
 
 def curves(lines: Mapping[str, Any], ax: Any, xlabel: str, ylabel: str) -> Any:
-    """Draw named curves on log-log axes, and mark the best points reached at any time.
+    """Plot named curves on log-log axes, with a band through the Pareto set of all points.
 
     Parameters
     ----------
     lines : dict
-        Name -> points (x, y) of positive numbers.
+        Lists of points (x, y) of positive numbers, by name of the curve.
     ax : matplotlib Axes
     xlabel, ylabel : str
 
@@ -277,11 +281,11 @@ def curves(lines: Mapping[str, Any], ax: Any, xlabel: str, ylabel: str) -> Any:
 def _labelled_curves(
     lines: Mapping[str, Any], ax: Any, xlabel: str, ylabel: str, title: str | None = None, xscale: str = "log"
 ) -> Any:
-    """Draw named curves with labels, a grid and a legend."""
+    """Plot named curves with labels, a grid and a legend."""
     for name, points in lines.items():
         ax.plot(*np.reshape(points, (-1, 2)).T, marker=".", markersize=4, linewidth=1, label=name)
     ax.set(xlabel=xlabel, ylabel=ylabel, title=title, xscale=xscale)
-    ax.set_yscale("log", nonpositive="mask")  # 0 has no logarithm, and leaves a gap
+    ax.set_yscale("log", nonpositive="mask")  # leave a gap at 0, which has no logarithm
     _thin_out(ax.xaxis)
     ax.grid(visible=True, color="0.93")
     if ax.lines:
@@ -290,7 +294,7 @@ def _labelled_curves(
 
 
 def _thin_out(axis: Any) -> None:
-    """Label few powers of ten along a logarithmic axis of many decades."""
+    """Limit the number of labels on a logarithmic axis of many decades."""
     low, high = axis.get_view_interval()
     if axis.get_scale() == "log" and np.log10(high / low) > MOST_TICKS:
         ticker = _matplotlib(".ticker")
@@ -299,28 +303,28 @@ def _thin_out(axis: Any) -> None:
 
 
 def convergence(best: Minimum, ax: Any = None, against: str = "iteration") -> Any:
-    """Draw the loss and the gradient norm of a run of `minimize` over iterations, seconds or solves.
+    """Plot loss and gradient norm of a run of `minimize` over iterations, seconds, evaluations or solves.
 
     Parameters
     ----------
     best : Minimum
-        From `minimize`.
+        The result of `minimize`.
     ax : matplotlib Axes, optional
         Default: the current axes of pyplot.
     against : "iteration", "seconds", "evaluations" or "solves"
-        What runs across.
+        The quantity on the horizontal axis.
 
     Returns
     -------
     matplotlib Axes
-        Logarithmic upwards; a loss that is not positive everywhere is drawn as its distance from the least one.
+        The vertical axis is logarithmic. If some values of the loss are not positive, the smallest one is subtracted.
 
     Raises
     ------
     ValueError
-        If `against` is another word.
+        If `against` is none of the four words.
     TypeError
-        If `best` is something else.
+        If `best` is not a result of `minimize`.
     ImportError
         If matplotlib is not installed.
 
@@ -351,15 +355,15 @@ def convergence(best: Minimum, ax: Any = None, against: str = "iteration") -> An
 
 
 def v_curve(audit: Audit, ax: Any = None) -> Any:
-    """Draw |difference - gradient| of an audit over the step, one curve for each direction.
+    """Plot the gap |difference - gradient| of an audit over the step size, with one curve for each direction.
 
-    A right gradient gives a V: the error of the differences falls with the step until rounding lifts it. A
-    wrong one gives a plateau.
+    For a correct gradient the curve is a V: the error of the differences decreases with the step until rounding errors
+    dominate. For a wrong gradient it has a plateau.
 
     Parameters
     ----------
     audit : Audit
-        From `check.gradient`.
+        The result of `check.gradient`.
     ax : matplotlib Axes, optional
         Default: the current axes of pyplot.
 
@@ -370,7 +374,7 @@ def v_curve(audit: Audit, ax: Any = None) -> Any:
     Raises
     ------
     TypeError
-        If it is something else.
+        If `audit` is not a result of `check.gradient`.
     ImportError
         If matplotlib is not installed.
 
@@ -396,7 +400,9 @@ def v_curve(audit: Audit, ax: Any = None) -> Any:
 
 
 def stability_chart(growth: Any, ax: Any) -> Any:
-    """Draw a stability map: growth factor over viscosity (across) and time step (up); refused steps are grey.
+    """Plot a stability map: the growth factor over viscosity (horizontal) and time step (vertical).
+
+    Steps that raise an error are grey.
 
     Parameters
     ----------
@@ -419,7 +425,7 @@ def stability_chart(growth: Any, ax: Any) -> Any:
 
 
 def _ends_between(values: NDArray[Any]) -> NDArray[Any]:
-    """Return the ends of cells around rising positive numbers, equally wide on both sides on a logarithmic axis."""
+    """Return the ends of cells around increasing positive numbers: the midpoints on a logarithmic axis."""
     ends = np.sqrt(values[1:] * values[:-1])
     return np.concatenate([values[:1] ** 2 / ends[:1], ends, values[-1:] ** 2 / ends[-1:]])
 
@@ -428,19 +434,19 @@ def _ends_between(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def figure() -> Any:
-    """Return an empty figure that belongs to no window."""
+    """Return an empty figure that is not registered with pyplot."""
     return _matplotlib(".figure").Figure(figsize=(5.5, 4.4), layout="constrained")
 
 
 def current(ax: Any) -> Any:
-    """Return the axes, or the current ones of pyplot for None."""
+    """Return `ax`, or the current axes of pyplot if `ax` is None."""
     if ax is None:
         return _matplotlib(".pyplot").gca()
     return ax
 
 
 def write_picture(path: Path, draw: Callable[[Any], Any]) -> None:
-    """Write what ``draw(axes)`` draws as a PNG file."""
+    """Call ``draw(axes)`` with new axes, and write the figure to a PNG file."""
     picture = draw(figure().add_subplot()).figure
     write_file(path, partial(picture.savefig, format="png", dpi=150, bbox_inches="tight", pad_inches=0.15))
 
@@ -448,7 +454,7 @@ def write_picture(path: Path, draw: Callable[[Any], Any]) -> None:
 def write_result(
     result: Result, folder: Path, stem: str, draw: Callable[[Any], Any] | None = None, heading: str = ""
 ) -> list[Path]:
-    """Write a result as stem.md, stem.csv and, with matplotlib, stem.png into a folder, and return the paths.
+    """Write a result to stem.md, stem.csv and, if matplotlib is installed, stem.png; return the paths.
 
     Parameters
     ----------
@@ -456,9 +462,9 @@ def write_result(
     folder : pathlib.Path
     stem : str
     draw : callable, optional
-        ``draw(axes)`` draws the picture.
+        ``draw(axes)`` draws the plot. Default: no .png file.
     heading : str
-        Before the text.
+        Text at the beginning of the .md file.
     """
     paths = [folder / f"{stem}.md", folder / f"{stem}.csv"]
     write_file(paths[0], heading + result.markdown())
@@ -472,18 +478,18 @@ def write_result(
 
 
 def sample_data(name: str) -> Any:
-    """Return an archive of matplotlib's sample data."""
+    """Return a file of matplotlib's sample data."""
     return _matplotlib(".cbook").get_sample_data(name)
 
 
 def opened(file: Any) -> Any:
-    """Return a file or stream as a picture of Pillow, which refuses one that is too large for memory."""
+    """Open a file or stream as a Pillow image. Pillow raises an error for images that are too large."""
     _matplotlib()
     return import_module("PIL.Image").open(file)
 
 
 def _matplotlib(part: str = "") -> Any:
-    """Import matplotlib or one of its modules (with the dot), since a picture is needed."""
+    """Import matplotlib, or one of its modules such as ".pyplot"; raise ImportError with advice if it is missing."""
     try:
         import_module("matplotlib")
         return import_module(f"matplotlib{part}")

@@ -1,9 +1,9 @@
-"""The growth factor of a time step: by how much a small change of the state grows in one step; and its map.
+"""The growth factor of a time step (how much a small change of the state grows in one step), and the stability map.
 
-A change is carried along the run by the tangent of the step and normalized after each step; the factor by which it
-grows once the fastest mode dominates is the growth factor. A factor above 1 need not be wrong: unstable physics
-grows. The step is wrong when the fastest mode changes its sign from step to step, or when the growth per unit of time
-falls with the step.
+A change of the state is propagated by the JVP of the step and normalized after each step. After some steps the fastest
+growing mode dominates, and the factor by which the change grows is the growth factor. A factor above 1 is not always an
+error, because unstable physics grows, too. The step itself is unstable if the fastest mode changes its sign from step
+to step, or if the growth per unit of time becomes smaller with a smaller step.
 
 References
 ----------
@@ -27,24 +27,24 @@ from sparsedp.errors import SparsedpError
 
 __all__ = ["LARGEST_STEADY_GROWTH", "SEED", "Growth", "StabilityMap", "growth_of", "stability_map"]
 
-SEED = 20240229  # of random changes, here and in the stress cases
+SEED = 20240229  # seed of random changes in this module and in the stress cases
 STEPS = 40
-MEASURED_STEPS = 20  # the last ones
+MEASURED_STEPS = 20  # the growth is averaged over this number of last steps
 LARGEST_STEADY_GROWTH = 1.0 + 1e-3  # growth factors up to here do not count as growth
-SHARES = np.geomspace(1e-2, 1e2, 9)  # of the time step and viscosity of the scene, along the axes of the map
+SHARES = np.geomspace(1e-2, 1e2, 9)  # multiples of time step and viscosity along the axes of the map
 
 
 class Growth(NamedTuple):
-    """Growth in one step.
+    """The growth of a small change in one time step.
 
     Attributes
     ----------
     factor : float
-        NaN where there is none.
+        The growth factor; NaN if the step raised an error.
     flips : bool
         Whether the fastest mode changes its sign from step to step.
     refusal : str
-        Name of the error that the step raised.
+        Name of the exception that the step raised; empty if none.
     """
 
     factor: float
@@ -53,18 +53,18 @@ class Growth(NamedTuple):
 
 
 class _FirstRollout(Exception):
-    """Carries the first rollout out of a loss before it runs; `args` are one step of it, and its start."""
+    """Raised inside a loss at the start of its first rollout. `args` are the step function and the initial state."""
 
 
 def growth_of(loss: Callable[[Any], Any], x: Any, step: Callable[[Any], Any] | None = None) -> Growth | None:
-    """Return the growth of the step of the first rollout of a loss; None without one.
+    """Return the growth in one step of the first rollout in a loss; None if the loss has no rollout.
 
     Parameters
     ----------
     loss : callable
     x : tree of arrays
     step : callable, optional
-        ``step(x)`` returns (advance, state) of another loop.
+        ``step(x)`` returns (advance, state): a step function and an initial state, in place of the first rollout.
     """
     try:
         if step is None:
@@ -77,7 +77,7 @@ def growth_of(loss: Callable[[Any], Any], x: Any, step: Callable[[Any], Any] | N
 
 
 def _first_rollout(loss: Callable[[Any], Any], x: Any) -> Any:
-    """Return one step of the first rollout of a loss, and its start; None without one."""
+    """Return (step function, initial state) of the first rollout in a loss; None if there is no rollout."""
 
     def leave(step: Any, state: Any, params: Any, inputs: Any, n: int) -> None:
         if not n:
@@ -98,7 +98,7 @@ def _first_rollout(loss: Callable[[Any], Any], x: Any) -> Any:
 
 
 def _measure_growth(advance: Callable[[Any], Any], state: Any) -> Growth:
-    """Measure the growth of a random change over the last of some steps."""
+    """Measure the growth of a random change, averaged over the last MEASURED_STEPS of STEPS steps."""
     change = np.random.default_rng(SEED).standard_normal(Point(state).size)
     rates = []
     flips = []
@@ -117,14 +117,15 @@ def _measure_growth(advance: Callable[[Any], Any], state: Any) -> Growth:
 
 
 class StabilityMap(Result):
-    """Growth factors over time step (down) and viscosity (across).
+    """Growth factors over time step (rows) and viscosity (columns).
 
     Attributes
     ----------
     names : (str, str)
+        Names of the time step and of the viscosity.
     time_steps, viscosities : 1-D arrays
     factors : 2-D array
-        Growth factor of a step; NaN where the step is refused.
+        Growth factor of a step; NaN if the step raises an error.
     here : (float, float)
         Time step and viscosity of the scene.
     """
@@ -132,14 +133,17 @@ class StabilityMap(Result):
     _plain = ("time_steps", "viscosities", "factors")
 
     def parts(self) -> list[str | Table]:
-        """Return the factors."""
+        """Return the table of growth factors."""
         cells = np.where(np.isnan(self.factors), "refused", self.factors.astype(object))
         rows = [(time_step, *row) for time_step, row in zip(self.time_steps, cells)]
         return ["growth factor of a step:", Table((" \\ ".join(self.names), *self.viscosities), rows)]
 
 
 def stability_map(scene: Any) -> StabilityMap | None:
-    """Return the stability map of a scene; None without a loop and both as single numbers."""
+    """Return the stability map of a scene.
+
+    Return None unless the scene has a rollout, and time step and viscosity are positive single numbers.
+    """
     time_step_name = scene.time_step
     viscosity_name = scene.viscosity
     if not scene.growth or scene.growth.refusal or time_step_name is None or viscosity_name is None:

@@ -1,4 +1,4 @@
-"""stress: a scene driven through stiff and extreme cases, one word for each."""
+"""stress: evaluate a loss for stiff and extreme values of its parameters, and grade each case."""
 
 from __future__ import annotations
 
@@ -35,37 +35,41 @@ def stress(
     viscosity: str | None = None,
     only: Sequence[str] | None = None,
 ) -> Stress:
-    """Run a scene through stiff and extreme cases: each has passed, was refused correctly, is degraded, or FAILED.
+    """Evaluate a loss and its gradient for stiff and extreme values of its parameters, and grade each case.
+
+    The grades are "passed", "refused correctly", "degraded" and "FAILED"; see Notes.
 
     Parameters
     ----------
     loss : callable
         ``loss(x) -> real scalar``.
     x : array, number, or any nesting of them in tuples, lists and dicts
-        The parameters. Entries of a dict are called by their key. Never modified.
+        The parameters. Entries of a dict are named by their keys. `x` is not modified.
     ranges : dict, optional
-        Name of a parameter -> (low, high), its legal range. A parameter that stands alone: (low, high).
+        Legal range (low, high) of each parameter, by name. If `x` is a single array or number: its range (low, high).
     step : callable, optional
-        ``step(x) -> (advance, state)``: one time step and where it starts, for the growth factor. Default: the
-        first rollout in the loss.
+        ``step(x)`` returns (advance, state): the function that advances a state by one time step, and an initial
+        state. Their growth factor is measured. Default: the time step of the first rollout in the loss.
     time_step, viscosity : str, optional
-        Names of these parameters. Default: those called dt, time_step, tau; nu, viscosity, diffusivity, kappa, mu.
+        Names of the parameters that are the time step and the viscosity. Default: a parameter called dt, time_step or
+        tau; and one called nu, viscosity, diffusivity, kappa or mu.
     only : sequence of str, optional
         Groups of cases to run: "as given", "scaling", "legal range", "zeros and signs", "jumps", "constant added",
-        "not finite", "kinds of arrays", "time step and viscosity". Default: all that apply.
+        "not finite", "kinds of arrays", "time step and viscosity". Default: all groups.
 
     Returns
     -------
     Stress
-        `.rows`, `.counts`, `.failures`, `.skipped`, `.map` (time step against viscosity, or None), `.to_dict()`,
-        `.markdown()`, `.csv()`, `.plot(ax)`; str() is the table; true when nothing FAILED.
+        It has the attributes `.rows`, `.counts`, `.failures`, `.skipped` and `.map` (the stability map over time step
+        and viscosity, or None), and the methods `.to_dict()`, `.markdown()`, `.csv()` and `.plot(ax)`. str() returns
+        the table. bool(result) is True if no case FAILED.
 
     Raises
     ------
     ValueError
         If a name is unknown, or a range is not two finite numbers.
     DerivativeError
-        If x has no floating leaf.
+        If `x` has no floating leaf.
 
     See Also
     --------
@@ -73,14 +77,21 @@ def stress(
 
     Notes
     -----
-    passed: finite, and the gradient agrees with differences to 1e-5 along a random direction in each leaf (in all
-    together of more than eight) and along itself, or the bits are those of the plain case. At x itself, and where a
-    direction does not agree, all evidence is gathered and weighed as by `check.gradient`, with its detection limits.
-    refused correctly: a typed error. degraded: a finite answer with a gap, shown as the figure; numbers that
-    overflow far outside any stated range; a foreign error. FAILED: within the scene's own values or stated ranges
-    a number that is not finite, without an error; a gradient that differs from the differences; NaN in, finite
-    out; an answer that changes by more than 1e-5 when x changes by rounding; a step that grows where the
-    physics does not (its fastest mode flips its sign from step to step, or its growth falls with the step).
+    **passed**: value and gradient are finite, and the gradient agrees with finite differences to 1e-5. The directions
+    are a random direction in each leaf (one in all leaves together if there are more than eight leaves) and the
+    gradient itself. At `x` itself, and if a direction does not agree, the gradient is examined as by `check.gradient`,
+    with its detection limits. Cases that must not change the result pass if value and gradient have the same bits as at
+    `x`.
+
+    **refused correctly**: the loss raises an exception of this library, ValueError or TypeError.
+
+    **degraded**: the result is finite, but differs from the expected one; the figure is the difference. Also: values
+    overflow outside the given ranges, or an exception of another type is raised.
+
+    **FAILED**: at `x` or within the given ranges, value or gradient is not finite and no exception is raised; the
+    gradient differs from finite differences; a parameter is NaN, but the result is finite; the result changes by more
+    than 1e-5 if `x` changes by rounding; or a time step is unstable although the physics is not (the fastest growing
+    mode changes its sign from step to step, or there is no such growth with a smaller step).
 
     Examples
     --------
@@ -101,7 +112,7 @@ def stress(
     rows = []
     growth_map = None
     with np.errstate(all="ignore"), unwarned(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the rows say what became of a case
+        warnings.simplefilter("ignore")  # the row of a case shows its result
         scene = Scene(loss, x, ranges, step, time_step, viscosity)
         for group, parameter, case, grade in cases(scene, chosen):
             rows.append(dict(zip(COLUMNS, (group, parameter, case, *grade()))))
@@ -123,7 +134,7 @@ def stress(
 
 
 def _skipped_groups(rows: list[dict[str, Any]], chosen: list[str]) -> list[str]:
-    """Return sentences about the groups without a case."""
+    """Return a sentence about each group in which no case was run."""
     groups_with_rows = {row["group"] for row in rows}
     sentences = []
     for name, group in GROUPS.items():
@@ -133,7 +144,7 @@ def _skipped_groups(rows: list[dict[str, Any]], chosen: list[str]) -> list[str]:
 
 
 def _failure(row: dict[str, Any]) -> str:
-    """Return a row that FAILED as one line: parameter and case, and the note."""
+    """Return a row that FAILED as one line with parameter, case and note."""
     case = " ".join(filter(None, (row["parameter"], row["case"])))
     return ": ".join(filter(None, (FAILED, case, row["note"])))
 
@@ -144,23 +155,25 @@ class Stress(Result):
     Attributes
     ----------
     rows : list of dict
-        group, parameter, case, outcome, figure (a gap, relative, or a growth factor), note.
+        One dict for each case: group, parameter, case, outcome, figure (a relative difference or a growth factor) and
+        note.
     counts : dict
         Number of rows by outcome.
     failures : list of dict
         The rows that FAILED.
-    verdict : "disagrees" when something FAILED, else "agrees"
+    verdict : "disagrees" if a case FAILED, else "agrees"
     summary : str
-        One line.
+        The counts in one line.
     skipped : list of str
-        Cases that do not apply, with the reason.
+        Sentences about cases that were not run, with the reasons.
     map : StabilityMap or None
+        Growth factors over time step and viscosity.
     """
 
     _plain = ("counts", "rows", "skipped", "map")
 
     def parts(self) -> list[str | Table]:
-        """Return all cases, what was skipped, the map, the failures, and the counts."""
+        """Return the table of cases, the skipped cases, the stability map, the failures, and the counts."""
         if self.map:
             growth = self.map.parts()
         else:
@@ -169,7 +182,7 @@ class Stress(Result):
         return ["stress", table_of(self.rows, COLUMNS), *self.omissions(), *growth, *failures, self.summary]
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw the stability map: growth factor of a step, time step against viscosity.
+        """Plot the stability map: the growth factor of a time step over viscosity and time step.
 
         Parameters
         ----------
@@ -183,7 +196,7 @@ class Stress(Result):
         Raises
         ------
         ValueError
-            If the scene has no stability map.
+            If there is no stability map.
         """
         if self.map is None:
             raise ValueError("this scene has no stability map; it needs a rollout, a time step and a viscosity by name")

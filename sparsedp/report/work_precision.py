@@ -1,4 +1,4 @@
-"""work_precision: error against run time, of values and of gradients, one row for each run."""
+"""work_precision: measure errors of values and gradients against run time, with one row for each run."""
 
 from __future__ import annotations
 
@@ -64,13 +64,13 @@ COLUMNS = (
     "seconds_backward_median",
     "seconds_backward_max",
 )
-KEY = ("scene", "method", "settings", "seed", "versions")  # identifies a row of an earlier run
+KEY = ("scene", "method", "settings", "seed", "versions")  # columns that identify a row
 TEXTS = (*KEY, "status")  # the other columns are numbers
 COUNTS = {"solves_forward": "solve", "solves_adjoint": "adjoint", "iterations": "iterations"}  # column: kind of call
-SETTLED_RATIO = 2.0  # a run is warm when the run before it took at most this many times as long
+SETTLED_RATIO = 2.0  # the warm-up ends if the previous run took at most this many times as long
 MOST_WARM_UPS = 7
-SHORT = 2e-3  # [s]: shorter times differ for other reasons
-GOALS = (0.1, 0.01, 1e-3, 1e-4, 1e-6)  # errors that a method is recommended for, as far as one reaches them
+SHORT = 2e-3  # [s]: differences below this time are ignored, since short times fluctuate
+GOALS = (0.1, 0.01, 1e-3, 1e-4, 1e-6)  # errors for which the fastest method is named
 FAILURES = (SparsedpError, ArithmeticError, ValueError, MemoryError, np.linalg.LinAlgError)
 
 
@@ -86,47 +86,50 @@ def work_precision(
     skip: Callable[[str, dict[str, Any]], str | None] | None = None,
     seed: int = 0,
 ) -> Rows:
-    """Measure error against run time: a table with one row for each method and setting.
+    """Measure errors of values and gradients against run time, for several methods and settings.
 
     Parameters
     ----------
     problem : callable
-        ``problem(**settings)`` -> (loss, x) or (loss, x, facts). Facts are columns (unknowns, steps, tolerance);
-        facts["output"], a function of x, gives the array that the forward error is about in place of the loss.
-        With x None, loss() is the run itself (an optimizer, say) and its result the answer; it has no gradient.
+        ``problem(**settings)`` returns (loss, x) or (loss, x, facts). The dict `facts` has values for the columns
+        "unknowns", "steps" and "tolerance". It may also have a function "output": then the forward error is that of
+        the array output(x), and not that of the loss. If x is None, loss() is called without arguments, for example to
+        run an optimizer; its result is compared with the reference, and there is no gradient.
     methods : dict
-        Name of a method -> dict of its settings.
+        A dict of settings for each method, by name of the method.
     over : dict, optional
-        Name of a setting -> list of values: every method is run with every combination.
+        A list of values for each setting, by name of the setting. Every method is run with every combination.
     reference : (value, gradient), callable, dict, or list of two dicts
-        The exact answer and gradient; a function of the settings in `over` that gives them; or settings that
-        replace those of the row: of two the second is used, and its distance from the first is the error of
-        the reference. Default: the errors are NaN.
+        The exact value and gradient, or a function of the settings in `over` that returns them. A dict of settings
+        means that the reference is computed by `problem` with these settings in addition to those in `over`. With a
+        list of two dicts, the second one gives the reference, and the difference of both results is the error of the
+        reference. By default there is no reference, and the errors are NaN.
     compare : callable, optional
-        ``compare(result, exact)`` -> error of a gradient or an answer. Default: Euclidean, relative.
+        ``compare(result, exact)`` returns the error of a value or a gradient. Default: the relative error in the
+        Euclidean norm.
     repeats : int
-        Timed runs after the warm ones; the least counts.
+        Number of timed runs after the warm-up. The shortest time is used.
     file : path, optional
-        CSV file: rows are added as they finish, and those in it are not run again.
+        CSV file to which each row is added when it is finished. Rows that the file already has are not run again.
     scene : str, optional
-        Default: the name of `problem`.
+        Name of the problem in the table. Default: the name of the function `problem`.
     skip : callable, optional
-        ``skip(method, settings)`` -> the reason why a run is skipped, or None.
+        ``skip(method, settings)`` returns the reason why a run is to be skipped, or None.
     seed : int
-        Noted in every row; passed to the problem by the caller.
+        Stored in every row. It is not passed to `problem`; the caller has to use it.
 
     Returns
     -------
     Rows
-        `.rows` (dicts), `.markdown()`, `.csv()`, `.plot(ax)`, `.pareto()`, `.save(folder)`, `.skipped`; str() is
-        the table.
+        It has the attributes `.rows` (list of dicts) and `.skipped`, and the methods `.markdown()`, `.csv()`,
+        `.plot(ax)`, `.pareto()` and `.save(folder)`. str() returns the table.
 
     Raises
     ------
     ValueError
-        If `repeats` is not a whole number >= 1, there is no method, or the file is not such a table.
+        If `repeats` is not an integer >= 1, `methods` is empty, or `file` is another kind of file.
     TypeError
-        If the problem does not give (loss, x), or several processes share the fields.
+        If `problem` does not return (loss, x), or the program runs on several MPI ranks.
 
     See Also
     --------
@@ -134,10 +137,11 @@ def work_precision(
 
     Notes
     -----
-    Every run is warm: it is repeated until its time has settled, and one that does not settle has the status
-    not_warm and no time. Set-up: the time of problem(...) and of the first set-ups of solvers. Backward: the time
-    of value and gradient less the time of the value. Peak bytes: what Python's allocator saw in one run. A run that
-    fails keeps its row, with the status of its solve or the name of its error.
+    Before it is timed, a run is repeated until its time no longer decreases. If this does not happen, the row has the
+    status "not_warm" and no times. The set-up time is the time of problem(...) and of the set-ups of solvers in the
+    first run. The backward time is the time of value and gradient minus the time of the value. The peak bytes are
+    measured by tracemalloc in one run. A run that raises an exception has a row, too; its status is that of the failed
+    solve, or the name of the exception.
 
     Examples
     --------
@@ -196,17 +200,17 @@ def work_precision(
 
 
 def words_of(settings: Mapping[str, Any]) -> str:
-    """Return settings in words."""
+    """Return settings as text for a sentence."""
     return ", ".join(f"{name}={value}" for name, value in settings.items()) or "no settings"
 
 
 def _text_of(settings: Mapping[str, Any]) -> str:
-    """Return settings as they stand in a row."""
+    """Return settings as JSON text, which is stored in a row and identifies it."""
     return json.dumps(settings, sort_keys=True, default=str)
 
 
 def _versions() -> str:
-    """Return the versions of Python and of the libraries that figures depend on."""
+    """Return the versions of Python and of the libraries that influence the results."""
     words = [f"python {platform.python_version()}"]
     for name in ("sparsedp", "numpy", "scipy", "autograd", "pyamg", "numba"):
         try:
@@ -221,17 +225,17 @@ def _versions() -> str:
 
 @dataclass
 class _Task:
-    """What a problem returned for some settings.
+    """What `problem` returned for some settings.
 
     Attributes
     ----------
     runs : list of callable
-        Of the value, and of value and gradient; the value alone where the loss is the run itself.
+        Functions without arguments that compute the value, and value and gradient. If `x` is None: only loss().
     x : tree or None
     facts : dict
-        Columns.
+        Values of columns.
     output : callable or None
-        ``output(x)`` returns the array that the forward error is about.
+        ``output(x)`` returns the array whose error is the forward error.
     """
 
     runs: Sequence[Callable[[], Any]]
@@ -240,7 +244,7 @@ class _Task:
     output: Callable[[Any], Any] | None
 
     def answer(self, result: Any) -> tuple[Any, Any]:
-        """Return what the forward error is about, and the gradient, from the result of the last run."""
+        """Return the answer, which the forward error is about, and the gradient from the result of the last run."""
         value = result
         gradient = None
         if self.x is not None:
@@ -251,7 +255,7 @@ class _Task:
 
 
 def _prepare(problem: Callable[..., Any], settings: Mapping[str, Any]) -> _Task:
-    """Call a problem with settings."""
+    """Call `problem` with settings, and return its result as a task."""
     parts = problem(**settings)
     if not isinstance(parts, tuple) or len(parts) not in (2, 3):
         kind = type(parts).__name__
@@ -262,7 +266,7 @@ def _prepare(problem: Callable[..., Any], settings: Mapping[str, Any]) -> _Task:
     else:
         facts = {}
     output = facts.get("output")
-    if x is None:  # the loss is the run itself, its result the answer
+    if x is None:  # loss() is run without arguments, and its result is the answer
         return _Task([loss], x, facts, output)
     unknowns = sum(map(np.size, leaves(x)))
     runs = [partial(loss, x), partial(value_and_grad(loss), x)]
@@ -270,7 +274,7 @@ def _prepare(problem: Callable[..., Any], settings: Mapping[str, Any]) -> _Task:
 
 
 def _measure(problem: Callable[..., Any], settings: Mapping[str, Any], repeats: int) -> dict[str, Any]:
-    """Return the figures of a run, with its answer and gradient; one that fails has a status only."""
+    """Return the measured values of a run, its answer and its gradient; only a status if the run fails."""
     try:
         start = perf_counter()
         task = _prepare(problem, settings)
@@ -298,13 +302,13 @@ def _measure(problem: Callable[..., Any], settings: Mapping[str, Any], repeats: 
 
 
 def _warm_up(run: Callable[[], Any]) -> tuple[str, Calls, Calls]:
-    """Run until the time no longer falls, since the first runs compile code and fill caches.
+    """Run until the time no longer decreases, since the first runs compile code and fill caches.
 
     Returns
     -------
     status : "ok" or "not_warm"
     first_calls, last_calls : Calls
-        Of the first and of the last run.
+        Calls of the first and of the last run.
     """
     status = "not_warm"
     last_seconds = inf
@@ -323,7 +327,7 @@ def _warm_up(run: Callable[[], Any]) -> tuple[str, Calls, Calls]:
 def _times(runs: Sequence[Callable[[], Any]], repeats: int) -> dict[str, float]:
     """Return the columns of times.
 
-    The time of the gradient is the time of value and gradient less the least time of the value.
+    The backward time is the time of value and gradient minus the shortest time of the value.
     """
     row: dict[str, float] = {}
     least = 0.0
@@ -338,9 +342,9 @@ def _times(runs: Sequence[Callable[[], Any]], repeats: int) -> dict[str, float]:
 
 
 def _peak_bytes(run: Callable[[], Any]) -> tuple[int, Any]:
-    """Return the bytes that a run allocates at most, as Python's allocator sees them, and its result."""
+    """Return the peak of allocated bytes during a run, as measured by tracemalloc, and the result of the run."""
     was_tracing = tracemalloc.is_tracing()
-    tracemalloc.start()  # does nothing where it runs already
+    tracemalloc.start()  # does nothing if it is already active
     try:
         tracemalloc.reset_peak()
         before, _ = tracemalloc.get_traced_memory()
@@ -353,7 +357,7 @@ def _peak_bytes(run: Callable[[], Any]) -> tuple[int, Any]:
 
 
 def _status_of(error: BaseException) -> str:
-    """Return the status of a run that failed: the word of the solve, or the name of the error."""
+    """Return the status of a run that failed: the status of its solve, or the name of the exception."""
     return getattr(getattr(error, "info", None), "status", None) or type(error).__name__
 
 
@@ -361,7 +365,7 @@ def _status_of(error: BaseException) -> str:
 
 
 class _References:
-    """The reference in any of its forms, computed once for the settings that methods share."""
+    """The reference in any of its forms. It is computed once for each combination of settings in `over`."""
 
     def __init__(self, problem: Callable[..., Any], reference: Any, compare: Callable[[Any, Any], float]) -> None:
         self.problem = problem
@@ -370,14 +374,14 @@ class _References:
         self._computed: dict[str, tuple[Any, Any, float]] = {}
 
     def at(self, shared: dict[str, Any]) -> tuple[Any, Any, float]:
-        """Return answer, gradient and the error of both."""
+        """Return answer, gradient and error of the reference, from a cache if possible."""
         text = _text_of(shared)
         if text not in self._computed:
             self._computed[text] = self._compute(shared)
         return self._computed[text]
 
     def _compute(self, shared: dict[str, Any]) -> tuple[Any, Any, float]:
-        """Return answer, gradient and the error of both."""
+        """Compute answer, gradient and error of the reference."""
         reference = self.reference
         if reference is None:
             return None, None, nan
@@ -400,7 +404,7 @@ class _References:
 
 
 def _errors(figures: dict[str, Any], references: _References, shared: dict[str, Any]) -> dict[str, Any]:
-    """Return the columns of errors of one run."""
+    """Return the columns with the errors of one run."""
     try:
         value, gradient, error = references.at(shared)
         row = {"reference_error": error}
@@ -417,7 +421,7 @@ def _errors(figures: dict[str, Any], references: _References, shared: dict[str, 
 
 
 class Rows(Result):
-    """Error against run time. Returned by `work_precision`.
+    """The result of `work_precision`: errors and run times.
 
     Attributes
     ----------
@@ -425,9 +429,9 @@ class Rows(Result):
     over : tuple of str
         Names of the settings that vary.
     rows : list of dict
-        Keys are COLUMNS; NaN where a figure does not exist.
+        The keys are COLUMNS. A value that was not measured is NaN.
     skipped : list of str
-        Runs that were not done, with the reason.
+        Sentences about runs that were skipped, with the reasons.
     """
 
     judged = deprecated_attribute("judged", "main_error", "0.5")
@@ -439,24 +443,24 @@ class Rows(Result):
 
     @property
     def main_error(self) -> str:
-        """Column that methods are compared by: the error of the gradient, where there is one."""
+        """Error by which methods are compared: "gradient_error" if any row has it, else "forward_error"."""
         if self.pareto():
             return "gradient_error"
         return "forward_error"
 
     def seconds(self, row: dict[str, Any], error: str = "gradient_error") -> float:
-        """Return the run time that belongs to an error: of the value, or of value and gradient."""
+        """Return the time of value and gradient for a gradient error, or the time of the value for a forward error."""
         if error == "gradient_error":
             return row["seconds_forward"] + row["seconds_backward"]
         return row["seconds_forward"] + 0.0
 
     def _points(self, error: str) -> list[tuple[float, float, dict[str, Any]]]:
-        """Return (seconds, error, row) of the runs that have both."""
+        """Return (seconds, error, row) for each successful row in which both numbers are finite."""
         points = [(self.seconds(row, error), row[error], row) for row in self.rows if row["status"] == "ok"]
         return [point for point in points if isfinite(point[0] + point[1])]
 
     def pareto(self, error: str = "gradient_error") -> list[dict[str, Any]]:
-        """Return the rows that no other row beats in both time and error, the fastest first."""
+        """Return the rows for which no other row has both less time and a smaller error, the fastest first."""
         return [row for *_, row in plots.unbeaten(self._points(error))]
 
     def best(self, error: float, which: str = "gradient_error") -> dict[str, Any] | None:
@@ -464,7 +468,7 @@ class Rows(Result):
         return next((row for row in self.pareto(which) if row[which] <= error), None)
 
     def parts(self) -> list[str | Table]:
-        """Return the figures, the settings that distinguish the rows of a method, and what was skipped."""
+        """Return the table of all rows, the skipped runs, and the fastest method for each error."""
         error = self.main_error
         best = [row for row in self.pareto(error) if row[error] < 1]
         rows = []
@@ -488,7 +492,7 @@ class Rows(Result):
         return parts
 
     def _recommendations(self, error: str) -> Iterator[str]:
-        """Say which method is the fastest for each of GOALS."""
+        """Yield a sentence that names the fastest method for each error in GOALS."""
         if not self.pareto(error):
             return
         for goal in GOALS:
@@ -501,14 +505,14 @@ class Rows(Result):
             yield f"fastest at {target}: {row['method']} ({settings}), {self.seconds(row, error):.1e} s"
 
     def plot(self, ax: Any = None, error: str | None = None) -> Any:
-        """Draw run time across and error up, log-log: one curve for each method, the Pareto set marked.
+        """Plot error against run time on logarithmic axes: one curve for each method, and the Pareto set as a band.
 
         Parameters
         ----------
         ax : matplotlib Axes, optional
             Default: the current axes of pyplot.
         error : "gradient_error" or "forward_error"
-            Default: the error of the gradient, where there is one.
+            Default: the error of the gradient if any row has one, else the forward error.
 
         Returns
         -------
@@ -516,13 +520,13 @@ class Rows(Result):
         """
         ax = plots.current(ax)
         curves, xlabel, ylabel = self.curves(error)
-        if curves:  # empty axes have no logarithmic scale
+        if curves:  # logarithmic axes cannot be empty
             plots.curves(curves, ax, xlabel, ylabel)
         ax.set_title(self.scene)
         return ax
 
     def curves(self, error: str | None = None) -> tuple[dict[str, list[Any]], str, str]:
-        """Return the error over the run time, a curve for each method."""
+        """Return the curves of error over run time, one for each method, and the labels of the axes."""
         error = error or self.main_error
         curves: dict[str, list[Any]] = {}
         for seconds, size, row in sorted(self._points(error), key=lambda point: point[0]):
@@ -530,7 +534,7 @@ class Rows(Result):
         return curves, "run time [s]", error.replace("_", " ")
 
     def save(self, folder: Any) -> list[Path]:
-        """Write scene.md, scene.csv and, where matplotlib is installed, scene.png into a folder.
+        """Write scene.md, scene.csv and, if matplotlib is installed, scene.png to a folder.
 
         Returns
         -------
@@ -543,7 +547,7 @@ class Rows(Result):
 
         Notes
         -----
-        "/" in the name of a scene becomes "-".
+        A "/" in the name of the scene is replaced by "-" in the file names.
         """
         folder = Path(folder)
         with path_errors(folder):
@@ -555,7 +559,7 @@ class Rows(Result):
 
 
 def _stored(file: Any) -> list[dict[str, Any]]:
-    """Return the rows of a CSV file, without one that was cut off; none without a file."""
+    """Return the complete rows of a CSV file. The list is empty if the file does not exist."""
     if not file or not os.path.exists(file):
         return []
     with path_errors(file, reading=True):
@@ -569,7 +573,7 @@ def _stored(file: Any) -> list[dict[str, Any]]:
 
 
 def _number(text: str) -> float:
-    """Return a number from a cell; an empty one is NaN."""
+    """Return the number in a cell. An empty cell is NaN."""
     if text.isdigit():
         return int(text)
     return float(text or "nan")
