@@ -1,7 +1,7 @@
 """Memory for large results: the buffers of garbage-collected results are recycled.
 
-A new large array costs more than the arithmetic that fills it, because the system provides its pages one by one, at the
-first access. The buffer of a result is free again once the array and all its views are deleted.
+To allocate a large array can take longer than the arithmetic that fills it, because the operating system provides each
+memory page at its first access. The buffer of a result is recycled when the array and all its views have been deleted.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ if TYPE_CHECKING:
 
 __all__ = ["empty"]
 
-LARGE = 1 << 18  # bytes: the C library itself recycles smaller arrays as fast
-SPARE = 1 << 30  # largest total of free buffers in bytes: a field of 256^3 cells and its faces takes half of it
+LARGE = 1 << 18  # bytes; smaller arrays are recycled by the C library
+SPARE = 1 << 30  # largest total size of free buffers in bytes; a field on 256^3 cells and one on the faces take half
 
 
 class _Buffer(np.ndarray):
-    """The bytes of a result.
+    """The memory of a result, as an array of bytes.
 
-    It needs a type of its own: the base of a view of a result would otherwise be the array of bytes, and the result
-    could be deleted while views of it exist.
+    A subclass is needed so that a view of a result has the result as its base. The base of a view of a plain array
+    would be this array of bytes, and the result could be deleted while views of it exist.
     """
 
 
-_free: dict[int, _Buffer] = {}  # by identity, the oldest first; each operation on it is atomic
+_free: dict[int, _Buffer] = {}  # id -> free buffer, the oldest first; only atomic operations are used (threads)
 
 
 def empty(shape: tuple[int, ...], dtype: DTypeLike) -> np.ndarray:
-    """Return an uninitialised array of its own memory, like np.empty.
+    """Return an uninitialised array like np.empty, for large sizes in recycled memory.
 
     Examples
     --------
@@ -52,13 +52,13 @@ def empty(shape: tuple[int, ...], dtype: DTypeLike) -> np.ndarray:
 def _take(size):
     """Return a free buffer of this size, or a new one."""
     for key, buffer in _free.copy().items():
-        if buffer.size == size and _free.pop(key, None) is not None:  # else another thread was first
+        if buffer.size == size and _free.pop(key, None) is not None:  # None: another thread took it
             return buffer
     return _Buffer(size, np.uint8)
 
 
 def _release(buffer):
-    """Keep a buffer for later results, and delete the oldest ones if they exceed SPARE."""
+    """Keep a buffer for later results; delete the oldest free buffers if their total size exceeds SPARE."""
     _free[id(buffer)] = buffer
     buffers = _free.copy()
     total = sum(other.size for other in buffers.values())

@@ -1,6 +1,6 @@
-"""Calls of public functions: advice for calls that do not fit the signature, and tracebacks without internal frames.
+"""Calls of public functions: error messages for wrong arguments, and tracebacks without internal frames.
 
-``SPARSEDP_TRACEBACK=full`` in the environment keeps every frame.
+The environment variable ``SPARSEDP_TRACEBACK=full`` keeps all frames.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ __all__ = [
 ]
 
 PACKAGE = Path(__file__).parent.parent
-# Packages whose frames stand between a user's call and the error: the library, and what runs its code.
+# Packages whose frames are removed from tracebacks: this library, and packages that call its code.
 HIDDEN = ("sparsedp", "autograd", "functools", "contextlib", "scipy", "pyamg")
-# Keyword arguments of other libraries: what to write instead, by the first of these parameters that a function has.
+# Keyword argument of other libraries -> {parameter of ours: advice}. The first parameter that the function has is used.
 FOREIGN_KEYWORDS = {
     "args": {"batches": "loss=lambda x: loss(x, *args)"},
     "argnums": {"argnum": "argnum=..."},
@@ -74,7 +74,7 @@ FOREIGN_KEYWORDS = {
     "workers": {"executor": "executor=..."},
     "x0": {"start": "start=...", "guess": "guess=...", "x": "x=..."},
 }
-# What to write for calls that need more explanation than a list of their required parameters.
+# Examples for error messages of functions for which a list of the required parameters is not enough.
 EXAMPLES = {
     "dp.ensemble": "dp.ensemble(loss, scenes), and executor=concurrent.futures.ProcessPoolExecutor(2) for processes",
     "dp.hvp": "dp.hvp(loss, x, tangent)",
@@ -85,7 +85,7 @@ EXAMPLES = {
 
 
 def nearest(word: Any, words: Sequence[str]) -> str | None:
-    """Return the one of some words that is most similar to a word which is none of them; None if none is similar."""
+    """Return the entry of `words` that is most similar to a misspelt word; None if none is similar."""
     word = str(word).lower()
     similar = [other for other in words if word and other.startswith(word)]
     if not similar:
@@ -96,7 +96,7 @@ def nearest(word: Any, words: Sequence[str]) -> str | None:
 
 
 def advice_near(word: Any, words: Sequence[str]) -> str:
-    """Return the end of a message that proposes the most similar of some words; empty if none is similar."""
+    """Return the end of an error message that proposes the most similar entry of `words`; empty if none is similar."""
     near = nearest(word, words)
     if near is None:
         return ""
@@ -107,20 +107,20 @@ Function = TypeVar("Function", bound="Callable")
 
 
 def public(written: str, advice: Callable | None = None) -> Callable[[Function], Function]:
-    """Decorate a public function: add advice to calls that do not fit, and remove internal frames from tracebacks.
+    """Decorate a public function: add advice to errors of wrong arguments, and remove internal frames from tracebacks.
 
     Parameters
     ----------
     written : str
-        What a user writes in front of the parentheses, such as ``"dp.rollout"``.
+        The function as a user writes it, such as ``"dp.rollout"``.
     advice : callable, optional
-        ``advice(*args, **options)`` returns what to write in place of a wrong call, or None for the default. It is
-        called with the arguments of that call.
+        ``advice(*args, **options)`` is called with the arguments of a wrong call. It returns the call that the user
+        should write instead, or None for the default advice.
 
     Returns
     -------
     callable
-        The decorator. What it returns has the signature, docstring and name of the function.
+        The decorator. The decorated function has the signature, docstring and name of the original one.
 
     Examples
     --------
@@ -147,7 +147,7 @@ def public(written: str, advice: Callable | None = None) -> Callable[[Function],
 
 
 def _call_error(error, function, written, advice, args, options):
-    """Return a TypeError with advice if the arguments do not fit the signature of a function, else the error."""
+    """Return a TypeError with advice if the arguments do not match the signature of a function, else the error."""
     raised_by_the_call = error.__traceback__.tb_next is None
     if not (isinstance(error, TypeError) and raised_by_the_call):
         return error
@@ -160,7 +160,7 @@ def _call_error(error, function, written, advice, args, options):
 
 
 def _misfit(form, written, advice, args, options):
-    """Return the TypeError for arguments that do not fit a signature."""
+    """Return the TypeError for arguments that do not match a signature."""
     parameters = {name: parameter for name, parameter in form.parameters.items() if name != "self"}
     given = args
     if "self" in form.parameters:
@@ -188,14 +188,14 @@ def _misfit(form, written, advice, args, options):
 
 
 def foreign_keyword_advice(name: str, parameters: Container[str]) -> str | None:
-    """Return what to write for a keyword argument that other libraries have, or None.
+    """Return advice for a keyword argument that only other libraries have, or None.
 
     Parameters
     ----------
     name : str
         The keyword argument.
     parameters : container of str
-        The parameters of the function that does not have it.
+        The parameters of the function that was called.
     """
     for parameter, advice in FOREIGN_KEYWORDS.get(name.lower(), {}).items():
         if parameter in parameters:
@@ -204,7 +204,7 @@ def foreign_keyword_advice(name: str, parameters: Container[str]) -> str | None:
 
 
 def _instead(name, parameters):
-    """Return what to write for a keyword argument that a function does not have, or None."""
+    """Return the argument to write in place of an unknown keyword argument, or None."""
     advice = foreign_keyword_advice(name, parameters)
     if advice:
         return advice
@@ -215,7 +215,7 @@ def _instead(name, parameters):
 
 
 def _example(written, parameters):
-    """Return a call with the required arguments."""
+    """Return the text of a call with the required arguments."""
     return f"{written}({', '.join(name for name, parameter in parameters.items() if _is_required(parameter))})"
 
 
@@ -227,7 +227,7 @@ def _is_required(parameter):
 
 
 def shortened(error: Exception) -> Exception:
-    """Remove internal frames from the traceback of an error and of its causes; the frame that raised it stays.
+    """Remove internal frames from the tracebacks of an error and its causes, except for the frame that raised it.
 
     Returns
     -------
@@ -246,7 +246,7 @@ def shortened(error: Exception) -> Exception:
 
 
 def _without_internal_frames(traceback):
-    """Return a traceback with the frames of the user's code and the last one."""
+    """Return a traceback with the frames of the user's code and the last frame."""
     entries = []
     while traceback is not None:
         entries.append(traceback)
@@ -263,9 +263,9 @@ def _is_of_the_user(frame):
 
 
 def frames_inside() -> int:
-    """Return how many frames of this package lie between the caller of this function, included, and the user's code.
+    """Return the number of frames of this package from the caller of this function up to the user's code.
 
-    A warning with one more as its `stacklevel` names the line of the user.
+    The caller itself is counted. A warning with ``stacklevel=frames_inside() + 1`` names the line of the user's code.
     """
     frame: Any = sys._getframe(1)
     count = 0
@@ -276,26 +276,26 @@ def frames_inside() -> int:
 
 
 class _CallableModule(ModuleType):
-    """A public module whose error says what to write if it is called like a function."""
+    """A public module that raises a TypeError with an example if a user calls it like a function."""
 
     def __call__(self, *args, **options):
         raise TypeError(f"{self.__name__} is a module; write {self._example}")
 
     def __getattr__(self, name):
-        if "__getattr__" in vars(self):  # of the module itself, which raised an AttributeError: raise it again
+        if "__getattr__" in vars(self):  # the module's own function has failed: call it again to raise its error
             return vars(self)["__getattr__"](name)
         raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}{advice_near(name, self.__all__)}")
 
 
 def describe_module(name: str, example: str) -> None:
-    """Let the errors of calls of a module, and of its public functions, say what to write.
+    """Add advice to the errors of wrong calls of a module and of its public functions.
 
     Parameters
     ----------
     name : str
-        Of the module, such as ``"sparsedp.check"``.
+        Name of the module, such as ``"sparsedp.check"``.
     example : str
-        What to write in place of a call of the module.
+        The call that a user should write instead of calling the module.
     """
     module: Any = sys.modules[name]
     module.__class__ = _CallableModule
@@ -307,7 +307,7 @@ def describe_module(name: str, example: str) -> None:
 
 
 def public_name(function: Callable, module: str, name: str) -> Callable:
-    """Wrap a function for the public module that shows it under a name."""
+    """Wrap a function with `public` under its name in a public module."""
     written = f"{module.replace('sparsedp', 'dp', 1)}.{name}"
     wrapped = public(written)(function)
     wrapped.__module__ = module  # pickle looks for the function there
@@ -315,12 +315,12 @@ def public_name(function: Callable, module: str, name: str) -> Callable:
 
 
 def warn_deprecated(old: str, new: str, removal: str) -> None:
-    """Warn the user's code that a name is deprecated.
+    """Issue a DeprecationWarning that names the line of the user's code.
 
     Parameters
     ----------
     old, new : str
-        The deprecated name and the one that replaces it, as a user writes them.
+        The deprecated name and its replacement, as a user writes them.
     removal : str
         Version in which the old name stops working.
     """
@@ -334,7 +334,7 @@ def deprecated_attribute(old: str, new: str, removal: str) -> property:
     Parameters
     ----------
     old, new : str
-        The deprecated name of the attribute and the one that replaces it.
+        The deprecated name of the attribute and its replacement.
     removal : str
         Version in which the old name stops working.
 

@@ -1,10 +1,10 @@
-"""Counters: how often each rule, operator and solve was called, and facts about it. `explain` prints them.
+"""Counters: numbers of calls of each rule, operator and solve, and facts about them. `explain` prints them.
 
-Kinds of calls: forward, vjp, jvp; of solves: solve, adjoint, iterations, setup, reused, hierarchy, skipped
-(nothing to solve); of operators: assembled (its matrix was built). A time loop counts its steps as forward, vjp
-and recomputed (computed again for the backward pass), and the bytes it keeps beside the tape.
+The kinds of calls are forward, vjp and jvp. Solves also count: solve, adjoint, iterations, setup, reused, hierarchy,
+skipped (no solve was needed). Operators also count: assembled (the matrix was built). A time loop counts its steps as
+forward, vjp and recomputed (run again for the backward pass), and the bytes of the states that it keeps.
 
-Each thread has counters of its own: simultaneous calls of other threads are neither counted nor changed.
+Each thread has its own counters, so that a block counts only the calls of its thread.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ class Thread(local):
     calls : list of Calls
         The open `recording()` blocks.
     solve_hooks : list
-        Objects that take part in every solve, the last one first.
+        Objects that are called in every solve, the last one first.
     loop_hooks : list of callables
-        Called for every time loop before it runs, with (step, state, params, inputs, n).
+        Called with (step, state, params, inputs, n) before a time loop runs.
     witnesses : list of callables
         Called for every new node of a tape: see `Recorder`.
     solves : int
-        Number of solves of the thread, forward and adjoint, also without an open block.
+        Number of forward and adjoint solves of the thread; also counted if no `recording()` block is open.
     controlled : int
-        Number of intervals under error control.
+        Number of intervals with error control.
     grown : int
-        Number of warnings of growing cotangents; whether Python shows a warning is decided for all threads together.
+        Number of warnings of growing cotangents. It is counted here because Python may suppress repeated warnings.
     quiet : int
-        Number of open blocks whose caller handles derivatives that are not finite: no warning is needed.
+        Number of open blocks that suppress warnings of derivatives that are not finite.
     inner : list of float
-        For each open timed call, the seconds of the calls inside it.
+        For each active call of `timed` the total seconds of the timed calls inside it.
     """
 
     def __init__(self) -> None:
@@ -59,20 +59,20 @@ class Thread(local):
 
 
 thread = Thread()
-active: list[None] = []  # an entry for each open block of any thread: if it is empty, there is nothing to count
+active: list[None] = []  # one entry for each open block of any thread, for a fast test whether anything is counted
 
 
 class Calls(Counter):
-    """Counts by (name, kind).
+    """Number of calls for each key (name, kind).
 
     Attributes
     ----------
     seconds : Counter
-        By the same keys, without the calls inside.
+        For the same keys the time of the calls, without the time of timed calls inside them.
     notes : dict of Counter
-        Noted values by (name, fact).
+        For each key (name, fact) the number of times that each value was noted.
     actors : dict of dict
-        By name, the objects whose methods were called, by identity.
+        For each name the objects whose methods were called; the inner keys are their ids.
     """
 
     def __init__(self, *counts: Any) -> None:
@@ -104,13 +104,13 @@ def recording() -> Iterator[Calls]:
     try:
         yield calls
     finally:
-        # By identity: two nested blocks with equal counts are equal Counters.
+        # Compare by identity, because two nested blocks with equal counts are equal Counters.
         thread.calls[:] = [other for other in thread.calls if other is not calls]
         active.pop()
 
 
 def count(name: str, kind: str, times: int = 1) -> None:
-    """Add a call of `name`, or several, to every open block. Without an open block it costs one function call."""
+    """Add one or more calls of `name` to every open block of this thread."""
     if active and times:
         for calls in thread.calls:
             calls[name, kind] += times
@@ -125,7 +125,7 @@ def note(name: str, fact: str, value: Any) -> None:
 
 
 def timed(name: str, kind: str, function: Callable, *args: Any) -> Any:
-    """Call a function; if a block is open, count the call, add its seconds, and note the object of a method."""
+    """Call a function; if a block is open, count the call, measure its time, and record the object of a method."""
     if not active:
         return function(*args)
     actor = getattr(function, "__self__", None)
@@ -144,7 +144,7 @@ def timed(name: str, kind: str, function: Callable, *args: Any) -> Any:
 
 
 def spent(name: str, kind: str, exclusive: float, inclusive: float) -> None:
-    """Add the seconds of a call, without and with those of the calls inside it."""
+    """Add the time of a call; `exclusive` does not contain the time of timed calls inside it, `inclusive` does."""
     if thread.inner:
         thread.inner[-1] += inclusive
     for calls in thread.calls:

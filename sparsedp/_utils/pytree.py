@@ -1,17 +1,17 @@
-"""Pytrees: nested containers of arrays, their leaves, their paths, and the pairing of two of them.
+"""Pytrees: nested containers of arrays, their leaves and the paths of these, and the pairing of two trees.
 
 A tree is any nesting of
 
-- tuples, also named ones,
+- tuples and named tuples,
 - lists,
-- dicts, also ``defaultdict``, ``OrderedDict`` and other subclasses, whose entries keep their order,
+- dicts and their subclasses, such as ``defaultdict`` and ``OrderedDict``; entries keep their order,
 - instances of dataclasses, whose entries are their fields.
 
-Everything else is a leaf, also dataclasses that cannot be rebuilt from their fields, because they have a
-``__post_init__`` or fields that are not arguments, and objects of this library.
+Every other object is a leaf. Objects of this library are leaves, too, and so are dataclasses that cannot be rebuilt
+from their fields because they have a ``__post_init__`` or fields that are not arguments.
 
-Two trees are always paired by `paired`: entries of dicts by key, those of named tuples and dataclasses by field, and
-those of plain tuples and lists by position.
+Two trees are always paired by `paired`: entries of dicts by key, entries of named tuples and dataclasses by field, and
+entries of plain tuples and lists by position.
 """
 
 from __future__ import annotations
@@ -51,37 +51,40 @@ __all__ = [
     "subscript",
 ]
 
-BRANCHES = tuple, list, dict  # types of containers beside dataclasses
-DEEPEST = 100  # containers in containers: recursions over deeper trees would exceed Python's limit
-SMALL = 2.0**-200  # between these, products of four numbers and a few more are floats
+BRANCHES = tuple, list, dict  # types of containers except dataclasses
+DEEPEST = 100  # largest depth of nested containers; deeper recursion could exceed Python's limit
+# Products of four numbers between these limits, times a moderate factor, neither overflow nor underflow.
+SMALL = 2.0**-200
 LARGE = 2.0**200
-MOST_EXPONENT = 1023  # of a power of two that is a float
+MOST_EXPONENT = 1023  # largest exponent of a power of two that is a finite float
 
 
 class TreeStructure:
-    """The containers of a tree, and its leaves that are not variables: names, takes apart and builds such trees.
+    """The structure of a tree: its containers, and the leaves that are not variables.
+
+    Variables are the leaves that may differ between two trees of the same structure. The methods return the names of
+    the variables, extract the variables from a tree of this structure, and build a tree from them.
 
     Parameters
     ----------
     tree : tree
     root : str
-        Name of the tree in messages.
+        Name of the tree in error messages.
     is_variable : callable, optional
-        ``is_variable(leaf)``: whether the leaf is a variable, which differs between trees of this structure. Default:
-        every leaf is one.
+        ``is_variable(leaf)`` returns whether the leaf is a variable. Default: every leaf is a variable.
     keep : callable, optional
-        ``keep(leaf)``: what is stored of a leaf that is not a variable. Default: the leaf itself.
+        ``keep(leaf)`` returns the object that is stored for a leaf that is not a variable. Default: the leaf itself.
 
     Attributes
     ----------
     places : list of int
         Positions of the variables among the leaves.
     statics : tuple
-        All leaves, None in place of the variables: a structure that is kept must not hold a trace or a large array.
+        All leaves, with None in place of the variables, so that the structure does not keep traces or large arrays.
     template : tree
         The tree with these leaves.
     is_leaf, is_flat : bool
-        Whether the tree is one variable and nothing else, or a tuple of variables.
+        Whether the tree is a single variable, and whether it is a tuple of variables.
 
     Examples
     --------
@@ -120,26 +123,26 @@ class TreeStructure:
 
     @cached_property
     def labels(self) -> list[str]:
-        """Names of all leaves, as one would write them: ``x['u'][0]``."""
+        """Names of all leaves as Python expressions, such as ``x['u'][0]``."""
         return labels(self.template, self.root)
 
     @cached_property
     def names(self) -> list[str]:
-        """Names of the variables, as one would write them."""
+        """Names of the variables as Python expressions."""
         return [self.labels[place] for place in self.places]
 
     def names_under(self, root: str) -> list[str]:
-        """Return the names of the variables of a tree with this structure and another name."""
+        """Return the names of the variables of a tree with this structure whose name is `root`."""
         all_names = labels(self.template, root)
         return [all_names[place] for place in self.places]
 
     def variables(self, tree: Any, name: str = "tree", **options: Any) -> list:
-        """Return the variables of a tree that must have this structure, in its order: see `paired`."""
+        """Return the variables of a tree that must have this structure, in the order of the latter; see `paired`."""
         entries = paired(tree, self.template, name, **options)
         return [entries[place] for place in self.places]
 
     def build(self, variables: Sequence, statics: Sequence | None = None) -> Any:
-        """Return the tree with these variables, and with its own other leaves unless others are given."""
+        """Build a tree from its variables and its other leaves (`statics`; default: those of this structure)."""
         if self.is_leaf:
             return variables[0]
         if self.is_flat:
@@ -153,7 +156,7 @@ class TreeStructure:
 
 
 def field_names(tree: Any) -> tuple[str, ...] | None:
-    """Return the fields of an instance of a dataclass that can be rebuilt from them; None for all other values."""
+    """Return the names of the fields of a dataclass instance that is a tree; None for all other values."""
     kind = type(tree)
     fields = getattr(kind, "__dataclass_fields__", None)
     if fields is None or hasattr(kind, "__post_init__") or kind.__module__.partition(".")[0] == "sparsedp":
@@ -164,7 +167,7 @@ def field_names(tree: Any) -> tuple[str, ...] | None:
 
 
 def is_branch(tree: Any) -> bool:
-    """Whether a tree is a container, not a leaf."""
+    """Return True if a tree is a container, False if it is a leaf."""
     return isinstance(tree, BRANCHES) or field_names(tree) is not None
 
 
@@ -187,7 +190,7 @@ def branches_mapped(function: Callable, tree: Any) -> Any:
     if isinstance(tree, dict):
         if type(tree) is dict:
             return {key: function(key) for key in tree}
-        built = copy(tree)  # keeps what a subclass knows beside its entries, such as a default
+        built = copy(tree)  # keeps attributes of a subclass, such as the default of a defaultdict
         for key in tree:
             built[key] = function(key)
         return built
@@ -198,7 +201,7 @@ def branches_mapped(function: Callable, tree: Any) -> Any:
 
 
 def subscript(tree: Any, key: Any) -> str:
-    """Return how one would write an entry of a container: ``['u']``, ``[0]``, or ``.k`` of a field."""
+    """Return the Python expression for an entry of a container: ``['u']``, ``[0]``, or ``.k`` for a field."""
     if not isinstance(tree, BRANCHES):
         return f".{key}"
     fields = getattr(tree, "_fields", None)
@@ -222,7 +225,7 @@ def flatten(tree: Any) -> tuple[list, Callable]:
     entries : list
         The leaves, from left to right.
     rebuild : callable
-        ``rebuild(entries)`` is equal to ``tree``; it takes any iterable of as many leaves.
+        ``rebuild(values)`` returns the tree with these leaves, an iterable of the same length as `entries`.
 
     Examples
     --------
@@ -242,12 +245,12 @@ def leaves(tree: Any, depth: int = 0) -> list:
     ----------
     tree : tree
     depth : int
-        Number of containers around it.
+        Number of containers that enclose the tree, in recursive calls.
 
     Raises
     ------
     ValueError
-        If containers are nested too deep, as those that contain themselves.
+        If containers are nested more than `DEEPEST` deep, for example if a list contains itself.
 
     Examples
     --------
@@ -268,14 +271,14 @@ def leaves(tree: Any, depth: int = 0) -> list:
 
 
 def _build(tree, values):
-    """Return a tree of the same structure and types, its leaves taken from an iterator."""
+    """Return a tree with the same structure and types, and with leaves from an iterator."""
     if keys(tree) is None:
         return next(values)
     return branches_mapped(lambda key: _build(child(tree, key), values), tree)
 
 
 def placed(entries: Iterable, places: Iterable[int], values: Iterable) -> list:
-    """Return a sequence as a list with other values at some places.
+    """Copy a sequence to a list, and replace the entries at some positions.
 
     Examples
     --------
@@ -289,7 +292,7 @@ def placed(entries: Iterable, places: Iterable[int], values: Iterable) -> list:
 
 
 def copied(tree: Any) -> Any:
-    """Return a tree with copies of its arrays and sparse matrices, so that the caller may reuse them."""
+    """Return a tree with copies of its arrays and sparse matrices, so that the caller may modify the originals."""
     return mapped(_copied_leaf, tree)
 
 
@@ -300,7 +303,7 @@ def _copied_leaf(leaf):
 
 
 def mapped(function: Callable, tree: Any, *others: Any) -> Any:
-    """Apply a function to every leaf of a tree, or to the leaves of several trees that are paired with the first one.
+    """Apply a function to every leaf of a tree, or to the corresponding leaves of several trees; return the tree.
 
     Examples
     --------
@@ -313,7 +316,7 @@ def mapped(function: Callable, tree: Any, *others: Any) -> Any:
 
 
 def labels(tree: Any, root: str) -> list[str]:
-    """Return the names of the leaves of a tree, from left to right, as one would write them.
+    """Return the names of the leaves of a tree as Python expressions, from left to right.
 
     Examples
     --------
@@ -327,7 +330,7 @@ def labels(tree: Any, root: str) -> list[str]:
 
 
 def described(tree: Any) -> str:
-    """Describe a tree in words: its kind and its size."""
+    """Return a description of a tree for error messages: its type and its size or keys."""
     if isinstance(tree, dict):
         return f"a dict of {', '.join(map(str, tree)) or 'nothing'}"
     if isinstance(tree, (tuple, list)):
@@ -355,25 +358,25 @@ def paired(
 ) -> list:
     """Return the leaves of a tree in the order of the leaves of a reference tree.
 
-    Entries of dicts are paired by key, whatever their order, those of named tuples and dataclasses by field, and those
-    of plain tuples and lists by position.
+    Entries of dicts are paired by key, regardless of their order, entries of named tuples and dataclasses by field, and
+    entries of plain tuples and lists by position.
 
     Parameters
     ----------
     tree, reference : trees
     name : str
-        Root of the paths in messages: ``name['u'][0]``.
+        Name of the tree, with which paths in error messages begin: ``name['u'][0]``.
     owner : str
-        Follows a path in messages, such as " of stepper(heun)".
+        Text after the path in error messages, such as " of stepper(heun)".
     advice : str
-        Ends a message.
+        End of error messages.
     shapes : bool
-        Whether leaves must have the shapes of those of the reference.
+        Whether leaves must have the same shapes as the leaves of the reference.
     prefix : callable, optional
-        ``prefix(leaf)``: whether this leaf may stand for a whole branch of the reference; it is then repeated for each
-        of its leaves. Default: none may.
+        ``prefix(leaf)`` returns whether this leaf may stand for a whole branch of the reference. It is then repeated
+        for each leaf of the branch. By default no leaf may.
     error : type
-        Of the exception.
+        Type of the exception that is raised.
 
     Returns
     -------
@@ -382,8 +385,8 @@ def paired(
     Raises
     ------
     ShapeError
-        Or `error`, if a key is missing or unknown, or a branch or the shape of a leaf differs. The message gives the
-        path.
+        If a key is missing or unknown, or if the type of a container or the shape of a leaf differs. The message
+        contains the path. With the argument `error` an exception of that type is raised instead.
 
     Examples
     --------
@@ -400,12 +403,12 @@ def paired(
 
 
 def is_uniform(leaf: Any) -> bool:
-    """Whether a leaf is one number or None, which may stand for a whole branch."""
+    """Return True if a leaf is one number or None, which may stand for a whole branch."""
     return leaf is None or (np.ndim(leaf) == 0 and np.asarray(leaf).dtype.kind in "biufc")
 
 
 class _MismatchError(Exception):
-    """Two branches cannot be paired: why, and the subscripts that lead to them, the innermost first."""
+    """Raised if two branches cannot be paired, with the reason and the subscripts of the path, the innermost first."""
 
     def __init__(self, words):
         super().__init__(words)
@@ -470,7 +473,7 @@ def _places(tree, reference):
 
 
 def _check_names(kind, names, wanted):
-    """Refuse unknown and missing names."""
+    """Raise an error for unknown and missing names."""
     unknown = [repr(name) for name in names if name not in wanted]
     missing = [repr(name) for name in wanted if name not in names]
     if unknown:
@@ -486,17 +489,17 @@ def _check_names(kind, names, wanted):
 
 
 def norm(tree: Any) -> float:
-    """Return the Euclidean norm over the numbers of all leaves, without overflow or underflow.
+    """Return the Euclidean norm of the entries of all leaves, without overflow or underflow of squares.
 
     Parameters
     ----------
-    tree : tree
-        Of arrays and numbers, real or complex; None is ignored.
+    tree : tree of arrays and numbers
+        Real or complex; leaves that are None are ignored.
 
     Returns
     -------
     float
-        Infinite or NaN where a leaf is.
+        Infinity or NaN if a leaf contains one.
 
     Examples
     --------
@@ -511,7 +514,7 @@ def norm(tree: Any) -> float:
 
 
 def power_of_two(value: float) -> float:
-    """Return the next larger power of two that is a float; dividing by it changes no digits. 1 for 0."""
+    """Return the next larger power of two, at most 2**1023, or 1 for 0; division by it is exact."""
     if value <= 0:
         return 1.0
     exponent = np.frexp(value)[1]
@@ -519,7 +522,7 @@ def power_of_two(value: float) -> float:
 
 
 def safe_unit(size: float) -> float:
-    """Return a power of two near a size whose square may underflow or overflow; 1 where it does not."""
+    """Return a power of two near a size if its square could underflow or overflow, else 1."""
     if SMALL < size < LARGE:
         return 1.0
     return power_of_two(size)

@@ -1,8 +1,9 @@
-"""The first event in a step, located by Brent's method.
+"""Locate the first event in a step by Brent's method.
 
-After each accepted step the sign of every event is compared with the sign at the start of the segment. If it changed,
-the length l of the step is found by Brent's method with the scheme itself: with the step map S,
-g(S(u, l), params, t + l) = 0. So the time of an event, like the state there, belongs to the discrete solution.
+After each accepted step the sign of every event function g is compared with its sign at the start of the segment. If it
+has changed, the step is repeated with a length l for which g(S(u, l), params, t + l) = 0, where S(u, l) is the state
+after a step of the scheme of length l. Brent's method computes l. So the time and the state of an event belong to the
+discrete solution, not to an interpolant.
 
 References
 ----------
@@ -30,13 +31,13 @@ if TYPE_CHECKING:
 
 __all__ = ["Crossing", "EventDetector"]
 
-DIP = 0.3  # share of the values of an event in a step up to which a minimum between them is located
-HALVINGS = 60  # of a step, to find a point before the crossing
-SAME_TIME = 64 * EPS  # difference of two times, relative to the time, that counts as rounding
+DIP = 0.3  # search for two zeros in a step if a parabola predicts a minimum below this fraction of the values
+HALVINGS = 60  # number of halvings of a step to find a point before the zero
+SAME_TIME = 64 * EPS  # two times with a smaller relative difference are regarded as equal
 
 
 class Crossing(NamedTuple):
-    """An event in a step: the step up to there, the event, and its sign before."""
+    """An event in a step: the step that ends at the event, the event, and the sign of its function before it."""
 
     step: AcceptedStep
     event: Event
@@ -44,23 +45,23 @@ class Crossing(NamedTuple):
 
 
 class EventDetector:
-    """The signs of all events while a segment is crossed.
+    """Locates events in successive steps, and stores the sign of each event function between events.
 
     Parameters
     ----------
     events : list of Event
     problem : Problem
     u, params, t, h
-        Start of an interval, and its length; plain.
+        State, params and time at the start of an interval, and its length; plain values.
 
     Attributes
     ----------
     signs : list of float
-        Of each event in the present segment.
+        Sign of each event function in the current segment.
     last_sign : float
-        Of the last event that was located, before it.
+        Sign of the function of the last located event before this event.
     simultaneous : list of (Event, float)
-        Other events at the time of the last one, and their signs before it.
+        Other events at the time of the last event, with the signs of their functions before it.
     """
 
     def __init__(self, events: list[Event], problem: Problem, u: Any, params: Any, t: float, h: float) -> None:
@@ -77,12 +78,12 @@ class EventDetector:
         self.simultaneous: list[tuple[Event, float]] = []
 
     def surfaces(self) -> tuple[Surface, ...]:
-        """Return the surfaces beyond which the rate must not be evaluated."""
+        """Return the surfaces of events, with the side on which the rate may be evaluated."""
         pairs = zip(self.events, self.signs, strict=True)
         return tuple(Surface(event, sign) for event, sign in pairs if event.is_located(sign))
 
     def _sign_after(self, event: Event, u: Any, t: float, rounding: float = 0.0) -> float:
-        """Return the sign right after (u, t): on the surface itself, the sign of the rate of change."""
+        """Return the sign of an event function just after (u, t); if it is 0 there, the sign of its time derivative."""
         value = event.plain_value(u, self.params, t)
         of_state, of_time = event.gradient(u, self.params, t)
         rates = leaves(self.problem(u, self.params, t))
@@ -103,13 +104,14 @@ class EventDetector:
         ----------
         event : Event
         before, after : tree
-            The states before and after its jump.
+            The states before and after the jump of the event.
         t : float
 
         Returns
         -------
         list of Event
-            Those at the same time that the next step would not find: beyond the jump they do not change their sign.
+            Events at the same time that the next step would not find, because their functions have the new sign from
+            the start of this step.
         """
         residual = abs(event.plain_value(before, self.params, t))
         for place, other in enumerate(self.events):
@@ -129,7 +131,10 @@ class EventDetector:
         self.signs[self.events.index(event)] = self._sign_after(event, after, t)
 
     def event_at_end(self, u: Any, t: float) -> Event | None:
-        """Return an event at the end of an interval whose zero the next interval would take for its start, or None."""
+        """Return an event at the end of an interval, or None.
+
+        The next interval would not find such an event, since it determines the signs after its start.
+        """
         crossed = []
         for event, sign in zip(self.events, self.signs):
             if event.is_located(sign) and self._sign_after(event, u, t) == -sign:
@@ -148,12 +153,12 @@ class EventDetector:
         scheme : Adaptive
         step : AcceptedStep
         start : tuple
-            (u, params, t, h) with which the scheme began the segment, plain.
+            Plain arguments (u, params, t, h) of the scheme for the current segment.
         """
         t, h = start[2:]
         t = t + step.done * h
         crossings = []
-        unlocated = []  # events whose sign changes without a crossing that counts
+        unlocated = []  # positions of events whose sign changes without a zero that is located
         for place, event in enumerate(self.events):
             if self.signs[place] == 0:
                 unlocated.append(place)
@@ -168,12 +173,12 @@ class EventDetector:
             last = step
         else:
             last = first.step
-        for place in unlocated:  # the signs where the next step begins
+        for place in unlocated:  # update the signs at the start of the next step
             value = self.events[place].plain_value(scheme.tree(last.new), self.params, t + last.length * h)
             self.signs[place] = float(np.sign(value)) or self.signs[place]
         if first is not None:
             self.last_sign = first.sign
-            # Times that differ by rounding; where the first of them jumps, the others might not be found again.
+            # Events at the same time up to rounding. After the jump of the first one the others might not be found.
             latest = first.step.length + SAME_TIME * max(abs(t), h) / h
             self.simultaneous = [
                 (crossing.event, crossing.sign)
@@ -185,7 +190,7 @@ class EventDetector:
     def _crossing(
         self, scheme: Adaptive, step: AcceptedStep, start: tuple, event: Event, sign: float
     ) -> tuple[Crossing | None, bool]:
-        """Return the first crossing of an event in a step, and whether the sign changes without counting before."""
+        """Return the first located zero of an event in a step, and whether a zero before it was not located."""
         t, h = start[2:]
         t = t + step.done * h
         middle, share = scheme.inner_state(step)
@@ -206,13 +211,13 @@ class EventDetector:
             upper = dip
         if event.is_located(sign):
             return self._located(scheme, step, start, event, sign, 0.0, upper), False
-        # Only a crossing back, later in this step, counts.
+        # The first zero has the wrong direction; a second zero in this step has the other one.
         if upper == step.length or inside[2] < 0:
             return None, True
         return self._located(scheme, step, start, event, -sign, upper, step.length), True
 
     def _value(self, scheme: Adaptive, step: AcceptedStep, start: tuple, event: Event, length: float) -> float:
-        """Return the event after a part of a step."""
+        """Return the value of an event function after a step of another length."""
         t, h = start[2:]
         t = t + step.done * h
         part = scheme.partial_step(step, start, length)
@@ -230,9 +235,10 @@ class EventDetector:
         share: float,
         values: np.ndarray,
     ) -> float | None:
-        """Return a length after which the event has the other sign, where it crosses zero twice in a step; else None.
+        """Return a length between two zeros of an event in a step; None if there are none.
 
-        The parabola through the values at the start, inside and at the end decides whether to search.
+        The minimum is searched only if the parabola through the values at the start, inside and at the end of the step
+        has a small minimum in it.
         """
         quadratic, linear_part, constant_part = np.polyfit([0.0, share, 1.0], values, 2)
         if quadratic <= 0 or not 0 < -linear_part < 2 * quadratic:
@@ -258,7 +264,7 @@ class EventDetector:
         lower: float,
         upper: float,
     ) -> Crossing | None:
-        """Return the crossing of an event between two lengths of a step; None where there is none."""
+        """Return the zero of an event between two lengths of a step; None if there is none."""
         t, h = start[2:]
         t = t + step.done * h
         value = partial(self._value, scheme, step, start, event)

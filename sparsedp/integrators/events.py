@@ -1,4 +1,4 @@
-"""Events and breaks as the user gives them, and the side of an event's surface on which a rate is evaluated."""
+"""Events and breaks of `stepper`, and the side of the surface of an event on which a rate is evaluated."""
 
 from __future__ import annotations
 
@@ -18,28 +18,29 @@ if TYPE_CHECKING:
 
 __all__ = ["Event", "Surface", "break_times", "event_list", "times_of"]
 
-SHIFTS = 12  # attempts to move a state to the right side of a surface
-MARGIN = 4 * EPS  # distance to the surface of the first attempt, relative to the size of the state
+SHIFTS = 12  # number of attempts to move a state to the required side of a surface
+MARGIN = 4 * EPS  # distance from the surface in the first attempt, relative to the size of the state
 
 
 class Event:
-    """A function whose zero stops a step.
+    """A function whose zeros end a step.
 
     Parameters
     ----------
     function : callable
-        ``function(u, params)`` or ``function(u, params, t)``: a real number.
+        ``function(u, params)`` or ``function(u, params, t)`` returns a real number.
     jump : callable or None
-        The same arguments: the state with which the step continues.
+        ``jump(u, params)`` or ``jump(u, params, t)`` returns the state with which the integration continues.
     position : int
-        Its position in the list of events, for messages.
+        Position in the list of events, for error messages.
 
     Attributes
     ----------
     terminal : bool
-        Whether the interval ends there.
+        Whether the interval ends at the event.
     direction : float
-        As in SciPy's `solve_ivp`: > 0 only from negative to positive, < 0 only from positive to negative, 0 both.
+        As in SciPy's `solve_ivp`: > 0 locates only zeros from negative to positive, < 0 only from positive to negative,
+        and 0 both.
     """
 
     def __init__(self, function: Callable, jump: Callable | None, position: int) -> None:
@@ -55,7 +56,7 @@ class Event:
         self.direction = check_number(f"the direction of {self.name}", getattr(function, "direction", 0))
 
     def value(self, u: Any, params: Any, t: Any) -> Any:
-        """Return the number whose zero is located, traced or not."""
+        """Return the value of the event function, traced or not."""
         if self.takes_time:
             result = self.function(u, params, t)
         else:
@@ -69,25 +70,25 @@ class Event:
         return result.reshape(())
 
     def plain_value(self, u: Any, params: Any, t: float) -> float:
-        """Return the number whose zero is located, as a float."""
+        """Return the value of the event function as a float; raise NonFiniteError if it is not finite."""
         value = float(plain(self.value(u, params, t)))
         if not np.isfinite(value):
             raise NonFiniteError(f"{self.name} must be finite, got {value} at t = {t:.6g}")
         return value
 
     def gradient(self, u: Any, params: Any, t: float) -> tuple[Any, float]:
-        """Return the derivatives in the state and in the time, of plain arguments."""
+        """Return the derivatives with respect to the state and to the time, for plain arguments."""
         if isbox(self.value(u, params, t)):
             raise DerivativeError(f"{self.name} uses a traced value that is not an argument; put it into params")
         back = pullback(lambda point: 1.0 * self.value(point[0], params, point[1]), (u, float(t)))[1]
         return back(np.float64(1.0))
 
     def is_located(self, sign: float) -> bool:
-        """Return whether a zero crossing that begins with this sign counts."""
+        """Return whether zeros before which the event function has this sign are located, as `direction` asks."""
         return sign != 0 and sign * self.direction <= 0
 
     def state_after(self, u: Any, params: Any, t: Any) -> Any:
-        """Return the state with which the step continues."""
+        """Return the state with which the integration continues after the event."""
         if self.jump is None:
             return u
         if self.jump_takes_time:
@@ -98,7 +99,7 @@ class Event:
 
 
 def _takes_time(name: str, function: Callable) -> bool:
-    """Check a function of (u, params) or (u, params, t); return whether it takes the time."""
+    """Check that a function takes (u, params) or (u, params, t); return whether it takes the time."""
     example = "lambda u, params, t: ..."
     check_function(f"stepper, as {name},", function, example)
     takes_time = takes_arguments(function, 3)
@@ -107,7 +108,7 @@ def _takes_time(name: str, function: Callable) -> bool:
 
 
 def event_list(events: Any) -> list[Event]:
-    """Return the events of `stepper`: from a function, a pair (function, jump), or a list of these."""
+    """Convert the argument `events` of `stepper` (function, pair (function, jump), or list) to a list of Event."""
     if callable(events) or _is_pair(events):
         events = [events]
     if not isinstance(events, (list, tuple)):
@@ -126,7 +127,7 @@ def event_list(events: Any) -> list[Event]:
 
 
 def _is_pair(events: Any) -> bool:
-    """Whether a tuple is an event function and its jump, which may be None."""
+    """Return True for a tuple of an event function and its jump, which may be None."""
     if not isinstance(events, tuple) or len(events) != 2:
         return False
     function, jump = events
@@ -134,7 +135,7 @@ def _is_pair(events: Any) -> bool:
 
 
 def break_times(breaks: Any) -> Any:
-    """Return the breaks of `stepper`: a function of params, or a sorted array of times."""
+    """Convert the argument `breaks` of `stepper` to a sorted array of times; return a function of params unchanged."""
     if callable(breaks):
         check_takes("stepper", breaks, 1, "breaks=lambda params: [params['off']]")
         return breaks
@@ -164,13 +165,13 @@ def times_of(breaks: Any) -> list:
 
 
 class Surface:
-    """The zeros of an event, and the side of them on which a rate is evaluated.
+    """The surface on which an event is 0, and the side of it on which a rate is evaluated.
 
     Parameters
     ----------
     event : Event
     sign : float
-        Of the event on this side.
+        Sign of the event function on this side.
     """
 
     __slots__ = ("event", "sign")
@@ -180,7 +181,7 @@ class Surface:
         self.sign = sign
 
     def inside(self, u: Any, params: Any, t: Any) -> tuple:
-        """Return (u, t), or the nearest point on the side of the surface, with the derivative of (u, t)."""
+        """Return (u, t) or, if it lies on the other side, a point near it on this side; derivatives do not change."""
         state, plain_params, time = untraced((u, params, t))
         value = self.event.plain_value(state, plain_params, time)
         if value * self.sign > 0:
@@ -216,14 +217,14 @@ class Surface:
 
 
 def _moved(u: Any, directions: list, shift: float) -> Any:
-    """Return u + shift * direction, leaf by leaf."""
+    """Return u + shift * direction, computed for each leaf."""
     entries, rebuild = flatten(u)
     pairs = zip(entries, directions, strict=True)
     return rebuild([leaf if leaf is None else leaf + shift * direction for leaf, direction in pairs])
 
 
 def _weight(leaf: Any) -> Any:
-    """Return the size of each entry of an array of the state, as for the default floor of errors; 0 of a constant."""
+    """Return |u| + floor with the default floor of errors for an array of the state; zeros for a constant leaf."""
     if leaf is None:
         return np.zeros(())
     if not is_variable(leaf):

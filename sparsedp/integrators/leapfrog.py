@@ -1,20 +1,23 @@
-"""Leapfrog steps of a first-order system p' = f(q), q' = g(p), with both fields half a step apart; and sponge layers.
+"""Leapfrog steps of a first-order system dp/dt = f(q), dq/dt = g(p), and damping layers ("sponges") for waves.
 
-q belongs to times halfway between those of p. A step h takes the state (p_n, q_(n-1/2)) to (p_(n+1), q_(n+1/2)):
+The field q is staggered in time: it is given half a step before p. A step of length h advances the state
+(p_n, q_(n-1/2)) to (p_(n+1), q_(n+1/2)), written with primes for new values:
 
-    q' = q + h g(p),        p' = p + h f(q'),
+    q' = q + h g(p),        p' = p + h f(q').
 
-second order, stable up to h w = 2 for the fastest frequency w, and reversible. w^2 is the largest eigenvalue of -f' g':
-it is estimated once for each h and params, from below, by a few steps of Arnoldi's method. The reversed step is
+The method has order 2, is reversible, and is stable for h w <= 2, where w is the largest frequency. w^2 is the largest
+eigenvalue of -f' g' (derivatives of f and g). It is estimated once for each h and params by a few steps of Arnoldi's
+method, which gives a lower bound. The reversed step is
 
     p = p' - h f(q'),       q = q' - h g(p).
 
-Damping with the rates s >= 0 [1 / time], one for each field, is split evenly over old and new values, stable for any s:
+Each field may be damped at a rate s >= 0 [1 / time]. The damping term uses the mean of old and new values, which is
+stable for any s:
 
     x' = ((1 - s h / 2) x + h r) / (1 + s h / 2) = x + h (r - s x) / (1 + s h / 2),       r = f or g.
 
-Where p and q are damped at the same rate the impedance does not change: a wave enters a sponge layer without an echo,
-except for the effects of the slope of the rate and of the angle.
+If p and q are damped at the same rate, the impedance does not change, so that a wave enters a sponge without
+reflection. Small reflections remain because s varies in space, and for waves at an oblique angle.
 
 References
 ----------
@@ -51,23 +54,23 @@ if TYPE_CHECKING:
 
 __all__ = ["Leapfrog", "sponge"]
 
-# Products and tolerance of Arnoldi's method: (h w)^2 is right to 0.4 % on 300^2 cells, to 2 % at worst.
+# Number of products and tolerance of Arnoldi's method. The error of (h w)^2 is 0.4 % on 300^2 cells, at most 2 %.
 PRODUCTS = 20
 ROUGH = 0.1
-SLACK = 1e-3  # excess of (h w)^2 over the limit, from which on a step is refused
-SAFE = 0.98  # share of the limit that the message recommends
-POWER = 2  # of the depth in a sponge layer, with which its rate grows: of 1 to 4 the least echo, with echo=1e-3
+SLACK = 1e-3  # relative excess of (h w)^2 over the stability limit above which an error is raised
+SAFE = 0.98  # fraction of the largest stable dt that the error message recommends
+POWER = 2  # the rate in a sponge grows with this power of the depth; of 1 to 4 it had the least echo for echo=1e-3
 
 
 class Leapfrog(Scheme):
-    """Steps of p' = f(q, params), q' = g(p, params): see the head of this file.
+    """Steps of dp/dt = f(q, params), dq/dt = g(p, params): see the docstring of this module.
 
     Parameters
     ----------
     rates : pair of callables
         f and g.
     damping : None, or pair of numbers or trees
-        Of p and of q.
+        Damping rates of p and of q.
     """
 
     stiff = ()
@@ -88,7 +91,7 @@ class Leapfrog(Scheme):
         self._fastest_squares = Cache()
 
     def check_stable(self, state: Any, params: Any, h: Any, dependencies: Any) -> None:
-        """Refuse a step that would grow without bound; `dependencies`: all that the frequencies depend on."""
+        """Raise UnstableStepError if waves grow without bound; `dependencies` are the key of the cached estimate."""
         state, params, h, dependencies = mapped(replicated, untraced((state, params, h, dependencies)))
         key = h, *leaves(dependencies)
         fastest = self._fastest_squares.find(key)
@@ -103,10 +106,10 @@ class Leapfrog(Scheme):
             )
 
     def _fastest_square(self, state: Any, params: Any, h: float) -> float:
-        """Return (h w)^2 of the fastest waves."""
+        """Return (h w)^2 for the largest frequency w."""
         p, q = _fields(state)
         f, g = self.rates
-        p = mapped(lambda leaf: leaf if leaf is None else leaf * 1.0, p)  # whole numbers have no slope
+        p = mapped(lambda leaf: leaf if leaf is None else leaf * 1.0, p)  # convert integers, which have no derivative
         flat = FlatDeviation(p, is_variable, [1.0] * len(leaves(p)))
         n = flat.space.size
 
@@ -120,11 +123,11 @@ class Leapfrog(Scheme):
         if n <= PRODUCTS:
             values = np.linalg.eigvals(np.reshape([product(unit) for unit in np.eye(n)], (n, n)))
         else:
-            start = np.random.default_rng(0).standard_normal(n)  # the same bits in every run
+            start = np.random.default_rng(0).standard_normal(n)  # a fixed seed, so that every run gives the same bits
             operator = LinearOperator((n, n), product, dtype=float)
             try:
                 values = eigs(operator, 1, which="LR", v0=start, ncv=PRODUCTS, tol=ROUGH, return_eigenvectors=False)
-            except ArpackError:  # of a map that is 0
+            except ArpackError:  # raised if the map is 0
                 return 0.0
         return float(np.max(values.real, initial=0.0))
 
@@ -137,7 +140,7 @@ class Leapfrog(Scheme):
         return _advanced(p, f(q, params), h, s, "damping[0]"), q
 
     def check_reversible(self) -> None:
-        """Refuse a step with damping."""
+        """Raise ValueError if the step has damping."""
         if self.damping is not None:
             raise ValueError(
                 "a leapfrog step with damping cannot be reversed: the damped part would grow; give rollout a memory "
@@ -145,7 +148,7 @@ class Leapfrog(Scheme):
             )
 
     def back(self, state: Any, params: Any, h: Any) -> tuple:
-        """Return the state before a step."""
+        """Reverse a step: return the state before it."""
         p, q = _fields(state)
         f, g = self.rates
         p = combine(p, (-h, f(q, params)))
@@ -157,7 +160,7 @@ def _fields(state: Any) -> Any:
 
 
 def _advanced(x: Any, rate: Any, h: Any, damping: Any, name: str) -> Any:
-    """Return x after h, with its rate; `name` of the damping is for messages."""
+    """Return x after a time h with the given rate; `name` is the name of the damping in error messages."""
     if damping is None:
         return combine(x, (h, rate))
     entries, rebuild = flatten(x)
@@ -170,29 +173,32 @@ def _advanced(x: Any, rate: Any, h: Any, damping: Any, name: str) -> Any:
 def sponge(
     grid: Grid, cells: int | Mapping[str, Any], speed: float, echo: float = 1e-3
 ) -> tuple[npt.NDArray, npt.NDArray]:
-    """Return rates at which waves decay near the ends of a grid: damping for `stepper("leapfrog", ...)`.
+    """Return damping rates for layers ("sponges") at the ends of a grid that absorb waves; see `stepper`.
 
     Parameters
     ----------
     grid : Grid
     cells : int, or dict
-        How many cells deep the sponge is at every bounded end; or {"x": 8, "y": (lower, upper)}, 0 for none, axes that
-        are not named have none.
+        Thickness of the sponge in cells, at both ends of every axis that is not periodic; or a dict such as
+        {"x": 8, "y": (lower, upper)} with the thickness for each axis or end. 0 means no sponge, and axes that are not
+        in the dict have none.
     speed : float
-        Of the waves there, the fastest [length / time].
+        Largest speed of the waves in the sponge [length / time].
     echo : float
-        Remaining share of a wave that enters at a right angle, is reflected at the wall, and leaves.
+        Ratio of the amplitude of a wave that leaves the sponge, after reflection at the wall, to the amplitude of the
+        wave that entered it at a right angle.
 
     Returns
     -------
-    (array of grid.shape, array of grid.faces.shape)
-        Rates in the cells and on the faces [1 / time]: for the state (p, v) of pressures and velocities, as the
-        `damping` of `stepper` takes them.
+    in_cells : array of grid.shape
+    on_faces : array of grid.faces.shape
+        Damping rates [1 / time] of cell and face fields. The pair is the argument `damping` of
+        ``stepper("leapfrog", ...)`` for the state (p, v) of pressures and velocities.
 
     Raises
     ------
     ValueError
-        If a sponge is deeper than its axis, an axis that is named has no ends, or speed or echo are out of range.
+        If a sponge is thicker than its axis, if `cells` names a periodic axis, or if speed or echo is out of range.
 
     See Also
     --------
@@ -200,9 +206,10 @@ def sponge(
 
     Notes
     -----
-    The rate grows with the square of the depth: s = 1.5 c log(1 / echo) (depth / width)^2 / width. Measured for round
-    waves around a pulse: an echo of 2e-4 of the pulse where the sponge is two wavelengths deep, 5e-4 for one and a
-    half, 2e-3 for one. A mean of p that is not 0 leaves an echo of 1e-2, where open space leaves none.
+    The rate grows with the square of the depth: s = 1.5 c log(1 / echo) (depth / width)^2 / width, where c is the speed
+    and width the thickness of the sponge. For circular waves from a pulse the measured echo, relative to the pulse, was
+    2e-4 for a sponge of two wavelengths, 5e-4 for one and a half, and 2e-3 for one. If the mean of p is not 0, an echo
+    of 1e-2 remains, which does not exist in an unbounded domain.
 
     References
     ----------
@@ -224,7 +231,7 @@ def sponge(
         raise ValueError(f"sponge needs a number of cells or a pair for axes of {bounded}, got {cells!r}")
 
     def rates(places: Any) -> np.ndarray:
-        """Return the rates at places, a list of coordinates by axis."""
+        """Return the rates at places, given as a list with the coordinates along each axis."""
         total: Any = 0
         for axis, name in enumerate(grid.axes):
             for is_upper, count in enumerate(np.broadcast_to(depths.get(name, 0), 2)):
@@ -240,7 +247,7 @@ def _rate(grid: Grid, axis: int, is_upper: int, count: Any, x: Any) -> np.ndarra
     widths = grid.widths[axis]
     if not (is_whole(count, 0) and count <= widths.size):
         raise ValueError(f"sponge on {AXES[axis]} needs 0 to {widths.size} cells, got {count}")
-    count = int(count)  # 2.0 counts as a whole number
+    count = int(count)  # `is_whole` also accepts floats such as 2.0
     width = np.inf
     if count:
         width = np.sum(widths[-count:] if is_upper else widths[:count])

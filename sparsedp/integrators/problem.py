@@ -1,13 +1,13 @@
-"""The right-hand side of a problem, the checks of its numbers, and arithmetic on states.
+"""The right-hand side of a problem, checks of its arguments, and arithmetic on states.
 
-A problem is u' = c L u + rate(u, params, t) + source(params, t). A state is an array, or any tree of arrays; each field
-of a tree has a c L of its own, or none.
+A problem is u' = c L u + rate(u, params, t) + source(params, t). A state is an array, or any tree of arrays. In a tree
+each field has its own coefficient c and operator L, or no such term.
 
-Where a rate switches, at a time or on a surface of the state, it has two values. Steps that end there need the value
-before, steps that begin there the value after. The stepper then passes the params of the rate as `Sided`, and `Problem`
-evaluates the rate a rounding error inside the interval, and on the side of the surface where the step began. The shifts
-are constants: they have no derivative. So the derivative of a Runge-Kutta stage beyond a surface is the derivative of
-the smooth continuation of the rate, to an error of the size of the shift.
+If a rate jumps, at a time or on a surface of the state, it has two values there. A step that ends at the jump needs the
+value before it, a step that begins there the value after it. So the stepper passes the params as `Sided`, and `Problem`
+evaluates the rate at a time inside the interval, shifted by a rounding error, and at a state on the side of the surface
+where the step began. The shifts are constants without a derivative. So if a Runge-Kutta stage lies beyond a surface,
+its derivative is that of the smooth continuation of the rate, up to an error of the size of the shift.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ __all__ = [
 
 
 def combine(u: Any, *pairs: tuple) -> Any:
-    """Return u plus the sum of factor * tree over the pairs (factor, tree), leaf by leaf.
+    """Return u plus the sum of factor * tree over the pairs (factor, tree), computed for each leaf.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def combine(u: Any, *pairs: tuple) -> Any:
     (3.0, 6.0)
     """
     shape = getattr(u, "shape", None)
-    if shape is not None and all(getattr(rate, "shape", None) == shape for _, rate in pairs):  # one array: quickly
+    if shape is not None and all(getattr(rate, "shape", None) == shape for _, rate in pairs):  # fast path for one array
         for factor, rate in pairs:
             u = u + factor * rate
         return u
@@ -77,15 +77,15 @@ def combine(u: Any, *pairs: tuple) -> Any:
 
 
 def field_leaves(tree: Any, u: Any, name: str = "rate") -> list:
-    """Return the leaves of a rate, one for each of the state u.
+    """Return the leaves of a rate in the order of the leaves of the state u.
 
-    Shapes must be equal: broadcasting one field into another would hide a mistake.
+    Shapes must be equal, because broadcasting one field to the shape of another would hide a mistake.
     """
     return paired(tree, u, name, advice="; return a tree like the state", shapes=True)
 
 
 def like(new: Any, u: Any) -> Any:
-    """Return a new state in the dtypes of the old one: rates in double precision do not widen a float32 state."""
+    """Convert a new state to the dtypes of the old one, so that float64 rates do not widen a float32 state."""
     return mapped(_rounded, new, u)
 
 
@@ -99,14 +99,14 @@ def _rounded(leaf: Any, old: Any) -> Any:
 
 
 def later(t: Any, h: Any) -> Any:
-    """Return the time t + h, or None where nothing depends on the time."""
+    """Return the time t + h, or None if t is None because nothing depends on the time."""
     if t is None:
         return t
     return t + h
 
 
 def untraced(tree: Any) -> Any:
-    """Return the same tree without a trace."""
+    """Return the tree of the plain values of traced leaves."""
     return mapped(plain, tree)
 
 
@@ -114,14 +114,17 @@ def untraced(tree: Any) -> Any:
 
 
 def check_pair(name: str, value: Any, example: str) -> Any:
-    """Return a tuple or list of two entries; refuse anything else."""
+    """Return the value if it is a tuple or list of two entries; raise TypeError otherwise."""
     if not (isinstance(value, (tuple, list)) and len(value) == 2):
         raise TypeError(f"{name} must be a pair, got {type(value).__name__}; write {example}")
     return value
 
 
 def real_number(value: Any, name: str, sign: str = "", advice: str = "") -> Any:
-    """Return one finite real number, traced or as a float, so that a float32 state stays in single precision."""
+    """Check that a value is one finite real number; return it if traced, else as a Python float.
+
+    A Python float does not widen a float32 state to float64.
+    """
     check_number(name, plain(value), sign, advice)
     if isbox(value):
         return value
@@ -129,7 +132,7 @@ def real_number(value: Any, name: str, sign: str = "", advice: str = "") -> Any:
 
 
 def takes_arguments(fun: Callable | None, least: int) -> bool:
-    """Return whether a function takes at least this many arguments: then the last one is the time."""
+    """Return whether a function has at least this number of required arguments, the last of which is the time."""
     if fun is None:
         return False
     try:
@@ -145,25 +148,25 @@ def takes_arguments(fun: Callable | None, least: int) -> bool:
 
 
 class Side:
-    """An interval of time, and the sides of event surfaces, in which a rate is evaluated.
+    """The time interval, and the sides of the surfaces of events, to which evaluations of a rate are restricted.
 
     Parameters
     ----------
     earliest, latest : float
         First and last time at which the rate may be evaluated.
     surfaces : tuple of objects
-        ``surface.inside(u, params, t)`` returns the state and time on the right side of it.
+        ``surface.inside(u, params, t)`` moves the state and time to the required side of the surface.
     """
 
     __slots__ = ("earliest", "latest", "surfaces")
 
     def __init__(self, earliest: float = -np.inf, latest: float = np.inf, surfaces: tuple = ()) -> None:
         self.earliest = earliest
-        self.latest = max(earliest, latest)  # between adjacent numbers there is none: the later one is after both
+        self.latest = max(earliest, latest)  # if two breaks are adjacent floats, no time lies between them
         self.surfaces = surfaces
 
     def time(self, t: Any) -> Any:
-        """Return the time, clipped to the interval; its derivative is 1."""
+        """Return the time clipped to the interval, with the derivative 1 also if it is clipped."""
         if t is None:
             return None
         value = plain(t)
@@ -181,7 +184,7 @@ class Side:
 
 
 class Sided(NamedTuple):
-    """Params of a rate, and the side of switching times and surfaces on which it is evaluated."""
+    """Params of a rate, and the side of breaks and event surfaces on which it is evaluated."""
 
     params: Any
     side: Side
@@ -206,7 +209,7 @@ class StiffTerm:
         L.
     coefficient : number, or function of params
     place : str
-        Its place in the option `linear`, for messages.
+        Path of the term in the option `linear`, for error messages.
     """
 
     described = "one operator"
@@ -229,7 +232,7 @@ class StiffTerm:
 
 
 def _stiff_terms(linear: Any, place: str) -> Any:
-    """Return the option `linear` with a StiffTerm in place of each operator and None where there is none."""
+    """Convert the option `linear` to a tree with a StiffTerm in place of each operator, and None for no term."""
     if linear is None or (isinstance(linear, (int, float)) and linear == 0):
         return None
     op = linear
@@ -244,12 +247,12 @@ def _stiff_terms(linear: Any, place: str) -> Any:
 
 
 def _is_none(term: Any) -> bool:
-    """Whether a term stands for a whole branch without a stiff part."""
+    """Return True for None, which stands for a whole branch without a stiff part."""
     return term is None
 
 
 def _coefficient_from_params(params: Any) -> Any:
-    """Return c of a rate that is an Operator: the params themselves, 1 where there are none."""
+    """Return the coefficient c of a rate that is an Operator: the params, or 1 if they are None."""
     if params is None:
         return 1.0
     return params
@@ -261,19 +264,19 @@ class Problem:
     Parameters
     ----------
     rate, linear, source, timed
-        As `stepper` takes them.
+        Arguments of `stepper`.
 
     Attributes
     ----------
     stiff : list of StiffTerm
-        Those of all fields.
+        The terms of all fields.
     operators : set of Operator
-        Every L there is.
+        The operators L of all terms.
     timed : bool
         Whether the state is the pair (u, t).
     rate_takes_time, source_takes_time : bool
     linear : bool
-        Whether the right-hand side is c L u + source: a step is a linear solve.
+        Whether the right-hand side is c L u + source, so that an implicit step is a linear solve.
     """
 
     def __init__(self, rate: Any, linear: Any, source: Any, timed: bool | None) -> None:
@@ -307,14 +310,14 @@ class Problem:
             raise TypeError("stepper needs a rate, a function rate(u, params) or an Operator, or the option linear")
 
     def terms(self, u: Any) -> list:
-        """Return the StiffTerm of each field of a state, None where there is none."""
+        """Return a list with the StiffTerm of each field of a state, or None for a field without one."""
         advice = "; write None for a field without a stiff part"
         return paired(self._terms, u, "linear", advice=advice, prefix=_is_none, error=TypeError)
 
     def on_fields(self, act: Callable, h: Any, params: Any, u: Any, *trees: Any) -> Any:
-        """Return the tree of act(L, h c, leaf, ...) for each field of the state u, and of trees like it.
+        """Return the tree of the results act(L, h c, leaf, ...), for the leaves of the state u and of trees like it.
 
-        L is None where nothing is stiff. None in the state stays None.
+        For a field without a stiff term the call is act(None, h, leaf, ...). A leaf None of the state stays None.
         """
         entries, rebuild = flatten(u)
         rows = zip(self.terms(u), entries, *(field_leaves(tree, u) for tree in trees), strict=True)
@@ -329,7 +332,7 @@ class Problem:
         return rebuild(results)
 
     def rate_value(self, u: Any, params: Any, t: Any) -> Any:
-        """Return the rate alone, or None; a copy, since it may write into the array that it returned before."""
+        """Return a copy of the value of the user's rate, which may reuse its result array; None without a rate."""
         if self.rate is None:
             return None
         if type(params) is Sided:
@@ -340,7 +343,7 @@ class Problem:
         return copied(_call_rate(self.rate, u, (params,)))
 
     def source_value(self, params: Any, t: Any) -> Any:
-        """Return the source alone, or None."""
+        """Return a copy of the value of the source; None without a source."""
         if self.source is None:
             return None
         if type(params) is Sided:
@@ -367,7 +370,7 @@ def _product(op: Operator | None, coefficient: Any, leaf: Any) -> Any:
 
 
 def _call_rate(rate: Callable, u: Any, arguments: Sequence) -> Any:
-    """Call a rate, which must not write into the state."""
+    """Call a rate with a read-only state; raise ValueError if it writes into the state."""
     try:
         return rate(mapped(frozen, u), *arguments)
     except (TypeError, ValueError) as error:
@@ -379,7 +382,7 @@ def _call_rate(rate: Callable, u: Any, arguments: Sequence) -> Any:
 
 
 def _error_without_trace(rate: Callable, u: Any, arguments: Sequence) -> Exception | None:
-    """Return the error that a rate raises on plain values: NumPy names a write into the state only there."""
+    """Return the error that a rate raises for plain values, whose message names a read-only array."""
     u, arguments = untraced((u, arguments))
     try:
         rate(mapped(frozen, u), *arguments)
