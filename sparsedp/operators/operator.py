@@ -1,4 +1,4 @@
-"""Operator: a constant linear map between two spaces that knows its transpose."""
+"""Operator: a constant linear map between two spaces, with its transpose."""
 
 from __future__ import annotations
 
@@ -27,32 +27,34 @@ from sparsedp.operators.structure.lazy import Diagonal, compose, times, total
 
 __all__ = ["Operator"]
 
-# Up to this number of unknowns for each pass, one sparse product costs less than stencil passes: benchmarks/apply.py.
+# Up to this number of unknowns (times the number of passes, if kernels are compiled), a sparse matrix product is faster
+# than the matrix-free form: see benchmarks/apply.py.
 EXPLICIT_BELOW_COMPILED = 4608
 EXPLICIT_BELOW_PLAIN = 262144
-AS_OPERATOR = "dp.from_matrix(M, A.domain, A.codomain)"  # a sparse matrix M beside an operator A
-SPY_BELOW = 20_000  # rows and columns of a matrix that a notebook draws, in 0.1 s
+AS_OPERATOR = "dp.from_matrix(M, A.domain, A.codomain)"  # advice when M, a sparse matrix, is combined with A
+SPY_BELOW = 20_000  # matrices with at most this many rows and columns are drawn in notebooks, which takes 0.1 s
 
 
 class Operator(Frozen, Reconstructible):
-    """A constant linear map from fields on `domain` to fields on `codomain`. Frozen.
+    """A constant, immutable linear map from fields on `domain` to fields on `codomain`.
 
-    Builders such as `gradient` and `from_matrix` return operators; ``@ + - *`` combine them, ``op(u)`` applies one. The
-    VJP of ``op(u)`` is ``op.T(g)``.
+    Functions such as `gradient` and `from_matrix` return operators. Operators can be combined by ``@``, ``+``, ``-``
+    and ``*``, and ``op(u)`` applies an operator to a field. The VJP of ``op(u)`` for a cotangent g is ``op.T(g)``.
 
     Parameters
     ----------
     structure : Structure
-        The linear map of flat arrays.
+        The linear map between flat arrays.
     domain, codomain : Space
     name : str
     form : "explicit" or "matrix-free", optional
-        Default: by a fixed rule, from the size, the structure and the presence of numba.
+        Whether the operator is applied by a sparse matrix. Default: chosen by a fixed rule that depends on the size,
+        the structure, and whether numba is installed.
 
     Raises
     ------
     ShapeError
-        If the structure does not fit the spaces.
+        If the shape of the structure does not match the spaces.
 
     See Also
     --------
@@ -60,7 +62,7 @@ class Operator(Frozen, Reconstructible):
 
     Notes
     -----
-    Complex numbers: see docs/guides/complex_numbers.md.
+    For complex fields and operators see docs/guides/complex_numbers.md.
 
     Examples
     --------
@@ -109,19 +111,24 @@ class Operator(Frozen, Reconstructible):
         arguments = self.structure, self.domain, self.codomain, self.name, self.form
         if self.form == "matrix-free" or "_origin" not in self.__dict__ or isinstance(self.structure, Matrix):
             return Operator, arguments
-        # The matrix of a transpose has the bits of the matrix of its origin, which is not pickled.
+        # The matrix of this transpose was computed from that of its origin. The origin is not pickled, so the matrix
+        # is: assembling it again could give other rounding errors.
         return _with_matrix, (self._matrix_structure, *arguments)
 
     # ------------------------------------------------------------ application
 
     def _origin(self):
-        """Return the operator whose transpose this is, while it exists; else None. Replaced by a weak reference."""
+        """Return the operator of which this is the transpose, or None.
+
+        `_make_transpose` replaces this method by a weak reference, which returns None after that operator was deleted.
+        """
         return None
 
     def __call__(self, u: Any) -> Any:
-        """Apply to a field of the shape of the domain, or to a batch of them. Differentiable; the result is new.
+        """Apply the operator to a field, or to a batch of fields. Differentiable; returns a new array.
 
-        Leading axes are a batch: from (50, *domain.shape) to (50, *codomain.shape).
+        Additional leading axes of `u` are batch axes: an array of shape (50, *domain.shape) gives a result of shape
+        (50, *codomain.shape).
         """
         try:
             if active or isbox(u):
@@ -131,14 +138,15 @@ class Operator(Frozen, Reconstructible):
             raise shortened(error)  # noqa: B904 SPARSEDP_TRACEBACK=full keeps all frames
 
     def apply(self, u: Any, out: np.ndarray | None = None) -> Any:
-        """Apply to a plain array, without the tape.
+        """Apply the operator to a plain array, without recording for differentiation.
 
         Parameters
         ----------
         u : array, shape (..., *`domain.shape`)
-            Leading axes are a batch of fields.
+            Leading axes are batch axes.
         out : array, shape (..., *`codomain.shape`), optional
-            Reused for the result: contiguous, of the dtype of the result, no overlap with `u`.
+            Array into which the result is written. It must be contiguous, have the dtype of the result, and not overlap
+            `u`.
 
         Returns
         -------
@@ -149,14 +157,14 @@ class Operator(Frozen, Reconstructible):
         ShapeError
             If `u` or `out` has another shape.
         TypeError
-            If `u` does not hold numbers, or `out` has another dtype.
+            If the entries of `u` are not numbers, or `out` has another dtype.
         ValueError
             If `out` overlaps `u` or is not contiguous.
         """
         return self.backend.apply(self, u, out)
 
     def apply_array(self, u: Any, out: np.ndarray | None = None) -> np.ndarray:
-        """Apply to a NumPy array: see `apply`."""
+        """Apply the operator to a NumPy array: see `apply`."""
         u = field_array(self, u, batch=True)
         shape = self.codomain.shape
         dtype = result_dtype(self.structure, u.dtype)
@@ -175,23 +183,23 @@ class Operator(Frozen, Reconstructible):
 
     @cached_property
     def local_structure(self) -> Structure:
-        """The linear map on the entries of fields that this process holds."""
+        """The linear map restricted to the field entries that are stored in this process."""
         return self.backend.local_structure(self)
 
     @cached_property
     def _acting(self):
-        """The structure that is applied in this form."""
+        """The structure used to apply the operator: the matrix in explicit form, `structure` otherwise."""
         if self.form == "explicit":
             return self._matrix_structure
         return self.structure
 
     @cached_property
     def _matrix_structure(self):
-        """The entries as a Matrix."""
+        """The operator as a Matrix structure, assembled at the first access."""
         if isinstance(self.structure, Matrix):
             return self.structure
         origin = self._origin()
-        if origin is not None:  # transposed entry by entry, so that the two matrices hold the same bits
+        if origin is not None:  # transpose the matrix of the origin, so that both have bitwise the same entries
             return origin._matrix_structure.transpose()
         return assembled(self.structure, self.name)
 
@@ -203,33 +211,33 @@ class Operator(Frozen, Reconstructible):
         return self._origin() or self._transposed or self._make_transpose()
 
     def _make_transpose(self):
-        """Return the transpose, and keep it."""
+        """Build the transpose, store it for later calls, and return it."""
         if self.name.endswith(".T"):
             name = self.name[:-2]
         else:
             name = f"{_bracket(self.name)}.T"
         transposed = self._acting_as(self.structure.transpose(), self.codomain, self.domain, name)
-        if self.tangent is self:  # otherwise the transpose of the transpose is the operator without checks
-            # Weak: a cycle would keep large matrices alive until the garbage collector runs.
+        if self.tangent is self:  # otherwise (A.T).T is not A, but A without the checks of primal data
+            # A weak reference, because a reference cycle would keep large matrices alive until garbage collection.
             transposed.__dict__["_origin"] = weakref.ref(self)
         self.__dict__["_transposed"] = transposed
         return transposed
 
     @property
     def tangent(self) -> Operator:
-        """The operator for tangents: this one, without checks of primal data."""
+        """The same operator without checks of primal data, for tangents and cotangents in derivative rules."""
         return self._unchecked or self
 
     @cached_property
     def _unchecked(self):
-        """The operator without checks; None if it has none."""
+        """The operator without checks of primal data; None if this operator has no such checks."""
         structure = self.structure.tangent()
         if structure is self.structure:
-            return None  # not the operator itself: the reference cycle would be freed late
+            return None  # returning self would create a reference cycle, which delays freeing the memory
         return self._acting_as(structure, self.domain, self.codomain, self.name)
 
     def _acting_as(self, structure, domain, codomain, name):
-        """Return an operator of the same class and form."""
+        """Return an operator with another structure and other spaces, in the same form."""
         return Operator(structure, domain, codomain, name, self.form)
 
     def __matmul__(self, other: Any) -> Any:
@@ -244,7 +252,7 @@ class Operator(Frozen, Reconstructible):
         return NotImplemented
 
     def _compose(self, other):
-        """Return the product with another operator."""
+        """Return the operator self @ other."""
         if not fits(self.domain, other.codomain):
             raise ShapeError(f"{self.name} takes {self.domain}, but {other.name} gives {other.codomain}")
         name = f"{_bracket(self.name)} @ {_bracket(other.name)}"
@@ -268,7 +276,7 @@ class Operator(Frozen, Reconstructible):
         structure = total(self.structure, other.structure)
         return Operator(structure, self.domain, self.codomain, f"{self.name} + {other.name}")
 
-    __radd__ = __add__  # raises with advice: only sums of operators are defined
+    __radd__ = __add__  # called only for operands that are not operators: raises an error with advice
 
     def __sub__(self, other: Any) -> Operator:
         if isinstance(other, (Operator, Number)) or issparse(other):
@@ -285,7 +293,7 @@ class Operator(Frozen, Reconstructible):
         return self * -1.0
 
     def _refuse_traced_factor(self):
-        """Raise the error of a traced number that scales an operator."""
+        """Raise DerivativeError, because the factor of an operator must be constant, not traced by autograd."""
         raise DerivativeError(
             f"a traced number cannot scale an operator; write nu * {self.name}(u), and to solve a system with it "
             "dp.implicit(residual)"
@@ -298,7 +306,7 @@ class Operator(Frozen, Reconstructible):
             raise TypeError(f"{self.name} * {factor.name} is not defined; write A @ B to compose operators")
         if not _is_scalar(factor):
             return NotImplemented
-        number: Any = complex(factor)  # NumPy has no integers of more than 64 bits
+        number: Any = complex(factor)  # also converts Python integers of more than 64 bits, which NumPy cannot
         label = "-" if number == -1 else f"{factor:g} * "
         if not np.iscomplexobj(factor):
             number = number.real
@@ -317,14 +325,14 @@ class Operator(Frozen, Reconstructible):
             raise NonFiniteError(f"{self.name} can be divided by a finite number other than 0 only, got {number}")
         if np.iscomplexobj(number):
             return self * (1.0 / number)
-        share, exponent = np.frexp(float(number))  # 1 / 1e308 is subnormal and loses digits, a power of two does not
-        half = int(exponent) // 2  # in two steps, as 2^-exponent of a subnormal number is infinite
+        share, exponent = np.frexp(float(number))  # 1 / 1e308 is subnormal and inexact; dividing by 2^exponent is exact
+        half = int(exponent) // 2  # two factors, because 2^-exponent overflows if `number` is subnormal
         structure = times(times(self.structure, 1.0 / float(share)), 2.0**-half)
         structure = times(structure, 2.0 ** (half - int(exponent)))
         return Operator(structure, self.domain, self.codomain, f"{_bracket(self.name)} / {number:g}")
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Operator:
-        """Let NumPy numbers scale an operator; raise TypeError with advice for any other NumPy function."""
+        """Support `number * op` for NumPy scalars; raise TypeError with advice for any other NumPy function."""
         if any(map(isbox, inputs)):
             self._refuse_traced_factor()
         if method == "__call__" and ufunc is np.multiply and np.shape(inputs[0]) == ():
@@ -350,36 +358,36 @@ class Operator(Frozen, Reconstructible):
 
     @property
     def matrix(self) -> Any:
-        """The entries as a csr_array with 32-bit indices; in the matrix-free form assembled at the first access."""
+        """The matrix of the operator, a csr_array with 32-bit indices. It is assembled at the first access."""
         return self._matrix_structure.matrix
 
     @property
     def separable(self) -> bool:
-        """Whether it is a Kronecker sum: one 1-D factor for each axis."""
+        """Whether the operator is a Kronecker sum, that is, a sum of operators along single axes."""
         return self.structure.separable
 
     def explicit(self) -> Operator:
-        """Return the same operator, applied by its matrix."""
+        """Return the same operator in explicit form, which is applied as a sparse matrix product."""
         return self._in_form("explicit")
 
     def matrix_free(self) -> Operator:
-        """Return the same operator, applied without a matrix; an operator that is defined by a matrix is unchanged."""
+        """Return the same operator in matrix-free form; operators that are defined by a matrix are unchanged."""
         if isinstance(self.structure, Matrix):
             return self
         return self._in_form("matrix-free")
 
     def _in_form(self, form):
-        """Return the same operator in a form."""
+        """Return the same operator in the given form."""
         if form == self.form:
             return self
         return Operator(self.structure, self.domain, self.codomain, self.name, form)
 
     def matvec(self, x: Any) -> Any:
-        """Return the flat product A x, for SciPy."""
+        """Return A x for a flat array x, as SciPy's LinearOperator does."""
         return self @ np.asarray(x).reshape(-1)
 
     def rmatvec(self, y: Any) -> Any:
-        """Return the flat product A^H y with the conjugate transpose, for SciPy (`.T` does not conjugate)."""
+        """Return A^H y for a flat array y, as SciPy's LinearOperator does. Unlike `T`, A^H is conjugated."""
         return np.conj(self.T @ np.conj(np.asarray(y).reshape(-1)))
 
     def to_scipy(self) -> Any:
@@ -392,7 +400,7 @@ class Operator(Frozen, Reconstructible):
         return f"<{self.name}: {self.domain} -> {self.codomain}, {self.form}>"
 
     def _repr_html_(self):
-        """Return HTML for a notebook: the spaces, the form, and a picture of the entries of a small operator."""
+        """Return HTML for notebooks: the spaces, the form, and a plot of the nonzero entries if the matrix is small."""
         entries: dict[str, Any] = {"from": self.domain, "to": self.codomain, "acts": self.form, "dtype": self.dtype}
         if self.structure.has_entries and max(self.shape) <= SPY_BELOW:
             matrix = self._acting.explicit()
@@ -403,14 +411,14 @@ class Operator(Frozen, Reconstructible):
 
 
 def _with_matrix(matrix, *arguments):
-    """Return an Operator whose matrix is known."""
+    """Return an Operator whose assembled matrix is already available."""
     op = Operator(*arguments)
     op.__dict__["_matrix_structure"] = matrix
     return op
 
 
 def _chosen_form(structure):
-    """Return the form by a fixed rule, not by timings: the same program gives the same bits everywhere."""
+    """Return the form by a fixed rule. Timings are not used, so that results are reproducible bit for bit."""
     if isinstance(structure, Matrix):
         return "explicit"
     if isinstance(structure, Diagonal) or not structure.has_entries:
@@ -429,7 +437,7 @@ def _is_scalar(value):
 
 
 def _bracket(name):
-    """Return the name of an operator for products: a sum in parentheses."""
+    """Return the name of an operator as a factor of a product: in parentheses if it is a sum."""
     if " + " in name or " - " in name:
         return f"({name})"
     return name

@@ -1,4 +1,4 @@
-"""The 1-D factors of the catalogue, a few diagonals each, and how operators are built from them."""
+"""The banded 1-D matrices (factors) that define the grid operators, and functions that combine them to operators."""
 
 from __future__ import annotations
 
@@ -31,25 +31,28 @@ __all__ = [
 
 
 def along(axis: int, dim: int, factor: Factor | None, scale: float = 1.0) -> tuple[Term]:
-    """Return the terms (one) of a factor along one axis and the identity along the others."""
+    """Return a tuple of one Kronecker term: a factor along one axis, and the identity along the others."""
     factors: list[Factor | None] = [None] * dim
     factors[axis] = factor
     return (Term(scale, tuple(factors)),)
 
 
 def kronecker_operator(domain: Space, codomain: Space, blocks: dict, name: str) -> Operator:
-    """Return the Operator with these terms for each pair (component of the result, component of the field)."""
+    """Return the Operator whose blocks are Kronecker terms.
+
+    The keys of `blocks` are pairs (component of the result, component of the argument); the values are tuples of terms.
+    """
     return Operator(Kronecker(codomain.parts, domain.parts, blocks), domain, codomain, name)
 
 
 def to_faces(name: str, grid: Grid, factors: Sequence[Factor]) -> Operator:
-    """Return an Operator from cells to faces, given the factor of each axis from cells to the faces across it."""
+    """Return an Operator from cells to faces, given for each axis the factor from its cells to its faces."""
     blocks = {(axis, 0): along(axis, grid.dim, factor) for axis, factor in enumerate(factors)}
     return kronecker_operator(grid.cells, grid.faces, blocks, name)
 
 
 def differences(grid: Grid, axis: int) -> Factor:
-    """Return the factor (v[i + 1] - v[i]) / h[i] from nodes (or faces) to cells."""
+    """Return the factor from nodes (or faces) to cells that computes (v[i + 1] - v[i]) / h[i]."""
     h = grid.widths[axis]
     cells = np.arange(h.size)
     nodes = grid.node_count(axis)
@@ -57,7 +60,10 @@ def differences(grid: Grid, axis: int) -> Factor:
 
 
 def slopes(grid: Grid, axis: int, sides: Any) -> Factor:
-    """Return the factor (u[i] - u[i - 1]) / d[i] from cells to faces; at a wall by the condition with value 0."""
+    """Return the factor from cells to faces that computes (u[i] - u[i - 1]) / d[i].
+
+    On a wall it computes the slope, in the direction of the axis, that the boundary condition with value 0 implies.
+    """
     face, lower, upper = _between(grid, axis)
     step = 1 / grid.spacings(axis)[face]
 
@@ -69,7 +75,10 @@ def slopes(grid: Grid, axis: int, sides: Any) -> Factor:
 
 
 def means(grid: Grid, axis: int, sides: Any) -> Factor:
-    """Return linear interpolation from cells to faces; at a wall the value that the condition with value 0 implies."""
+    """Return the factor that interpolates linearly from cells to faces.
+
+    On a wall it computes the value that the boundary condition with value 0 implies.
+    """
     face, lower, upper = _between(grid, axis)
     h = grid.widths[axis]
     both = h[lower] + h[upper]
@@ -84,7 +93,7 @@ def means(grid: Grid, axis: int, sides: Any) -> Factor:
 
 
 def wall_slopes(grid: Grid, axis: int, side: int, condition: Any) -> Factor:
-    """Return the part of the slope on faces that depends on the value on one wall (0: lower, 1: upper)."""
+    """Return the factor from the boundary value on one wall (side 0: lower, 1: upper) to the slope on the faces."""
     nodes = grid.node_count(axis)
     widths = grid.widths[axis]
     half = 0.5 * (widths[-1:] if side else widths[:1])
@@ -94,7 +103,10 @@ def wall_slopes(grid: Grid, axis: int, side: int, condition: Any) -> Factor:
 
 
 def one_sided(grid: Grid, axis: int, upper: bool, condition: Any) -> Factor:
-    """Return the slope from cells to faces, computed from the lower (upper) cell, with a wall on the face."""
+    """Return the factor from cells to faces that computes the slope as if each face were a wall.
+
+    The slope is computed from the upper cell of the face if `upper`, else from the lower one, with boundary value 0.
+    """
     slope = condition.a / (0.5 * condition.a * grid.widths[axis] + condition.b)
     if not upper:
         slope = -slope
@@ -102,25 +114,28 @@ def one_sided(grid: Grid, axis: int, upper: bool, condition: Any) -> Factor:
 
 
 def pick(grid: Grid, axis: int, upper: bool) -> Factor:
-    """Return the value on the lower (upper) face of each cell, from faces to cells."""
+    """Return the factor from faces to cells that takes the value on the upper (or lower) face of each cell."""
     cell = np.arange(grid.shape[axis])
     nodes = grid.node_count(axis)
     return Factor.from_diagonals((cell.size, nodes), (cell, (cell + upper) % max(nodes, 1), np.ones(cell.size)))
 
 
 def mean_of_faces(grid: Grid, axis: int) -> Factor:
-    """Return the mean of the lower and the upper face of each cell, from faces to cells."""
+    """Return the factor from faces to cells that computes the mean of the two faces of each cell."""
     return (pick(grid, axis, False) + pick(grid, axis, True)).scaled(0.5)
 
 
 def with_ends(matrix: sp.csr_array) -> Factor:
-    """Return a matrix with two more rows: its result is put between the first and the last entry of its argument."""
+    """Return `matrix` with the first row of the identity added above it, and the last row of the identity below it."""
     ends = sp.eye_array(matrix.shape[1], format="csr")
     return Factor(sp.vstack([ends[[0]], matrix, ends[[-1]]], format="csr"))
 
 
 def cell_beside(grid: Grid, axis: int, upper: bool) -> Factor:
-    """Return the value of the cell below (above) each face, from cells to faces; at a wall, of its only cell."""
+    """Return the factor from cells to faces that takes the value of the upper (or lower) cell of each face.
+
+    A wall face has only one cell, whose value is taken in both cases.
+    """
     nodes, n = _cells_to_faces(grid, axis)
     face = np.arange(nodes if n else 0)
     cell = face if upper else face - 1
@@ -137,14 +152,14 @@ def _cells_to_faces(grid, axis):
 
 
 def _between(grid, axis):
-    """Return the faces with a cell on both sides, and these two cells."""
+    """Return the indices of the faces between two cells, and those of their lower and upper cells."""
     n = grid.shape[axis]
     face = np.arange(0 if grid.periodic[axis] else 1, n)
     return face, (face - 1) % max(n, 1), face
 
 
 def _walls(grid, axis, sides, entry):
-    """Return the diagonals of the two wall faces; none on a periodic axis or one without cells."""
+    """Return the (rows, columns, values) of the entries on the two walls; an empty list if there are no walls."""
     n = grid.shape[axis]
     if sides is None or n == 0:
         return []

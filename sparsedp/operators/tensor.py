@@ -1,13 +1,15 @@
-"""Full tensors: slopes and fluxes at the corners of cells, for div(K grad u) with a matrix K in every cell.
+"""Discretization of div(K grad u) with a full tensor K in every cell, by gradients at the corners of cells.
 
-At each of its 2^dim corners a cell has one face across each axis, with the slopes g on these faces. With the flux
-K g of every corner, the flux through a face is the mean over the corners at its two sides, weighted with volumes:
+At each of the 2^dim corners of a cell, one face for each axis meets. The slopes on these faces form the gradient g at
+the corner, and the flux there is K g. The flux through a face is the volume-weighted mean over the corners of its two
+cells that touch the face:
 
     div(K grad u) = D Q diag(K) S G,    S: slopes from faces to corners,    Q: fluxes from corners to faces.
 
-The sum over all corners of volume / 2^dim times g.K g is the energy, so that the operator is positive where K is, and,
-up to the factor of the volumes, symmetric where K is. On a face without a slope (a closed wall, a solid) the flux is 0,
-and the slope there is the one for which it is 0: the axis is eliminated from K at the corners beside the face.
+The energy is the sum over all corners of volume / 2^dim times g.K g. Therefore, if K is positive (semi)definite or
+symmetric, so is the operator after multiplication by the cell volumes. Through a closed face (a closed wall or a face
+of a solid cell) the flux must be 0. This determines the slope on the face, which is eliminated from K at the adjacent
+corners.
 
 References
 ----------
@@ -39,32 +41,33 @@ if TYPE_CHECKING:
 
 __all__ = ["check_tensor", "corners"]
 
-PIVOT_ROUNDING = 64 * EPS  # share of an entry below which a pivot is rounding
+PIVOT_ROUNDING = 64 * EPS  # pivots below this multiple of the original diagonal entry count as 0
 
 
 def corners(grid: Grid, closed: NDArray) -> tuple[Operator, Operator, Callable]:
-    """Return the operators S and Q, and the function from a tensor to tensors at corners: see the module.
+    """Return the operators S and Q of the module docstring, and the function that computes the tensors at the corners.
 
     Parameters
     ----------
     grid : Grid
     closed : bool array, a field on the faces
-        The faces without slope and flux.
+        True for faces through which the flux is 0.
 
     Returns
     -------
     S : Operator, faces -> (2^dim, dim, dim, *cells)
-        At each corner, for each entry K_ij, the slope along axis j.
+        Computes, at each corner and for each entry K_ij, the slope along axis j.
     Q : Operator, (2^dim, dim, dim, *cells) -> faces
+        Computes the flux through each face, from the products of the entries K_ij and the slopes.
     at_corners : callable
-        ``at_corners(K)``, K of shape (dim, dim, *cells): the tensors at the corners, differentiable.
+        ``at_corners(K)`` takes K of shape (dim, dim, *cells) and returns the tensors at the corners. Differentiable.
     """
     dim = grid.dim
     volumes = grid.volumes.reshape(-1)
     beside = [[_face_beside(grid, axis, upper) for upper in (0, 1)] for axis in range(dim)]
     sides = list(product((0, 1), repeat=dim))
     at_faces = sum(face.T @ volumes for faces in beside for face in faces)
-    shares = 2.0 ** (1 - dim) / np.where(at_faces > 0, at_faces, 1.0)  # of the volume at a face
+    shares = 2.0 ** (1 - dim) / np.where(at_faces > 0, at_faces, 1.0)  # 1 / (total volume of the corners at a face)
     picks = {(side, i, j): (beside[i][side[i]], beside[j][side[j]]) for side in sides for i, j in np.ndindex(dim, dim)}
     slopes = sp.vstack([other for _, other in picks.values()])
     fluxes = sp.hstack([one.T * volumes for one, _ in picks.values()])
@@ -80,13 +83,16 @@ def corners(grid: Grid, closed: NDArray) -> tuple[Operator, Operator, Callable]:
 
 
 def _face_beside(grid, axis, upper):
-    """Return the matrix from faces to cells that takes the lower (upper) face across an axis."""
+    """Return the matrix from faces to cells that takes the upper (or lower) face of each cell along an axis."""
     blocks = {(0, axis): along(axis, grid.dim, pick(grid, axis, upper))}
     return Kronecker(grid.cells.parts, grid.faces.parts, blocks).explicit()
 
 
 def _eliminated(K, closed):
-    """Return K after elimination of each axis in the cells where its flux is 0; `closed`: a field for each axis."""
+    """Return K after elimination of the slopes on closed faces.
+
+    `closed` has one boolean cell field for each axis, which is True where the flux along this axis is 0.
+    """
     for axis, shut in enumerate(closed):
         if np.any(shut):
             K = K - anp.where(shut, K[:, axis, None] * (K[None, axis] / K[axis, axis]), 0.0)
@@ -99,7 +105,7 @@ def check_tensor(name: str, K: Any, grid: Grid) -> None:
     check_shape(f"{name}, a tensor for each cell,", values, (grid.dim, grid.dim, *grid.shape))
     check_finite(name, values)
     rest = 0.5 * (values + values.swapaxes(0, 1)).real
-    for axis in range(grid.dim):  # the pivots of an elimination are positive where the matrix is
+    for axis in range(grid.dim):  # a symmetric matrix is positive definite if and only if all pivots are positive
         pivot = rest[axis, axis]
         bad = ~(pivot > PIVOT_ROUNDING * np.abs(values[axis, axis]))
         if np.any(bad):

@@ -1,4 +1,4 @@
-"""The history of a run of `minimize`, and the decision when it stops."""
+"""The history of a run of `minimize`, and its convergence test."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Monitor"]
 
-STATIONARY = 1e-6  # share of a gradient below which a search that ends in rounding is at a stationary point
+STATIONARY = 1e-6  # a run that ends by rounding has converged if the relative gradient is below this
 
 
 class Monitor:
-    """Keeps the history of a run and decides when it stops. Called with every accepted point.
+    """Records the history of a run and decides when it stops. It is called with every accepted point.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class Monitor:
     ----------
     history : list of Record
     message : str
-        Why the run is over; empty until then.
+        The reason why the run stopped; empty while it continues.
     converged : bool
     """
 
@@ -59,7 +59,7 @@ class Monitor:
         self._packing = packing
         self._tolerance = tolerance
         self._callback = callback
-        # What is added to the clock and to the counter of solves to get those of the run.
+        # Added to the clock and to the global counter of solves, these give the time and the solves of this run.
         self._seconds_offset = -time.perf_counter()
         self._solves_offset = -thread.solves
         self.history: list[Record] = []
@@ -76,12 +76,12 @@ class Monitor:
         ----------
         history : list of Record
         first, last : Evaluation
-            At the ends of the history.
+            The points of the first and of the last record.
 
         Notes
         -----
-        The callback is not asked about the last point: a run that it stopped continues. A tolerance that is met stops
-        this run too.
+        The callback is not called for the last point, so that a run that it stopped continues. If the tolerance is
+        already met, the run stops at once.
         """
         self.history = history
         self._seconds_offset += history[-1].seconds
@@ -97,7 +97,7 @@ class Monitor:
         return len(self.history) - 1
 
     def __call__(self, evaluation: Evaluation) -> None:
-        """Record an accepted point, and decide whether the run is over."""
+        """Record an accepted point, and set `message` if the run should stop."""
         gradient_norm = self._gradient_norm(evaluation)
         record = Record(
             len(self.history),
@@ -126,7 +126,8 @@ class Monitor:
     def _test_convergence(self, gradient_norm):
         """Set `converged` and `message` if the tolerance is met.
 
-        `gradient_norm` is in the units of the evaluations: that of a record may have left the range of floats.
+        `gradient_norm` is in the units of the evaluations, because in the units of the records it may overflow or
+        underflow.
         """
         if self._objective.batches.varied:
             self._test_convergence_of_batches()
@@ -147,13 +148,13 @@ class Monitor:
         self.message = f"converged: the {gradient} is {share}"
 
     def _test_convergence_of_batches(self):
-        """Decide by the last pass over the batches: one of them alone may have a small gradient."""
+        """Test convergence over all batches: the gradient of a single batch may be small by chance."""
         period = self._objective.batches.period
         first = self.history[0]
         recent = self.history[-period:]
         out_of_range = not 0 < first.gradient_norm < inf
         if out_of_range and self._first_gradient_norm > 0:
-            return  # the gradients of the records cannot be compared
+            return  # the first gradient norm overflows or underflows, so the records cannot be compared
         if len(recent) < period:
             return
         if callable(self._tolerance):
@@ -167,9 +168,10 @@ class Monitor:
         self.message = f"converged: the gradients of the last {period} batches are {share:.1e} of that at the start"
 
     def _comparable_records(self, gradient_norm):
-        """Return the last record and the first one, with losses and gradients that can be compared.
+        """Return the last record and the first one, with comparable losses and gradient norms.
 
-        Where those of least squares have left the range of floats, both are in the units of the evaluations.
+        If one of the gradient norms overflows or underflows, which can occur in least-squares problems, the values of
+        both records are given in the units of the scaled objective.
         """
         last, first = self.history[-1], self.history[0]
         if 0 < last.gradient_norm < inf and 0 < first.gradient_norm < inf:
@@ -179,10 +181,10 @@ class Monitor:
         return last, first
 
     def _is_stationary(self):
-        """Return whether the gradient is small beside that at the start, or beside the loss per length of x.
+        """Return whether the gradient is small relative to that at the start, or relative to |loss| / |x|.
 
-        Where a loss has kinks, or is badly scaled, steps become so short that no change of the loss is seen although
-        the gradient is not small.
+        A run that ends because steps no longer change the loss has not always converged: if the loss has kinks or is
+        badly scaled, steps become very short although the gradient is not small.
         """
         gradient_norm = self._gradient_norm(self._last)
         if gradient_norm <= STATIONARY * self._first_gradient_norm:
@@ -201,7 +203,7 @@ class Monitor:
         method : str
         resumed : str
         covariance : array or str
-            Or the reason why it is not known.
+            The covariance, or a sentence that says why it is not available.
         """
         return Minimum(
             x=x,
@@ -216,7 +218,7 @@ class Monitor:
         )
 
     def stop(self, error: NoStepFound) -> None:
-        """End the run of a method that found no acceptable point."""
+        """End the run after a method has found no acceptable point."""
         if isinstance(error, RoundingReached):
             self.converged = self._is_stationary()
             self.message = self._message_of_rounding()
@@ -232,7 +234,7 @@ class Monitor:
         self.message = f"stopped: {error}{refused}; {advice}"
 
     def _message_of_rounding(self):
-        """Return the message of a run that ended because no change of the loss is visible."""
+        """Return the message of a run that ended because steps change the loss by less than its rounding error."""
         if self.converged:
             return "converged to rounding: the loss cannot fall further in floating point numbers"
         share = self._gradient_norm(self._last) / (self._first_gradient_norm or 1.0)

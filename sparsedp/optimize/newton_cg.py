@@ -1,4 +1,4 @@
-"""Newton with truncated conjugate gradients inside a trust region, from Hessian products."""
+"""Newton's method in a trust region, by truncated conjugate gradients with Hessian-vector products."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ if TYPE_CHECKING:
 
 __all__ = ["NewtonCG", "NewtonState", "truncated_cg"]
 
-POOR, GOOD = 0.25, 0.75  # shares of the predicted decrease below and above which the region changes
-MOST_REGIONS = 60  # radii that are tried in one iteration
+POOR, GOOD = 0.25, 0.75  # the radius shrinks (grows) if actual / predicted decrease is below POOR (above GOOD)
+MOST_REGIONS = 60  # maximum number of radii tried in one iteration
 
 
 class NewtonState(NamedTuple):
     """State of newton_cg.
 
-    Steps and the radius are in units of `length_unit`, and gradients in units of another power of two, so that no
-    product of two of them leaves the range of floating-point numbers.
+    Steps and the radius are divided by `length_unit`, and gradients by another power of two, so that products of them
+    neither overflow nor underflow.
 
     Attributes
     ----------
     current : Evaluation
     radius : float
-        Of the trust region; 0 while it is unknown.
+        Radius of the trust region; 0 means unlimited.
     first_gradient_norm : float
     length_unit : float
         A power of two near |x| at the start.
@@ -50,17 +50,18 @@ class NewtonState(NamedTuple):
 
 @dataclass
 class NewtonCG(Method):
-    """Newton in a trust region: Steihaug's conjugate gradients on products with the Hessian.
+    """Newton's method in a trust region, by Steihaug's truncated conjugate gradients with Hessian-vector products.
 
     Parameters
     ----------
     inner : int
-        Most Hessian products in one iteration.
+        Maximum number of Hessian-vector products for one trial step.
 
     Notes
     -----
-    The step p approximately minimizes g.p + p.H p / 2 where |p| is at most the radius, to the relative accuracy
-    min(0.1, sqrt(|g| / |g0|)) of the residual. The radius follows the ratio of the actual and the predicted decrease.
+    The step p approximately minimizes the model g.p + p.H p / 2 subject to |p| <= radius. Inside the region, the
+    conjugate gradient iteration stops when |g + H p| <= min(0.1, sqrt(|g| / |g0|)) |g|, where g0 is the gradient at the
+    start. The radius is increased or decreased according to the ratio of the actual and the predicted decrease.
 
     References
     ----------
@@ -91,7 +92,7 @@ class NewtonCG(Method):
             return hessian_product(state.length_unit * direction) / gradient_unit
 
         def candidates():
-            """Yield the minimum of the model in ever smaller regions."""
+            """Yield the minimizer of the model in trust regions of decreasing radius."""
             radius = state.radius or np.inf
             for _ in range(MOST_REGIONS):
                 step, decrease, on_boundary = truncated_cg(gradient, scaled_product, radius, accuracy, self.inner)
@@ -118,26 +119,26 @@ def truncated_cg(
     accuracy: float,
     limit: int,
 ) -> tuple[NDArray[np.float64], float, bool]:
-    """Minimize the model g.p + p.H p / 2 where |p| <= radius, by conjugate gradients.
+    """Minimize the model g.p + p.H p / 2 subject to |p| <= radius, by conjugate gradients.
 
     Parameters
     ----------
     gradient : (n,) array
-        g.
+        The gradient g.
     hessian_product : callable
         ``hessian_product(p)`` returns H p.
     radius : float
         May be infinite.
     accuracy : float
-        Relative to |g|, of the residual g + H p.
+        The iteration stops when |g + H p| is at most this multiple of |g|.
     limit : int
-        Most products.
+        Maximum number of products.
 
     Returns
     -------
     p : (n,) array
     decrease : float
-        Of the model.
+        Decrease of the model at p.
     on_boundary : bool
         Whether |p| is the radius.
     """
@@ -155,11 +156,11 @@ def truncated_cg(
             t = square / curvature
         on_boundary = not (np.isfinite(t) and norm(p + t * direction) < radius)
         if on_boundary:
-            # Along a direction of negative curvature an infinite region is cut at twice the present length.
+            # If the curvature is not positive and the region is unlimited, stop at twice the current length of p.
             boundary = radius
             if not np.isfinite(radius):
                 boundary = max(1.0, 2 * norm(p))
-            # The larger root t of |p + t d|^2 = boundary^2.
+            # t is the larger root of |p + t d|^2 = boundary^2.
             coefficients = [np.dot(direction, direction), 2 * np.dot(p, direction), np.dot(p, p) - boundary**2]
             t = np.max(np.roots(coefficients).real)
         p = p + t * direction

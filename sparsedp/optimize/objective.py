@@ -1,4 +1,4 @@
-"""The loss of `minimize` on flat vectors: evaluations are counted, refused points listed, the best point kept."""
+"""The loss of `minimize` as a function of a flat vector, with its evaluation count, failed points and best point."""
 
 from __future__ import annotations
 
@@ -24,41 +24,42 @@ if TYPE_CHECKING:
 
 __all__ = ["SMALLEST", "SUFFICIENT", "Objective"]
 
-SUFFICIENT = 1e-4  # share of the predicted decrease that a step must reach (Armijo)
-SMALLEST = 5e-324  # smallest positive float: no loss changes by less
-ROUNDINGS = 100  # a predicted decrease below this multiple of the rounding of the loss is not visible
-CLEAR_ROUNDINGS = 2000  # one above this multiple is visible
-REFUSALS = (UnstableStepError, ConvergenceError, NonFiniteError)  # errors that mark a point as not admissible
+SUFFICIENT = 1e-4  # minimum of actual / predicted decrease for an accepted step (Armijo condition)
+SMALLEST = 5e-324  # smallest positive float, the minimum of the estimated rounding error of a loss
+ROUNDINGS = 100  # a predicted decrease below this multiple of the rounding error cannot be observed
+CLEAR_ROUNDINGS = 2000  # a predicted decrease above this multiple of the rounding error can be observed
+REFUSALS = (UnstableStepError, ConvergenceError, NonFiniteError)  # at trial points they count as an infinite loss
 
 
 class Objective:
-    """The loss on flat vectors.
+    """The loss as a function of a flat vector.
 
     Parameters
     ----------
     loss : callable
-        ``loss(x, *batch)`` of trees.
+        ``loss(x, *batch)``, where x is a tree.
     gradient : callable or None
-        ``gradient(x, *batch)``; None: reverse mode.
+        ``gradient(x, *batch)``; None: reverse-mode differentiation.
     packing : Packing
-        Maps trees to flat vectors.
+        The map between trees and flat vectors.
     box : Box
-        The admissible points.
+        The bounds.
     batches : Batches
     residual_options : least-squares method, optional
-        If given, the loss returns residuals r, and the objective is |r / s|^2 / 2 with a power of two s, so that
-        squares of small residuals do not underflow and those of large ones do not overflow. Its attributes `apart`,
-        `forms_jacobian` and `absolute_sigma` say how their Jacobian is computed.
+        If given, the loss returns residuals r, and the objective is |r / s|^2 / 2. The power of two s prevents
+        underflow and overflow of squared residuals. The attributes `apart`, `forms_jacobian` and `absolute_sigma` of
+        this object are the options for the Jacobian and the covariance.
 
     Attributes
     ----------
     iteration : int
-        Number of the current iteration, which selects the batch of new points; set by the loop.
+        Number of the current iteration, which determines the batch. The loop of `minimize` sets it.
     best : Evaluation
+        The best point so far; with batches, the last point.
     count : int
-        Evaluations so far.
+        Number of evaluations so far.
     failures : list of Failure
-        Points refused since the last call of `pop_failures`.
+        Points at which the loss could not be evaluated, since the last call of `pop_failures`.
     residual_scale : float or None
         The power of two s; None until the first residuals are known.
     """
@@ -87,25 +88,25 @@ class Objective:
         self.residual_scale: float | None = None
 
     def evaluate_start(self, vector: NDArray[np.float64]) -> Evaluation:
-        """Return the evaluation at the start; errors of the loss are not caught."""
+        """Return the evaluation at the start. Exceptions of the loss are not caught."""
         self.best = self._evaluate(vector)
         return self.best
 
     def __call__(self, vector: NDArray[np.float64], below: float = np.inf) -> Evaluation:
-        """Return the evaluation at a point; errors that mark it as not admissible count as the value infinity.
+        """Return the evaluation at a point; the value is infinity if the loss raises one of `REFUSALS`.
 
         Parameters
         ----------
         vector : (n,) array
         below : float
-            The gradient of residuals is omitted unless the value is below this bound.
+            In least-squares problems the gradient is computed only if the value is below this bound.
         """
         try:
             evaluation = self._evaluate(vector, below)
         except REFUSALS as error:
             self.failures.append(Failure(type(error).__name__, str(error)))
             return Evaluation(np.array(vector), np.inf, np.full_like(vector, np.nan))
-        # Losses of two batches cannot be compared: then the last point is the result.
+        # Losses of different batches cannot be compared; with batches the last point is the result.
         if self.batches.varied or evaluation.value < self.best.value:
             self.best = evaluation
         return evaluation
@@ -113,28 +114,29 @@ class Objective:
     def first_lower(
         self, current: Evaluation, candidates: Iterable[tuple[Any, float, Any]], failure: str
     ) -> tuple[Evaluation, float, Any]:
-        """Return the first of some points at which the loss is sufficiently lower than at the current one.
+        """Return the first candidate at which the loss is sufficiently lower than at the current point.
 
         Parameters
         ----------
         current : Evaluation
         candidates : iterable of (vector, decrease, label)
-            A point, the predicted decrease of the loss, and any value that tells candidates apart. They approach the
-            current point.
+            Trial points that approach the current point. `decrease` is the predicted decrease of the loss; `label` is
+            any value, which is returned for the accepted candidate.
         failure : str
-            The message if there is none.
+            The message of the exception if no candidate is accepted.
 
         Returns
         -------
         (Evaluation, float, label)
-            With the share of the predicted decrease that was reached.
+            The accepted point, its actual decrease divided by the predicted one, and its label.
 
         Raises
         ------
         RoundingReached
-            If there is none, and the first predicted decrease is lost in the rounding of the loss.
+            If no candidate is accepted, and the first predicted decrease is too small to be observed beside the
+            rounding error of the loss.
         NoStepFound
-            If there is none for another reason.
+            If no candidate is accepted for another reason.
         """
         decreases: list[float] = []
         for vector, decrease, label in candidates:
@@ -142,7 +144,7 @@ class Objective:
             if evaluation.value < current.value and current.value - evaluation.value >= SUFFICIENT * decrease:
                 share = (current.value - evaluation.value) / decrease if decrease > 0 else 0.0
                 return evaluation, share, label
-            decreases.append(abs(decrease))  # bounds can make it negative for a long step; a shorter one may do
+            decreases.append(abs(decrease))  # clipping can make it negative for a long step but not for a shorter one
             if decreases[-1] <= current.rounding:
                 break
         lost_in_rounding = decreases[0] <= ROUNDINGS * current.rounding
@@ -151,11 +153,11 @@ class Objective:
         raise NoStepFound(failure)
 
     def decrease_is_visible(self, current: Evaluation, step: NDArray[np.float64]) -> bool:
-        """Return whether the gradient predicts a decrease along a step that exceeds the rounding of the loss by far."""
+        """Return whether the decrease that the gradient predicts for a step is far above the rounding error."""
         return -float(np.dot(current.gradient, step)) > CLEAR_ROUNDINGS * current.rounding
 
     def _evaluate(self, vector, below=np.inf):
-        """Return the evaluation at a point, or raise the error of the loss."""
+        """Return the evaluation at a point; exceptions of the loss are not caught."""
         self.count += 1
         if self._residual_options is None:
             value, gradient = self._value_and_gradient(vector)
@@ -163,21 +165,21 @@ class Objective:
             value, gradient = self._sum_of_squares(vector, below)
         if not np.isfinite(value):
             raise NonFiniteError(f"the loss is {value}; start where it is finite")
-        rounded = self._packing.pack(self._packing.unpack(vector))  # single-precision leaves round
+        rounded = self._packing.pack(self._packing.unpack(vector))  # rounds the entries of single-precision leaves
         rounding = max(self._packing.eps * abs(value), SMALLEST)
         return Evaluation(rounded, value, gradient, rounding, self.iteration)
 
     def _sum_of_squares(self, vector, below):
         """Return half the sum of squares of the scaled residuals, and its gradient J^T r."""
         linearization = self._linearize(vector, self.iteration)
-        with np.errstate(over="ignore"):  # infinity is refused
+        with np.errstate(over="ignore"):  # the caller raises NonFiniteError for infinity
             value = 0.5 * float(np.dot(linearization.flat, linearization.flat))
         if not value < below:
             return value, None
         return value, linearization.vjp(linearization.flat)
 
     def _linearize(self, vector, iteration):
-        """Return the residuals and their Jacobian at a point, on the batch of an iteration; kept for the last point."""
+        """Return the linearization at a point, with the batch of an iteration. The last one is cached."""
         batch = self.batches.at(iteration)
         key = vector, iteration if batch else 0
         cached = self._linearizations.find(key)
@@ -190,8 +192,8 @@ class Objective:
         return self._linearizations.put(key, linearization.rescaled(self.residual_scale))
 
     def _value_and_gradient(self, vector):
-        """Return the loss and its flat gradient. Each call of the user's functions gets a fresh tree."""
-        with unwarned():  # a gradient that is not finite is refused below
+        """Return the loss and its flat gradient. Each call of a user's function gets a new tree that it may modify."""
+        with unwarned():  # pack_gradient raises NonFiniteError for a gradient that is not finite
             batch = self.batches.at(self.iteration)
             tree = self._packing.unpack(vector)
             if self._gradient is None:
@@ -209,16 +211,16 @@ class Objective:
                 raise
 
     def in_units_of_loss(self, number: float) -> float:
-        """Return a loss, or the norm of a gradient, of scaled residuals in the units of the user's loss."""
+        """Convert a value or gradient norm of the scaled objective to that of the user's loss."""
         scale = self.residual_scale or 1.0
         return number * scale * scale
 
     def linearization(self, evaluation: Evaluation) -> Linearization:
-        """Return the scaled residuals at a point and their Jacobian, on the batch of that evaluation."""
+        """Return the linearization of the scaled residuals at a point, with the batch of its evaluation."""
         return self._linearize(evaluation.point, evaluation.iteration)
 
     def covariance(self, evaluation: Evaluation) -> NDArray[np.float64] | str:
-        """Return the covariance of the unknowns at a point, or the reason why it is not known."""
+        """Return the covariance of the unknowns at a point, or a sentence that says why it is not available."""
         if self._residual_options is None:
             return NO_RESIDUALS
         if self.batches.varied:
@@ -226,9 +228,10 @@ class Objective:
         return self.linearization(evaluation).covariance(self._residual_options.absolute_sigma)
 
     def hessian_product(self, evaluation: Evaluation) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
-        """Return the product of the Hessian at a point with flat vectors, 0 in entries that bounds hold.
+        """Return a function that multiplies the Hessian at a point by flat vectors.
 
-        The gradient is recorded once; each product is one backward pass.
+        Entries of the product are 0 if the unknown is held at a bound (see `free`). The gradient computation is
+        recorded once, so that each product is one backward pass.
         """
         if self._gradient is not None:
             raise TypeError("newton_cg differentiates the loss twice and does not use gradient; leave it out")
@@ -250,15 +253,15 @@ class Objective:
         return product
 
     def free(self, evaluation: Evaluation) -> NDArray[np.bool_]:
-        """Return which unknowns can follow the negative gradient at a point without leaving the bounds."""
+        """Return False for unknowns at a bound that a step along the negative gradient would violate, else True."""
         return self.box.free(evaluation.point, evaluation.gradient)
 
     def projected_gradient(self, evaluation: Evaluation) -> Any:
-        """Return the gradient, 0 in entries that bounds hold."""
+        """Return the gradient with entries set to 0 for unknowns that are held at a bound (see `free`)."""
         return np.where(self.free(evaluation), evaluation.gradient, 0.0)
 
     def pop_failures(self) -> tuple[Failure, ...]:
-        """Return the points refused since the last call."""
+        """Return the failed points since the last call, and clear the list."""
         failures = tuple(self.failures)
         self.failures = []
         return failures

@@ -1,4 +1,4 @@
-"""Evaluations of a loss, the history of a run, and its result."""
+"""Data classes of `minimize`: evaluations of the loss, records of iterations, and the result of a run."""
 
 from __future__ import annotations
 
@@ -15,62 +15,63 @@ if TYPE_CHECKING:
 __all__ = ["Evaluation", "Failure", "Minimum", "NoStepFound", "Record", "RoundingReached"]
 
 NO_RESIDUALS = "only least-squares problems have one; return the residuals and write method='levenberg_marquardt'"
-SHOWN = 6  # lines of the history that are printed at each end
+SHOWN = 6  # number of first and of last iterations that are printed from a long history
 
 
 class NoStepFound(Exception):
-    """Signals that a method found no acceptable point; the message says why. Never reaches the user."""
+    """Internal exception: a method found no acceptable point. `minimize` catches it and reports its message."""
 
 
 class RoundingReached(NoStepFound):
-    """Signals that a method found no lower point because the predicted decrease is lost in the rounding of the loss."""
+    """Internal exception: no lower point was found, because rounding of the loss hides the predicted decrease."""
 
 
 class Evaluation(NamedTuple):
-    """A point with the loss and its gradient, as flat vectors of doubles.
+    """A point with its loss and gradient; point and gradient are flat vectors in double precision.
 
-    A refused point has the value infinity and a gradient of NaN. The gradient of residuals is None where the loss is
-    not below the bound that the caller gave.
+    If the loss raised an error or was not finite, the point is called refused: its value is infinity and its gradient
+    is NaN. For least-squares problems the gradient is None if the value is not below the bound that the caller gave,
+    because the gradient of a rejected point is not needed.
     """
 
     point: np.ndarray
     value: float
     gradient: Any
-    rounding: float = 0.0  # smallest visible change of the loss
-    iteration: int = 0  # selects the batch that the loss was given
+    rounding: float = 0.0  # estimated rounding error of the loss
+    iteration: int = 0  # the iteration, which determines the batch of the loss
 
     @property
     def refused(self) -> bool:
-        """Whether the loss has no value here."""
+        """Whether the loss raised an error or was not finite at this point."""
         return self.value == np.inf
 
 
 class Failure(NamedTuple):
-    """A trial point that the loss refused."""
+    """A trial point at which the loss raised an error or was not finite."""
 
-    error: str
+    error: str  # name of the exception class
     message: str
 
 
 class Record(NamedTuple):
-    """One iteration; number 0 is the start.
+    """The record of one iteration. Iteration 0 is the start.
 
     Attributes
     ----------
     iteration : int
     value : float
-        The loss; infinite or 0 where it leaves the range of floating-point numbers.
+        The loss. It is infinite if it overflows, and 0 if it underflows.
     gradient_norm : float
-        Euclidean norm of the gradient; with bounds of the projected gradient, which is 0 in entries that bounds hold.
-        Infinite or 0 where it leaves the range of floating-point numbers.
+        Euclidean norm of the gradient, or, with bounds, of the projected gradient: its entries are 0 where a bound
+        prevents a step along the negative gradient. Infinite on overflow, 0 on underflow.
     seconds : float
-        Since the start of the run.
+        Time since the start of the run.
     evaluations : int
-        Of the loss, since the start of the run.
+        Number of evaluations of the loss since the start of the run.
     failed : tuple of Failure
-        The trial points that the loss refused in this iteration, as (error, message).
+        The trial points of this iteration at which the loss raised an error or was not finite, as (error, message).
     solves : int
-        Forward and adjoint solves of every inverse in this thread, since the start of the run.
+        Number of linear solves, forward and adjoint, in this thread since the start of the run.
     """
 
     iteration: int
@@ -82,7 +83,7 @@ class Record(NamedTuple):
     solves: int = 0
 
     def summary(self) -> str:
-        """Return a few words for a progress bar."""
+        """Return a short text for a progress bar."""
         words = f"loss {self.value:.6g}, gradient {self.gradient_norm:.1e}"
         if self.failed:
             words += f", {len(self.failed)} refused"
@@ -90,34 +91,36 @@ class Record(NamedTuple):
 
 
 class Minimum(Frozen):
-    """The result of `minimize`. Frozen.
+    """The result of `minimize`. Immutable.
 
     Attributes
     ----------
     x : tree
-        The best point seen, with the structure, shapes and dtypes of the start.
+        The best point found, with the structure, shapes and dtypes of the start.
     value : float
-        The loss there.
+        The loss at x.
     history : tuple of Record
+        One record for the start and one for each iteration.
     method : str
     message : str
-        Why the run stopped.
+        The reason why the run stopped.
     converged : bool
-        Whether the tolerance was met, or the loss cannot fall further in floating-point numbers.
+        True if the tolerance was met, or if rounding prevents a further decrease of the loss.
     evaluations : int
-        Evaluations of loss and gradient, including refused ones.
+        Number of evaluations of the loss and its gradient, including those that failed.
     resumed : str
-        Whether the run continued from the checkpoint folder; empty without one.
+        A sentence that says whether the run continued from the checkpoint folder; empty if there is no such folder.
     covariance : (n, n) array
-        Of the n unknowns of a least-squares problem, in the order of the leaves of x. With the m residuals r and
-        their Jacobian J at x it is
+        Covariance of the n unknowns of a least-squares problem, in the order of the leaves of x. With the m residuals
+        r and their Jacobian J at x it is
 
             s^2 (J^T J)^(-1)  with  s^2 = |r|^2 / (m - n),    or  (J^T J)^(-1)  with absolute_sigma=True.
 
         The first form estimates the variance of the data from the residuals. The second is for residuals that were
-        divided by known standard deviations; it is the posterior covariance for a flat prior. Infinite where J has
-        a rank below n; bounds are ignored. Access raises ValueError with the reason where it is not known: for other
-        methods, with batches, where J is not formed, when n > 4000, and when m <= n without absolute_sigma.
+        divided by known standard deviations; it is the posterior covariance for a flat prior. Bounds are ignored. All
+        entries are infinite if the rank of J is less than n. Access raises ValueError, with the reason in its message,
+        if the covariance is not available: for methods other than least squares, with batches, if J is not formed, if
+        n > 4000, or if m <= n without absolute_sigma.
     """
 
     x: Any
@@ -128,7 +131,7 @@ class Minimum(Frozen):
     converged: bool
     evaluations: int
     resumed: str = ""
-    _covariance: Any = NO_RESIDUALS  # the array, or the reason why it is not known
+    _covariance: Any = NO_RESIDUALS  # the array, or a sentence that says why it is not available
     meant = {
         "fun": "best.value",
         "point": "best.x",
@@ -157,7 +160,7 @@ class Minimum(Frozen):
     __repr__ = __str__
 
     def _repr_html_(self):
-        """Return a table of how the run ended and a curve of the loss, for notebooks."""
+        """Return HTML for notebooks: a table of the results and a plot of the loss."""
         losses = [(record.iteration, record.value) for record in self.history]
         converged = "yes" if self.converged else "no"
         entries = {
