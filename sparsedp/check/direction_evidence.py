@@ -1,15 +1,15 @@
-"""The evidence about a gradient along one direction, and the word that it leads to.
+"""The evidence about a gradient along one direction, and the result (a word such as "agrees") that follows from it.
 
-Everything is read from the gap m(t) = (f(x + t d) - f(x - t d)) / 2t - g . d, with the displacement that the rounding
-of x leaves of t d. For a right gradient m(t) = c t^2 + noise / t; for a wrong one it has a plateau.
+The central quantity is the gap m(t) = (f(x + t d) - f(x - t d)) / 2t - g . d, in which the displacement t d is that
+after rounding of x + t d. For a correct gradient m(t) = c t^2 + noise / t; for a wrong gradient m(t) has a plateau.
 
-Estimates of the plateau are each m(t) and each Richardson extrapolation of two neighbours. The error bar of an
-estimate is its largest distance from the two estimates beside it, plus the noise of the loss divided by the step. The
-estimate with the smallest bar counts.
+The height of the plateau is estimated by each m(t), and by each Richardson extrapolation of two neighbouring steps.
+The error bar of an estimate is its largest distance from the two neighbouring estimates, plus the noise of the loss
+divided by the step. The estimate with the smallest error bar is used.
 
-Taylor: R1(t), the size of f(x +- t d) - f without the gradient, must fall like t; R2(t), the size of
-f(x +- t d) - f -+ t g . d, like t^2 or faster. Each is the root mean square over both signs, so that the t^2 and t^3
-parts of a smooth loss cannot cancel.
+Taylor orders: R1(t) is the size of f(x +- t d) - f(x), and must decrease like t. R2(t) is the size of
+f(x +- t d) - f(x) -+ t g . d, and must decrease like t^2 or faster. Each size is the root mean square over both signs,
+so that the t^2 and t^3 terms of a smooth loss cannot cancel.
 
 References
 ----------
@@ -31,18 +31,18 @@ from sparsedp.check.thresholds import THRESHOLDS
 
 __all__ = ["PROVED", "DirectionEvidence", "DirectionResult", "pairwise_orders", "rms_of_both_sides", "weigh"]
 
-PROVED = ("agrees", "vanishes")  # words that speak for the gradient
+PROVED = ("agrees", "vanishes")  # results that confirm the gradient
 FLOAT_TINY = np.finfo(float).tiny
-FEW_EPS = 8.0  # roundings of x that change a difference through the curvature
-SINGLE_PRECISION_EPS = 300.0  # roundings of x below which no gap of a coarse dtype is seen
+FEW_EPS = 8.0  # assumed rounding error of x, in units of eps, in the error bar
+SINGLE_PRECISION_EPS = 300.0  # smallest detectable gap in units of the eps of x; matters in single precision
 
 
 @dataclass
 class DirectionEvidence:
-    """The numbers along one direction, and what follows from them.
+    """The measured values along one direction, and the conclusions from them.
 
-    Arrays have an entry for each usable level, from coarse to fine. NaN and infinite defaults hold where there are too
-    few levels.
+    Arrays have an entry for each usable level (step size), from coarse to fine. If there are too few usable levels,
+    the attributes keep their defaults (NaN or infinity).
 
     Attributes
     ----------
@@ -52,45 +52,46 @@ class DirectionEvidence:
     slope, difference : float
         g . d, and the best estimate of the derivative from differences.
     gap, bar, scale : float
-        difference - slope, its error bar, and the size of the derivative that both are compared with.
+        difference - slope; its error bar; and the size of the derivative, relative to which both are measured.
     silent : float
-        Largest step, if no step changes the loss; else 0.
+        The largest step if no step changes the loss, else 0.
     smallest_change : float
-        Change of the loss that its rounding can hide, if no step changes it.
+        If no step changes the loss: the largest change that rounding or noise of the loss can hide.
     refusals : str
-        Why levels cannot be used.
+        Why some levels cannot be used, as text.
     steps, changes, remainders, gaps, kinks, rounding, noise : ndarray
-        Step t; f(x +- t d) - f; the same without the gradient; m(t); the jump of the one-sided differences; rounding
-        and noise of the loss.
+        The step t; f(x +- t d) - f(x); the same minus +- t g . d; the gap m(t); the difference of the one-sided
+        difference quotients; rounding error and noise of the loss.
     jitter : float
         Noise of the loss in units of its rounding.
     curvature : float
         Size of the second derivative at the coarsest steps.
     step : float
-        Where the plateau is.
+        The step of the estimate that is used.
     split, split_bar : float
-        Jump of the one-sided derivatives there, 0 if it may be 0, and its error bar.
+        Difference of the one-sided derivatives near this step, 0 if it is not significant; and its error bar.
     floor : float
-        Part of the bar that is the rounding of x.
+        Part of the error bar that is due to the rounding of x.
     agreement : float
-        Share of the derivative below which a gap is agreement.
+        A gap below this share of the derivative counts as agreement.
     size, share, beyond : float
-        Size of the gap; its share of the derivative; by how much the slope lies outside the one-sided derivatives.
+        Absolute value of the gap; the same divided by `scale`; and, at a kink, by how much the slope is outside the
+        interval between the one-sided derivatives.
     is_resolved, is_close, is_wrong, is_zero, is_flat : bool
-        Whether the bar is small; gap and bar are small; the gap is significant; slope and bar are small beside the
-        curvature; there is no climb to read order 1 from.
+        True if, in this order: the error bar is small; gap and error bar are small; the gap is significant; slope and
+        error bar are negligible relative to the curvature; the first-order term is too small to measure order 1.
     left_by_solves, left_by_steps : float
-        Gaps that solves and time steps with error control may leave.
+        Largest gaps that may be due to the tolerance of solves and of time steps.
     digits : float
-        Digits that are proved.
+        Number of digits in which gradient and difference agree.
     first_levels, first_order, second_levels, second_order, third_levels, third_order
-        Numbers of levels that Taylor orders are read from, and the orders; see `DirectionResult`.
+        Numbers of levels from which Taylor orders are measured, and the orders; see `DirectionResult`.
     bend : float
         d . H d, if a Hessian product was examined.
     hessian_gap : float
-        By which share it is off.
+        Relative error of d . H d.
     hessian_jumps : bool
-        Whether the remainder changes its sign with the step.
+        Whether the third Taylor remainder differs between the two signs of the step (the Hessian jumps at x).
     """
 
     line: Line
@@ -145,7 +146,7 @@ class DirectionEvidence:
 
     @property
     def difference(self) -> float:
-        """Best estimate of the derivative from differences."""
+        """Best estimate of the derivative by finite differences."""
         return self.slope + self.gap
 
     @property
@@ -155,7 +156,7 @@ class DirectionEvidence:
         return self.bar / self.scale
 
     def result(self) -> DirectionResult:
-        """Return what a user sees of the evidence."""
+        """Return the public result."""
         return DirectionResult(
             direction=self.direction,
             word=self.word,
@@ -179,29 +180,30 @@ class DirectionEvidence:
 
 
 class DirectionResult(Result):
-    """What is proved along one direction, in a word, and the evidence for it.
+    """The result of an audit along one direction: a word, and the evidence for it.
 
     Attributes
     ----------
     direction : str
     word : str
-        agrees, disagrees; vanishes: both derivatives are 0 to rounding; kink: the one-sided derivatives differ;
-        outside: they differ, and the gradient is beyond both; rough: a Taylor remainder has the wrong order;
-        noise, few: nothing is proved, because of noise or for want of usable steps;
-        loose steps: the gap is a few tolerances of time steps with error control;
-        masked: gap and bar are small, but noise that is no rounding leaves too few digits;
-        constant: the loss does not change, as the gradient says; ripple: coarse and fine steps see two derivatives.
+        "agrees" or "disagrees". "vanishes": both derivatives are 0 up to rounding. "constant": the loss does not
+        change, and g . d is 0. "kink": the one-sided derivatives differ. "outside": they differ, and g . d is not
+        between them. "rough": a Taylor remainder has the wrong order. "noise": noise hides the derivative. "few": there
+        are too few usable steps. "loose steps": the gap is at most a few tolerances of time steps. "masked": gap and
+        error bar are small, but noise other than rounding leaves too few digits. "ripple": coarse and fine steps show
+        different derivatives.
     difference, slope : float
-        Best estimate of the derivative from differences; and g . d.
+        Best estimate of the derivative by finite differences; and g . d.
     gap, bar, scale : float
-        Difference less slope, its error bar, and what both are compared with.
+        difference - slope; its error bar; and the size of the derivative.
     share, resolution : float
-        Gap and bar as shares of the scale.
+        Gap and error bar, divided by the scale.
     step : float
-        Where the plateau is.
+        Step of the best estimate.
     rate1, rate2, rate3 : float
-        Orders of f(x + t d) - f, the one farthest from 1, NaN when there is none; the lowest with t g . d subtracted,
-        infinite when that is noise on all levels; and with t^2/2 d . H d too, where a Hessian product was examined.
+        Taylor orders. rate1 is the order of f(x + t d) - f(x) that is farthest from 1, or NaN if there is none. rate2
+        is the lowest order after t g . d is subtracted, or infinite if the remainder is noise on all levels. rate3 is
+        the lowest order after t^2 / 2 d . H d is subtracted as well, if a Hessian product was examined.
     bend : float
         d . H d.
     digits : float
@@ -232,9 +234,9 @@ class DirectionResult(Result):
     __str__ = __repr__ = object.__repr__
 
 
-@np.errstate(all="ignore")  # losses near the limits of the floating-point numbers are treated like others
+@np.errstate(all="ignore")  # losses near overflow or underflow are treated like others
 def weigh(line: Line) -> DirectionEvidence:
-    """Return the evidence that the levels of a line give, with its word."""
+    """Return the evidence from all levels of a line, with the resulting word."""
     unchanged = max(line.unchanged_steps, default=0.0)
     evidence = DirectionEvidence(
         line=line,
@@ -254,9 +256,9 @@ def weigh(line: Line) -> DirectionEvidence:
 
 
 def _smallest_visible_change(line: Line, largest_step: float) -> float:
-    """Return the change of a loss below which nothing need be seen.
+    """Return the largest change of the loss that rounding or noise can hide.
 
-    Where the loss is 0 to rounding, its noise along other directions, which grows with x, takes the place of its size.
+    It is the rounding error of the loss. If the loss is 0 up to rounding, its measured noise is used instead.
     """
     deviation = line.evaluations.deviation
     if abs(line.base) <= THRESHOLDS.bars_disagree * deviation:
@@ -265,7 +267,7 @@ def _smallest_visible_change(line: Line, largest_step: float) -> float:
 
 
 def _read_levels(evidence: DirectionEvidence) -> None:
-    """Read gaps, remainders and noise from all levels."""
+    """Compute gaps, remainders and noise of all usable levels."""
     line = evidence.line
     usable = line.usable
     steps = np.array([level.step for level in usable])
@@ -274,10 +276,10 @@ def _read_levels(evidence: DirectionEvidence) -> None:
     changes = losses - line.base
     remainders = changes - predicted
     gaps = (remainders[0] - remainders[1]) / (2 * steps)
-    # The jump of the one-sided differences, without the part that comes from unequal displacements.
+    # The difference of the one-sided quotients, without the effect of unequal rounding of both displacements.
     kinks = (remainders[0] + remainders[1]) / steps
     rounding = line.evaluations.eps * np.max(np.abs(losses), axis=0, initial=max(abs(line.base), FLOAT_TINY))
-    # What the finest levels vary by in roundings of the loss: rounding does that, or a solve inside.
+    # Variation between the finest levels, in roundings of the loss. It is due to rounding or to an inexact solve.
     variation = np.abs(np.diff(gaps)) * steps[1:] / rounding[1:]
     finest = variation[1 - THRESHOLDS.noise_levels :]
     evidence.steps = steps
@@ -293,7 +295,7 @@ def _read_levels(evidence: DirectionEvidence) -> None:
 
 @dataclass
 class _Plateau:
-    """An estimate of the derivative that may be chosen."""
+    """A candidate for the estimate of the derivative."""
 
     gap: float
     bar: float
@@ -302,11 +304,11 @@ class _Plateau:
     split: float
     split_bar: float
     is_doubtful: bool
-    is_passing: bool  # a finer level contradicts it
+    is_passing: bool  # True if a finer level contradicts it
 
 
 def _estimate_plateau(evidence: DirectionEvidence) -> None:
-    """Choose the estimate with the smallest bar that no finer level contradicts, away from kinks if there is one."""
+    """Choose the estimate with the smallest error bar that no finer level contradicts, if possible without a kink."""
     line = evidence.line
     eps = line.point.eps
     if line.evaluations.solved:
@@ -320,7 +322,7 @@ def _estimate_plateau(evidence: DirectionEvidence) -> None:
     jumps = _extrapolated(evidence.steps, evidence.kinks, 1, 2 * evidence.noise)
     plateaus = []
     for gap, bar, index in _extrapolated(evidence.steps, evidence.gaps, 2, evidence.noise):
-        # The jump of the one-sided derivatives around the level, 0 if it may be 0.
+        # The difference of the one-sided derivatives near this level, 0 if there is no estimate.
         jump = jump_bar = 0.0
         for value, value_bar, value_index in jumps:
             if abs(value_index - index) <= 1:
@@ -330,7 +332,7 @@ def _estimate_plateau(evidence: DirectionEvidence) -> None:
         scale = max(evidence.scale, abs(evidence.slope + gap))
         is_jump = abs(jump) > max(THRESHOLDS.bars_disagree * jump_bar, evidence.agreement * scale)
         split = abs(jump) * is_jump
-        # A derivative is a limit, not a passing plateau: all finer levels agree with it.
+        # The derivative is the limit t -> 0, so all finer levels must agree with it.
         distances = np.abs(evidence.gaps - gap)[index + 1 :]
         allowed = (bar + 6 * evidence.noise / evidence.steps)[index + 1 :]
         plateaus.append(
@@ -346,7 +348,7 @@ def _estimate_plateau(evidence: DirectionEvidence) -> None:
             )
         )
     lasting = [plateau for plateau in plateaus if not plateau.is_passing] or plateaus[-1:]
-    best = min(lasting, key=lambda plateau: plateau.is_doubtful)  # the first without doubt has the smallest bar
+    best = min(lasting, key=lambda plateau: plateau.is_doubtful)  # the first one has the smallest bar
     evidence.gap = best.gap
     evidence.bar = best.bar
     evidence.step = best.step
@@ -358,7 +360,7 @@ def _estimate_plateau(evidence: DirectionEvidence) -> None:
 def _extrapolated(
     steps: NDArray[Any], values: NDArray[Any], power: int, noise: NDArray[Any]
 ) -> list[tuple[float, float, int]]:
-    """Return estimates of v0 in values(t) = v0 + c t^power: (estimate, bar, index of its finest level), best first."""
+    """Estimate v0 in values(t) = v0 + c t^power. Return a list (estimate, bar, index of finest level), best first."""
     ratio = (steps[:-1] / steps[1:]) ** power
     richardson = (ratio * values[1:] - values[:-1]) / (ratio - 1)
     estimates: list[tuple[float, float, int]] = []
@@ -371,7 +373,7 @@ def _extrapolated(
 
 
 def _compare_gap_and_bar(evidence: DirectionEvidence) -> None:
-    """Compare gap, bar, scale and noise."""
+    """Classify the gap by comparing it with error bar, scale and noise."""
     evaluations = evidence.line.evaluations
     base = abs(evidence.line.base)
     gap = evidence.gap
@@ -407,13 +409,16 @@ def _compare_gap_and_bar(evidence: DirectionEvidence) -> None:
 def _measure_taylor_orders(evidence: DirectionEvidence) -> None:
     """Measure the orders of the Taylor remainders on levels near the plateau.
 
-    Usable for order 2: R2 >= clear_of_noise (noise + t |gap|). Where these are fewer than fewest_orders, the even part
-    of R2 is read, which no gap can hide, then the same on all levels; without any usable level the loss is linear to
-    its noise, and has no order 2. Usable for order 1: R1 >= clear_of_noise noise, and t |g . d| >= linear_share times
-    the even part (f(x + t d) + f(x - t d)) / 2 - f. Where the slope is so small that f bends before it climbs (near a
-    minimum), order 1 cannot be 1: the direction is flat, and order 1 is not read. The same holds where neither the
-    loss nor t g . d ever exceeds the noise (the kernel of a Laplacian), if gap and bar are far below the terms of
-    g . d.
+    For order 2, a level is usable if R2 >= clear_of_noise * (noise + t |gap|). If there are fewer than fewest_orders
+    such levels, the even part of R2 is used instead, because a gap does not contribute to it; if there are still too
+    few, levels far from the plateau are used, too. If there is no usable level at all, the loss is linear up to noise,
+    and there is no order 2.
+
+    For order 1, a level is usable if R1 >= clear_of_noise * noise, and if t |g . d| is at least linear_share times the
+    even part (f(x + t d) + f(x - t d)) / 2 - f(x). If the slope is so small that the even part dominates (near a
+    minimum), the order cannot be 1; the direction is then called flat, and order 1 is not measured. The same applies
+    if neither the change of the loss nor t g . d exceeds the noise at any level (in the kernel of a Laplacian), while
+    gap and error bar are far below the individual terms of g . d.
     """
     steps = evidence.steps
     clear = THRESHOLDS.clear_of_noise * evidence.noise
@@ -456,7 +461,7 @@ def rms_of_both_sides(sides: NDArray[Any]) -> NDArray[Any]:
 def pairwise_orders(
     steps: NDArray[Any], remainder: NDArray[Any], is_usable: NDArray[Any], most: int = THRESHOLDS.most_orders
 ) -> tuple[int, list[float]]:
-    """Return the number of the finest usable levels, and the orders of pairs at least a factor pair_ratio apart."""
+    """Return the number of usable levels (at most `most`), and the orders of pairs with step ratio >= pair_ratio."""
     levels = np.flatnonzero(is_usable)[-most:]
     orders = []
     for coarse in levels:
@@ -468,17 +473,17 @@ def pairwise_orders(
     return len(levels), orders
 
 
-# ------------------------------------------------------------ from evidence to a word
+# ------------------------------------------------------------ the word that follows from the evidence
 
 
 def _word_and_reason(evidence: DirectionEvidence) -> tuple[str, str]:
-    """Return the word for the evidence along one direction and its reason; the first rule that applies decides."""
+    """Return the word for one direction, and the reason. The first rule that applies decides."""
     if evidence.silent:
         return _without_any_change(evidence)
     usable = len(evidence.line.usable)
     if usable < THRESHOLDS.fewest_levels:
         return "few", (f"{usable} usable steps, at least {THRESHOLDS.fewest_levels} are needed ({evidence.refusals})")
-    # Between two one-sided derivatives every value is a matter of convention.
+    # At a kink every value between the one-sided derivatives is acceptable.
     significant = THRESHOLDS.bars_disagree * (evidence.bar + evidence.split_bar)
     if evidence.beyond > significant and evidence.beyond > THRESHOLDS.resolved_share * evidence.scale:
         return "outside", f"outside the one-sided derivatives, off by {evidence.share:.1e}"
@@ -496,7 +501,7 @@ def _word_and_reason(evidence: DirectionEvidence) -> tuple[str, str]:
 
 
 def _without_any_change(evidence: DirectionEvidence) -> tuple[str, str]:
-    """Return word and reason where no step changes the loss."""
+    """Return word and reason if no step changes the loss."""
     if evidence.slope == 0:
         return "constant", "the loss does not change along this direction"
     predicted = abs(evidence.slope) * evidence.silent
@@ -506,14 +511,14 @@ def _without_any_change(evidence: DirectionEvidence) -> tuple[str, str]:
 
 
 def _with_a_significant_gap(evidence: DirectionEvidence) -> tuple[str, str]:
-    """Return word and reason where the gap is beyond its bar."""
+    """Return word and reason if the gap is larger than its error bar."""
     off = f"off by {evidence.share:.1e}"
     if evidence.size <= evidence.left_by_solves:
         return "noise", f"{off}: solves may leave this in such a loss, tighten their rtol"
     if evidence.size <= evidence.left_by_steps:
         tolerance = evidence.line.evaluations.step_tolerance
         return "loose steps", f"{off}: the steps' tolerance of {tolerance:g} leaves this, tighten it"
-    # Noise that exceeds the whole difference may be a chaotic loss with a right gradient.
+    # If the noise is larger than the difference itself, the loss may be chaotic and the gradient correct.
     is_difference = abs(evidence.difference) > THRESHOLDS.bars_disagree * evidence.bar
     if evidence.jitter < THRESHOLDS.rounding_noise or is_difference:
         return "disagrees", f"{off}, with error bars of {evidence.resolution:.1e}"
@@ -521,7 +526,7 @@ def _with_a_significant_gap(evidence: DirectionEvidence) -> tuple[str, str]:
 
 
 def _with_a_small_gap(evidence: DirectionEvidence) -> tuple[str, str]:
-    """Return word and reason where the gap is within its bar, or both derivatives vanish."""
+    """Return word and reason if the gap is within its error bar, or if both derivatives vanish."""
     fewest = THRESHOLDS.fewest_orders
     is_noisy = evidence.jitter > THRESHOLDS.rounding_noise
     if evidence.is_close and is_noisy and evidence.bar > THRESHOLDS.noisy_agreement_share * evidence.scale:

@@ -16,16 +16,17 @@ from sparsedp.check.evaluations import Line
 
 __all__ = ["POINTS", "measure_noise"]
 
-POINTS = 8  # values of a table
-ORDER = 4  # of the differences that are read: those of a parabola are 0
-VARIANCE = math.factorial(2 * ORDER) / math.factorial(ORDER) ** 2  # of such a difference of errors of variance 1
-SMALLEST_DISTANCE = 0.7320508 * 2.0**-28  # in units of x, double precision; never a power of two times a step
-GROWTH = 2.0**6  # of the distance while the loss does not change
+POINTS = 8  # number of values in the table
+ORDER = 4  # order of the differences, which are 0 for polynomials of lower degree
+# Variance of such a difference if the values have independent errors of variance 1.
+VARIANCE = math.factorial(2 * ORDER) / math.factorial(ORDER) ** 2
+SMALLEST_DISTANCE = 0.7320508 * 2.0**-28  # in units of x, for float64; its ratio to a step is never a power of two
+GROWTH = 2.0**6  # factor by which the distance is increased while the loss does not change
 MOST_DISTANCES = 4
 
 
 def measure_noise(line: Line) -> tuple[float, float]:
-    """Measure how much a loss varies beside its smooth part.
+    """Measure the noise of a loss: its variation that is not smooth.
 
     Parameters
     ----------
@@ -34,15 +35,16 @@ def measure_noise(line: Line) -> tuple[float, float]:
     Returns
     -------
     (float, float)
-        Standard deviation in units of the rounding of the loss, and in units of the loss; 0 where nothing varies.
+        Standard deviation in units of the rounding of the loss, and as an absolute value. Both are 0 if the loss does
+        not vary.
 
     Notes
     -----
-    Values at equal distances, so close that a smooth loss is a straight line there. The k-th differences of a line
-    are 0; those of independent errors of standard deviation s have the variance s^2 (2k)! / (k!)^2. The distance is
-    no power of two times a step of the sweep, and it grows until the loss changes from point to point: otherwise the
-    steps of a rounded loss (to single precision, by a table) may coincide with points of the sweep and stay unseen.
-    The points lie on one side, since a kink at x is no noise.
+    The loss is evaluated at equidistant points that are so close that a smooth loss is linear there. The k-th
+    differences of a linear function are 0. Those of independent errors with standard deviation s have the variance
+    s^2 (2k)! / (k!)^2. A loss may be piecewise constant, for example if it is rounded to single precision. To detect
+    this, the distance is increased until the loss changes from point to point, and its ratio to the steps of the sweep
+    is not a power of two. All points lie on one side of x, because a kink at x is not noise.
     """
     distance = SMALLEST_DISTANCE * max(1.0, line.point.eps / float(np.finfo(float).eps)) ** 0.5
     for _ in range(MOST_DISTANCES):

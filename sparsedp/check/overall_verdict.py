@@ -1,4 +1,4 @@
-"""From the words of all directions, and further findings, to the verdict on a gradient."""
+"""The verdict on a gradient, from the results along all directions and from further findings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sparsedp.check.thresholds import THRESHOLDS
 
 __all__ = ["overall_verdict"]
 
-# The first group with a member decides, by the member with the largest gap.
+# The first group that has a member decides the verdict. Its member with the largest gap gives the reason.
 VERDICTS = (
     (("unsound",), "inconclusive"),
     (("broken",), "disagrees"),
@@ -27,12 +27,12 @@ def overall_verdict(directions: Sequence[DirectionEvidence], findings: Sequence[
     ----------
     directions : sequence of DirectionEvidence
     findings : sequence of (str, str)
-        Word and reason of what was found beside the directions.
+        (word, reason) of each finding that does not belong to a direction.
 
     Returns
     -------
     (str, str)
-        "agrees", "disagrees" or "inconclusive"; the reason is empty where the gradient simply agrees.
+        The verdict ("agrees", "disagrees" or "inconclusive") and its reason, which may be empty for "agrees".
     """
     largest = max((direction.scale for direction in directions), default=0.0)
     evidence = [(word, reason, inf) for word, reason in findings]
@@ -54,7 +54,7 @@ def overall_verdict(directions: Sequence[DirectionEvidence], findings: Sequence[
 
 
 def _is_negligible(direction: DirectionEvidence, largest: float) -> bool:
-    """Return whether an undecided direction has a small derivative by gradient and differences beside the largest."""
+    """Return True if a direction is undecided, but its derivative is negligible relative to the largest one."""
     if direction.word not in ("noise", "masked", "few"):
         return False
     if abs(direction.gap) > THRESHOLDS.bars_agree * direction.bar:

@@ -6,11 +6,11 @@ import numpy as np
 
 __all__ = ["COARSER_STEPS", "FINER_STEPS", "RIPPLE_STEPS", "STEPS_BETWEEN", "default_steps"]
 
-# Steps beyond those of the sweep.
-COARSER_STEPS = tuple(2.0**k for k in range(1, 38, 3))  # for noise of rounding: x may be small beside the loss
-FINER_STEPS = tuple(2.0**-k for k in range(33, 46, 3))  # for other noise: there may be finer features
-STEPS_BETWEEN = 2.0 ** np.arange(-9, 7)  # times the step of the plateau: more levels for an order
-RIPPLE_STEPS = 2.0 ** -np.arange(27, 46)  # that may show a ripple
+# Steps that extend the default sweep.
+COARSER_STEPS = tuple(2.0**k for k in range(1, 38, 3))  # if rounding errors hide the derivative
+FINER_STEPS = tuple(2.0**-k for k in range(33, 46, 3))  # if other noise hides it: there may be finer features
+STEPS_BETWEEN = 2.0 ** np.arange(-9, 7)  # multiples of the step of the plateau, for Taylor orders
+RIPPLE_STEPS = 2.0 ** -np.arange(27, 46)  # fine steps at which a ripple is visible
 
 
 def default_steps(eps: float) -> tuple[float, ...]:

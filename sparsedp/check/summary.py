@@ -1,4 +1,4 @@
-"""Results of checks and instruments: frozen values that print themselves, as text, in Markdown and as HTML."""
+"""Base classes of results: immutable objects with representations as text, Markdown, HTML, CSV and plain data."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ __all__ = ["Result", "Row", "Summary", "error_text"]
 
 
 class Result(Frozen):
-    """The result of an instrument: frozen, as plain data, as text; true unless it has a verdict other than "agrees".
+    """Base class of immutable results. bool(result) is False if it has a verdict other than "agrees".
 
-    The attributes are the values of the constructor; the docstring of each kind lists them, and nothing else does.
-    ``parts()`` of each kind returns its text from top to bottom, a list of str and Table: lines, the first one a title,
-    and tables.
+    The keyword arguments of the constructor become the attributes, which the docstring of each subclass lists. The
+    method ``parts()`` of a subclass returns the content from top to bottom, as a list of str (lines, of which the first
+    is the title) and Table.
     """
 
-    _plain: tuple[str, ...] = ()  # names of the attributes that are plain data; default: all
-    skipped: Sequence[str] = ()  # sentences
+    _plain: tuple[str, ...] = ()  # names of the attributes in to_dict(); empty for all attributes
+    skipped: Sequence[str] = ()  # sentences about what was skipped
     left_out = deprecated_attribute("left_out", "skipped", "0.5")
 
     def __getattr__(
@@ -42,27 +42,27 @@ class Result(Frozen):
         return self.ok
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the result as plain numbers, strings, lists and dicts; None where an array holds NaN."""
+        """Return the result as plain numbers, strings, lists and dicts. NaN in an array becomes None."""
         data = {name: _plain(getattr(self, name)) for name in self._plain or vars(self)}
         if "skipped" in data:
             data["left_out"] = data["skipped"]  # deprecated
         return data
 
     def omissions(self) -> list[str]:
-        """Return what was skipped, with the reason: lines of its text."""
+        """Return lines of text about what was skipped, with the reasons."""
         return [f"  skipped: {sentence}" for sentence in self.skipped]
 
     def __str__(self) -> str:
         return "\n".join(map(str, self.parts()))
 
     def markdown(self) -> str:
-        """Return the text in Markdown: a heading, tables, and the other lines as a list."""
+        """Return the result in Markdown: the title as a heading, tables, and all other lines as a list."""
         title, *parts = self.parts()
         blocks = [f"\n{part.markdown()}\n" if isinstance(part, Table) else f"- {part.strip()}" for part in parts]
         return "\n".join([f"### {title}", "", *blocks, ""])
 
     def html(self) -> Markup:
-        """Return the text as HTML: a title, tables, the other lines; what was skipped is folded away.
+        """Return the result as HTML: the title, tables and lines. What was skipped is in a collapsed section.
 
         Returns
         -------
@@ -80,18 +80,18 @@ class Result(Frozen):
         return Markup("\n".join([*blocks, folded("What was skipped", self.skipped)]))
 
     def curves(self) -> tuple[dict[str, Any], str, str]:
-        """Return what is drawn on logarithmic axes; nothing unless a kind of result says so.
+        """Return curves to plot on logarithmic axes. The default is no curves; subclasses may override it.
 
         Returns
         -------
         curves : dict
-            Name: points (x, y) of each curve. Without curves there is no picture.
+            List of points (x, y) by name of the curve. If it is empty, there is no plot.
         xlabel, ylabel : str
         """
         return {}, "", ""
 
     def _repr_html_(self) -> Markup:
-        """Return the result for a notebook: with its picture, if it has one."""
+        """Return the result as HTML for a notebook, with a plot if there are curves."""
         return Markup(self.html() + curves(*self.curves(), log=(True, True)))
 
     def csv(self) -> str:
@@ -103,7 +103,7 @@ class Result(Frozen):
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as plain data."""
+    """Convert a value to plain numbers, strings, lists and dicts."""
     if isinstance(value, Result):
         return value.to_dict()
     if isinstance(value, Row):
@@ -116,10 +116,10 @@ def _plain(value: Any) -> Any:
 
 
 class Row(NamedTuple):
-    """One property: its name, the measured figure, the largest one allowed, and whether it holds.
+    """One tested property: its name, the measured figure, the largest allowed figure, and whether it holds.
 
-    The figure is infinite for NaN and errors. `ok` is None when the property does not apply; `note` says why, or what
-    went wrong.
+    The figure is infinite if the test gave NaN or raised an exception. `ok` is None if the property was not tested.
+    `note` says why, or what went wrong.
     """
 
     name: str
@@ -130,7 +130,7 @@ class Row(NamedTuple):
 
 
 class Summary(Result):
-    """The rows of a check of an operator. Frozen; true when nothing failed and something was tested.
+    """The result of a check of an operator. bool(summary) is True if no row failed and at least one was tested.
 
     Attributes
     ----------
@@ -141,7 +141,7 @@ class Summary(Result):
     failed : tuple of str
         Names of the rows that failed.
     verdict : "agrees", "disagrees" or "inconclusive"
-        Inconclusive where nothing could be tested.
+        It is "inconclusive" if nothing could be tested.
     """
 
     _plain = ("title", "verdict", "limit", "worst", "rows")
@@ -160,11 +160,11 @@ class Summary(Result):
 
     @property
     def worst(self) -> float:
-        """Largest figure of the tested rows; 0 without any."""
+        """Largest figure of all tested rows; 0 if there are none."""
         return max((row.figure for row in self.rows if row.figure is not None), default=0.0)
 
     def parts(self) -> list[Any]:
-        """Return the verdict, and the rows."""
+        """Return the title line with the verdict, and the table of rows."""
         words = {True: "ok", False: "FAILS", None: "-"}
         cells = []
         for row in self.rows:
@@ -177,12 +177,12 @@ class Summary(Result):
 
 
 def _figure(row: Row) -> Any:
-    """Return the figure of a row; as text where it fails and its first digits are those of the limit."""
+    """Return the figure of a row. If rounding would hide that it exceeds the limit, return text with more digits."""
     if row.ok is False and row.limit is not None and f"{row.figure:.2g}" == f"{row.limit:.2g}":
         return number_beside(row.figure, row.limit, digits=2)
     return row.figure
 
 
 def error_text(error: BaseException) -> str:
-    """Return an error in one line."""
+    """Return type and message of an exception in one line."""
     return " ".join(f"{type(error).__name__}: {error}".split())

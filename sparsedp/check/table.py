@@ -1,4 +1,4 @@
-"""Tables of results: as text, in Markdown, as HTML, as CSV."""
+"""Tables of results, with representations as text, Markdown, HTML and CSV."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from sparsedp._utils.html import Markup, table, text_of
 
 __all__ = ["Table", "table_of"]
 
-DIGITS = 2  # of a float in a cell
-NUMBER = re.compile(r"[-+]?(\d[\d.]*(e[-+]\d+)?|nan|inf|exact)?")  # such cells are aligned to the right
+DIGITS = 2  # significant digits of a float in a cell
+NUMBER = re.compile(r"[-+]?(\d[\d.]*(e[-+]\d+)?|nan|inf|exact)?")  # columns of such cells are right-aligned
 
 
 class Table(NamedTuple):
-    """Rows of cells, and the names of the columns. str() sets words to the left, numbers to the right."""
+    """Rows of cells, and the names of the columns. str() aligns numbers to the right and words to the left."""
 
     names: Sequence[Any]
     rows: Sequence[Sequence[Any]]
 
     def texts(self) -> list[tuple[str, ...]]:
-        """Return the cells in words, below the names; without the columns that are empty, except the first one."""
+        """Return the names and all cells as text. Empty columns are omitted, except the first one."""
         texts = ([text_of(cell, DIGITS) for cell in row] for row in (self.names, *self.rows))
         columns = list(zip(*texts, strict=True))
         nonempty = [column for column in columns[1:] if any(column[1:]) or not self.rows]
@@ -47,20 +47,20 @@ class Table(NamedTuple):
         return "\n".join([head, f"|{'---|' * len(cells[0])}", *body])
 
     def html(self) -> Markup:
-        """Return the table as HTML; nothing without a row."""
+        """Return the table as HTML; an empty string if there are no rows."""
         names, *rows = self.texts()
         if rows:
             return table(rows, names)
         return Markup("")
 
     def csv(self) -> str:
-        """Return the table as CSV: every digit of a number, a line of names."""
+        """Return the table as CSV with a header line. Numbers have all their digits."""
         stream = io.StringIO()
         csv.writer(stream, lineterminator="\n").writerows([self.names, *self.rows])
         return stream.getvalue()
 
 
 def table_of(rows: Sequence[dict[str, Any]], names: Sequence[str] = ()) -> Table:
-    """Return the table of the entries of these names; default: all names of the rows, in the order of first use."""
+    """Return a table of dicts. `names` selects the columns; by default all keys, in the order of first use."""
     names = names or list(dict.fromkeys(name for row in rows for name in row)) or ["nothing"]
     return Table(names, [[row.get(name) for name in names] for row in rows])
