@@ -1,4 +1,4 @@
-"""Store the fields of a grid on the ranks of a communicator (`distribute`), and collect them (`gather`)."""
+"""Distribute the fields of a grid over MPI ranks (`distribute`), and collect a field on every rank (`gather`)."""
 
 from __future__ import annotations
 
@@ -14,32 +14,34 @@ from sparsedp.grid.grid import Grid, check_grid
 
 __all__ = ["distribute", "gather"]
 
-SIZE_VARIABLES = "OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE"  # set by launchers: the number of processes
+# Environment variables in which the launchers of MPI store the number of processes.
+SIZE_VARIABLES = "OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE"
 
 
 def distribute(grid: Grid, comm: Any = None) -> Grid:
-    """Return a grid whose fields are stored in blocks by the processes that run this program.
+    """Return a copy of a grid whose fields are distributed over MPI ranks.
 
     Parameters
     ----------
     grid : Grid
     comm : mpi4py.MPI.Comm, optional
-        Default: all processes that ``mpirun -n 64 python -m mpi4py scene.py`` has started.
+        Default: all processes of the program, such as those started by ``mpirun -n 64 python -m mpi4py scene.py``.
 
     Returns
     -------
     Grid
-        With one process, the grid itself, and nothing is imported. Otherwise every rank holds a block of each field:
-        arithmetic is local; sums, means, maxima and norms are computed over the whole field, with the same bits on
-        every rank; all other functions raise TypeError. A plain array of the whole shape is a field that every rank
-        holds, and so is its gradient.
+        On one process, `grid` itself; mpi4py and petsc4py are then not imported. On several processes, each rank stores
+        a block of every field. Elementwise arithmetic needs no communication. Sums, means, maxima and norms are
+        computed over the whole field and give bitwise the same result on every rank. NumPy functions that need other
+        entries than those of the block raise TypeError. A NumPy array of the whole shape can be combined with such
+        fields; it must be the same on every rank, and its gradient is again a whole array on every rank.
 
     Raises
     ------
     ImportError
-        If there are several processes, and mpi4py or petsc4py is missing.
+        If there are several processes, and mpi4py or petsc4py is not installed.
     RuntimeError
-        If mpi4py belongs to another MPI than the one that started the processes.
+        If mpi4py was built with another MPI library than the one that started the processes.
     TypeError
         If `comm` is not a communicator.
 
@@ -76,7 +78,7 @@ def distribute(grid: Grid, comm: Any = None) -> Grid:
             "this MPI"
         )
     if MPI.COMM_WORLD.size > 1:
-        atexit.unregister(end_all_after_error)  # of an earlier call
+        atexit.unregister(end_all_after_error)  # an earlier call may have registered it
         atexit.register(end_all_after_error)
     if comm is None:
         comm = MPI.COMM_WORLD
@@ -84,16 +86,17 @@ def distribute(grid: Grid, comm: Any = None) -> Grid:
 
 
 def gather(u: Any) -> np.ndarray:
-    """Return a field, on ranks or not, as one plain array that every rank holds: for pictures and small files.
+    """Return the whole field as a NumPy array on every rank, for plots and small files. All ranks must call it.
 
     Parameters
     ----------
     u : field
+        A distributed field, or an array.
 
     Returns
     -------
     array
-        `u` itself where it is a plain array.
+        `u` itself if it is a NumPy array.
 
     Raises
     ------

@@ -1,9 +1,10 @@
-"""A field of which this rank holds a block: it behaves like one array of the whole shape.
+"""Distributed fields: each rank stores a block of the field, which behaves like an array of the shape of the whole.
 
-Elementwise arithmetic acts on the block; sums, means, maxima and norms are those of the whole field, with the same bits
-on every rank. What cannot be computed from blocks (u[i, j], sorting, sums along an axis) raises TypeError: nothing is
-silently local, no program branches differently on two ranks, and every rank records the same tape. A plain array of the
-whole shape is a field that every rank holds: as the other operand of a field on ranks, each takes its own block of it.
+Elementwise arithmetic is applied to the blocks. Sums, means, maxima and norms are computed over the whole field and are
+bitwise the same on every rank. Operations that cannot be computed from the blocks, such as u[i, j], sorting or sums
+along an axis, raise TypeError. Thus no result depends on the rank by accident, all ranks take the same branches of a
+program, and autograd records the same graph on every rank. A NumPy array of the whole shape can be combined with a
+distributed field; each rank then uses its own block of the array.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ __all__ = ["DistributedField", "alike", "block", "everywhere", "total"]
 
 
 class DistributedField(np.lib.mixins.NDArrayOperatorsMixin):
-    """The flat block of this rank, read-only, and the space of the whole field."""
+    """A field distributed over ranks: the flat, read-only block of this rank, and the space of the whole field."""
 
     __slots__ = ("__weakref__", "flat", "space")
 
@@ -42,16 +43,16 @@ class DistributedField(np.lib.mixins.NDArrayOperatorsMixin):
     ndim = property(lambda self: len(self.space.shape))
     size = property(lambda self: self.space.size)
     dtype = property(lambda self: self.flat.dtype)
-    nbytes = property(lambda self: self.space.size * self.flat.dtype.itemsize)  # the same on every rank
+    nbytes = property(lambda self: self.space.size * self.flat.dtype.itemsize)  # of the whole field, equal on all ranks
     real = property(lambda self: self.like(self.flat.real))
     imag = property(lambda self: self.like(self.flat.imag))
 
     def like(self, flat: NDArray) -> DistributedField:
-        """Return another field on the same space."""
+        """Return a field on the same space, given the flat block of this rank."""
         return DistributedField(np.ascontiguousarray(flat), self.space)
 
     def copy(self) -> DistributedField:
-        """Return the field itself: it is read-only."""
+        """Return the field itself, because it is read-only."""
         return self
 
     def astype(self, dtype: DTypeLike, copy: bool = True) -> DistributedField:
@@ -59,15 +60,15 @@ class DistributedField(np.lib.mixins.NDArrayOperatorsMixin):
         return self.like(self.flat.astype(dtype))
 
     def gather(self) -> NDArray:
-        """Return the whole field on every rank, a plain array."""
+        """Return the whole field as a NumPy array, on every rank."""
         return self.layout.gather(self.flat, self.space.parts).reshape(self.shape)
 
     def fingerprint(self) -> int:
-        """Return an integer for its bits, the same on every rank."""
+        """Return a hash of the whole field, the same on every rank."""
         return int(self.layout.sum(np.int64(hash(self.flat.tobytes()) >> 16)))
 
     def refuse(self, what: str | Callable, *args: Any, **options: Any) -> NoReturn:
-        """Raise TypeError for an operation that needs more than the block."""
+        """Raise TypeError for an operation that cannot be computed from the blocks."""
         name = getattr(what, "__name__", what)
         raise TypeError(f"{name} does not work on a field on ranks; write dp.gather(u) for the whole array")
 
@@ -75,7 +76,7 @@ class DistributedField(np.lib.mixins.NDArrayOperatorsMixin):
         return f"<field on {self.space}, on rank {self.layout.comm.rank} of {self.layout.comm.size}>"
 
     def block_of(self, value: Any) -> Any:
-        """Return the flat block of another operand; numbers are returned unchanged."""
+        """Return the flat block of another operand; scalars are returned unchanged."""
         if np.ndim(value):
             return block(value, self.space).flat
         self.layout.compare(value)
@@ -93,7 +94,7 @@ class DistributedField(np.lib.mixins.NDArrayOperatorsMixin):
             self.refuse(f"{ufunc.__name__} with {option}")
         act: Callable = ufunc
         if ufunc is np.power and not options:
-            act = pow  # the operator of arrays is fast for small integer powers
+            act = pow  # the operator ** of arrays is faster than np.power for small integer exponents
         return self.like(act(*map(self.block_of, inputs), **options))
 
     def __array_function__(self, function, types, args, options):
@@ -121,7 +122,10 @@ for method_name, description in REFUSED_METHODS.items():
 
 
 def block(value: Any, space: Space) -> DistributedField:
-    """Return a field on ranks, from such a field, a number, or an array that every rank holds and that broadcasts."""
+    """Return a distributed field, given one, a number, or a NumPy array that is the same on every rank.
+
+    An array is broadcast to the shape of the space.
+    """
     if isinstance(value, DistributedField):
         if value.space.parts != space.parts or value.layout != space.grid.backend:
             raise ShapeError(f"a field on {space.described} is needed, got one on {value.space.described}")
@@ -140,7 +144,7 @@ def block(value: Any, space: Space) -> DistributedField:
     return DistributedField(layout.take(whole.reshape(-1), space.parts), space)
 
 
-# ---- NumPy's functions of fields on ranks ----
+# ---- implementations of NumPy functions for distributed fields ----
 
 
 def _first(*values):
@@ -148,9 +152,9 @@ def _first(*values):
 
 
 def _over_all(function, act, x, axis=None, *others, **options):
-    """Return ``act(x)`` for a reduction of a whole field; other arguments, such as an axis, are refused."""
+    """Return ``act(x)`` for a reduction over the whole field; raise TypeError for arguments such as an axis."""
     if axis is not None and options == {"keepdims": True} and x.shape[axis] == 1:
-        return x  # along an axis of one entry
+        return x  # a reduction along an axis of length 1 changes nothing
     if any(value is not None and value is not False for value in (axis, *others, *options.values())):
         x.refuse(f"{function.__name__} with a choice such as an axis")
     return act(x)
@@ -162,18 +166,18 @@ def _sum(x):
 
 
 def _mean(x):
-    total_in_dtype = _sum(x)[None]  # a number would have no dtype in a division
+    total_in_dtype = _sum(x)[None]  # an array of length 1, so that the division keeps the dtype
     return (total_in_dtype / x.size)[0]
 
 
 def _max(x):
-    """Return the largest entry; NaN if one is NaN."""
+    """Return the largest entry; NaN if any entry is NaN."""
     smallest, _ = _range_of_dtype(x)
     return x.layout.max(np.maximum.reduce(x.flat, initial=smallest))
 
 
 def _min(x):
-    """Return the least entry; NaN if one is NaN."""
+    """Return the smallest entry; NaN if any entry is NaN."""
     _, largest = _range_of_dtype(x)
     return x.layout.min(np.minimum.reduce(x.flat, initial=largest))
 
@@ -194,7 +198,7 @@ def _max_from(x, *axis, initial=None, **options):
 
 
 def _range_of_dtype(x):
-    """Return the least and the largest number of the dtype of a field."""
+    """Return the smallest and the largest value of the dtype of a field."""
     kind = x.dtype.kind
     if kind == "i":
         return np.iinfo(x.dtype).min, np.iinfo(x.dtype).max
@@ -212,7 +216,7 @@ def _vdot(x, y):
 
 
 def _norm(x):
-    """Return the root of the sum of the squares."""
+    """Return the Euclidean norm."""
     x = 1.0 * x  # integers become float64
     return np.sqrt(_vdot(x, x).real)
 
@@ -233,7 +237,7 @@ def _equal(x, y, **options):
 
 
 def _place(extreme, x):
-    """Return the flat index in the whole field of the first entry that is the least or the largest, or NaN."""
+    """Return the flat index, in the whole field, of the first entry equal to `extreme(x)`, or of the first NaN."""
     is_extreme = (x.flat == extreme(x)) | np.isnan(x.flat)
     indices = x.layout.take(np.arange(x.size), x.space.parts)[is_extreme]
     return int(x.layout.min(np.min(indices, initial=x.size)))
@@ -289,7 +293,7 @@ FUNCTIONS: dict[Callable, Callable] = {
     np.isrealobj: _is_real,
     np.result_type: _result_type,
     np.max: _max_from,
-    np.amax: _max_from,  # in new versions of NumPy the same, in old ones a function of its own
+    np.amax: _max_from,  # identical to np.max in new versions of NumPy, a separate function in old ones
     np.count_nonzero: _count_nonzero,
     np.argmin: partial(_place, _min),
     np.argmax: partial(_place, _max),
@@ -314,32 +318,32 @@ OVER_ALL: dict[Any, Callable] = {
     np.linalg.norm: _norm,
 }
 FUNCTIONS |= {function: partial(_over_all, function, act) for function, act in OVER_ALL.items()}
-REDUCED: dict = {np.add: _sum, np.maximum: _max, np.minimum: _min}  # as ``np.add.reduce(u, axis=None)``
+REDUCED: dict = {np.add: _sum, np.maximum: _max, np.minimum: _min}  # for calls such as ``np.add.reduce(u, axis=None)``
 
 
 # ---- derivatives ----
 
 
 def _spread(shape, space):
-    """Return the rules from numbers or whole arrays of a shape to fields on ranks, and their transposes."""
+    """Return differentiable functions that distribute a number or whole array of a shape, and the transpose of this."""
     back = DistributedField.gather if shape else _sum
     return linear("block", lambda x: block(x, space), back)
 
 
 def everywhere(x: Any, space: Space) -> Any:
-    """Return a field on ranks, from a number or an array that every rank holds, traced or not."""
+    """Return a distributed field, given a number or an array that is the same on every rank. Differentiable."""
     if not isbox(x):
         return block(x, space)
     value = plain(x)
     if isinstance(value, DistributedField):
         return x
     if np.shape(value) not in ((), space.shape):
-        x = x * np.ones(space.shape)  # the derivative of broadcasting is a sum; autograd computes it
+        x = x * np.ones(space.shape)  # broadcast by a product, whose VJP autograd provides
     return _spread(np.shape(value), space)[0](x)
 
 
 def alike(derivative: Any, value: Any) -> Any:
-    """Return a cotangent or tangent in the form of its value: a number, a whole array, or a field on ranks."""
+    """Convert a cotangent or tangent to the kind of its value: a number, a whole array, or a distributed field."""
     plain_value = plain(value)
     if isinstance(plain_value, DistributedField):
         return everywhere(derivative, plain_value.space)
@@ -351,15 +355,15 @@ def alike(derivative: Any, value: Any) -> Any:
 
 
 def total(x: Any) -> Any:
-    """Return the sum of all entries; differentiable."""
+    """Return the sum of all entries. Differentiable."""
     return alike(x, 0.0)
 
 
 def formulas(fun: Callable, value: Any, args: Sequence[Any], nums: Sequence[int]) -> tuple | None:
-    """Return the VJP and JVP of a call ``value = fun(*args)`` of autograd.numpy, as in FORMULAS; None if unknown.
+    """Return the VJP and JVP of a call ``value = fun(*args)`` of a function of autograd.numpy; None if unknown.
 
-    Numbers and whole arrays are converted to fields first, by rules whose transposes add up the cotangents. Then
-    autograd's derivatives of every function that acts entry by entry apply, to every order.
+    Numbers and whole arrays are first converted to distributed fields, by differentiable functions whose transposes add
+    the cotangents over all ranks. Then autograd's own derivatives of elementwise functions can be used, to any order.
     """
     if fun not in KNOWN:
         return None
@@ -389,7 +393,7 @@ def formulas(fun: Callable, value: Any, args: Sequence[Any], nums: Sequence[int]
 
 
 def _formulas_of_reduction(slope):
-    """Return the VJP and JVP of a number computed from one field; `slope`: its gradient."""
+    """Return the VJP and JVP of a scalar function of one field, whose gradient is `slope`."""
 
     def vjp(nums, args):
         def pull(g):
@@ -403,7 +407,7 @@ def _formulas_of_reduction(slope):
     return vjp, jvp
 
 
-# The gradients of reductions, ``slope(x, value, space)``.
+# Functions slope(x, value, space) that return the gradients of reductions.
 
 
 def _slope_of_sum(x, value, space):
@@ -415,7 +419,7 @@ def _slope_of_mean(x, value, space):
 
 
 def _slope_of_extreme(x, value, space):
-    """Return equal shares for all entries that have the extreme value."""
+    """Return the gradient of max or min, shared equally by all entries that attain the extreme value."""
     is_extreme = block(plain(x) == plain(value), space).astype(float)
     return is_extreme / _sum(is_extreme)
 
@@ -438,7 +442,7 @@ KNOWN = {*REDUCTIONS, *filter(callable, vars(anp).values())}
 
 
 class DistributedVSpace(VSpace):
-    """The vector space of fields on ranks, as autograd needs it to add up cotangents."""
+    """autograd's vector space of distributed fields, by which it adds cotangents."""
 
     def __init__(self, value: DistributedField) -> None:
         self.shape = value.shape
@@ -453,13 +457,14 @@ class DistributedVSpace(VSpace):
         return x + y
 
 
-# ---- calls that are the same on all ranks ----
+# ---- calls that all ranks make together ----
 
 
 def together(what: str, arguments: Any, act: Callable, *args: Any) -> Any:
-    """Return act(*args): an error of one rank is raised on all; arguments and result must be equal on all ranks.
+    """Return act(*args), called by all ranks together.
 
-    Ranks exchange no message if the call uses no field on ranks.
+    If one rank raises an exception, all ranks raise it. ValueError is raised unless arguments and result are equal on
+    all ranks. If the call uses no distributed field, the ranks do not communicate.
     """
     is_outermost = state.messages_before_call is None
     entry = (what, arguments)
@@ -486,7 +491,7 @@ def together(what: str, arguments: Any, act: Callable, *args: Any) -> Any:
 
 
 def _agreement(arguments: Any) -> Agreement | None:
-    """Return the agreement of the fields among some values, or of the last message of this call; else None."""
+    """Return the Agreement of the distributed fields among the arguments, else the one used last in this call."""
     for leaf in leaves(arguments):
         backend: Any = getattr(plain(leaf), "backend", NUMPY)
         if not backend.whole_fields:

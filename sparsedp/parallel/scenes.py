@@ -1,4 +1,4 @@
-"""The weighted sum of one loss over many scenes, with derivatives, computed by the workers of any executor."""
+"""Differentiable weighted sums of a loss over many scenes, computed in parallel by an executor."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from sparsedp.autodiff.tape_constants import frozen
 
 __all__ = ["Ensemble", "ensemble"]
 
-CACHED = 128  # most scenes and losses that a worker caches, with the solvers that they have set up
+CACHED = 128  # maximum number of scenes and losses (with their solvers) in the cache of a worker
 
 
 def ensemble(
@@ -38,40 +38,41 @@ def ensemble(
     chunk: int | None = None,
     progress: bool | str = False,
 ) -> Ensemble:
-    """Return the function total(x), the weighted sum of loss(x, scene) over all scenes, differentiable in x.
+    """Return a differentiable function total(x), the weighted sum of loss(x, scene) over many scenes.
 
     Parameters
     ----------
     loss : callable
-        ``loss(x, scene)``, a real scalar; `x` is any nesting of arrays, tuples, lists and dicts.
+        ``loss(x, scene)`` returns a real scalar; `x` is any nesting of arrays, tuples, lists and dicts.
     scenes : iterable
-        Second arguments of the loss: observations, initial states, grids, solvers.
+        The second arguments of the loss, such as observations, initial states, grids or solvers.
     executor : concurrent.futures.Executor, optional
-        Such as ``ProcessPoolExecutor``, Dask's ``client.get_executor()``, mpi4py's ``MPIPoolExecutor``.
-        Default: this process, one scene after the other. The caller starts the executor and shuts it down.
+        For example ``ProcessPoolExecutor``, Dask's ``client.get_executor()`` or mpi4py's ``MPIPoolExecutor``. The
+        caller must start it and shut it down. Default: the scenes are evaluated one by one in this process.
     weights : array (number of scenes,), optional
         Default: ones.
     chunk : int, optional
-        Number of scenes in one task; default 1. A larger chunk needs fewer messages: a task returns one sum.
+        Number of scenes in one task, 1 by default. A task returns one sum over its scenes, so that larger chunks need
+        less communication.
     progress : bool or str
-        Whether to show a progress bar over the tasks of each evaluation; a str is its label.
+        Show a progress bar over the tasks of each evaluation; a string is used as its label.
 
     Returns
     -------
     Ensemble
-        ``total(x)``; ``total(x, numbers)`` is the sum over the scenes with these numbers, in this order, as the batches
-        of `minimize` need it.
+        The function ``total(x)``. ``total(x, numbers)`` is the sum over the scenes with the given indices, in this
+        order; use it with the argument `batches` of `minimize`.
 
     Raises
     ------
     TypeError
-        If `loss` is not a function, the executor has no `submit`, or a scene cannot be pickled.
+        If `loss` is not a function, the executor has no method `submit`, or a scene cannot be pickled.
     ValueError
         If there is no scene, or `chunk` is not a positive integer.
     ShapeError, NonFiniteError
-        If there is not one finite weight for each scene.
+        If `weights` does not have one finite number for each scene.
     IndexError
-        On use, if there is no scene with a number.
+        When ``total(x, numbers)`` is called, if an index is out of range.
 
     See Also
     --------
@@ -79,19 +80,20 @@ def ensemble(
 
     Notes
     -----
-    Sums are taken in the order of the scenes, within a chunk and over chunks: the result is the same to the last bit
-    for every executor and number of workers. Loss and scenes are pickled once (by cloudpickle, if it is installed and
-    pickle fails, as for lambdas). A worker caches the unpickled objects, so each worker sets up a solver once. The
-    pickled bytes are sent with each task until every worker has them, and again to a worker that lacks them. Each task
-    sends x and returns a gradient of its size. An error keeps its type and names its scene; tasks that have not
-    started are cancelled.
+    The results are added in the order of the scenes, within a chunk and over chunks. For a given chunk size the result
+    is therefore bitwise the same for every executor and number of workers. Loss and scenes are pickled once. If pickle
+    fails, as for lambdas, cloudpickle is used if it is installed. Each worker caches the unpickled objects, so that it
+    sets up a solver only once. The pickled objects are sent with each task until every worker has them, and are sent
+    again to a worker whose cache has dropped them. Each task receives x and returns a gradient of the size of x. If the
+    loss raises an exception for a scene, an exception of the same type is raised; its message contains the index of
+    the scene, and tasks that have not started are cancelled.
 
-    Derivatives of first and second order are supported, those of third order are not. Only the traced leaves of x
-    are differentiated. `explain` counts the work of this process only.
+    First and second derivatives are supported, third derivatives are not. Only the leaves of x that are being
+    differentiated cause gradient computations. `explain` counts the work of this process only.
 
-    A script that starts processes needs ``if __name__ == "__main__":`` around its main part. Processes that are forked
-    while compiled loops run on several threads may hang: start new ones with one thread each, by
-    ``ProcessPoolExecutor(2, multiprocessing.get_context("spawn"), dp.set_threads, (1,))``.
+    A script that starts processes must have its main part inside ``if __name__ == "__main__":``. Processes that are
+    forked while compiled loops run in several threads may hang. To avoid this, start new processes with one thread
+    each: ``ProcessPoolExecutor(2, multiprocessing.get_context("spawn"), dp.set_threads, (1,))``.
 
     Examples
     --------
@@ -154,14 +156,14 @@ class Ensemble(Reconstructible):
         else:
             self._loss = _packed(loss)
             self._scenes = [_packed(scene) for scene in scenes]
-        self._held_keys: dict[str, set] = {}  # for each worker that has answered, the keys of its cached objects
+        self._held_keys: dict[str, set] = {}  # the keys of the cached objects of each worker, as far as known
 
     def __repr__(self):
         return f"<ensemble of {self.count} scenes>"
 
     @public("dp.ensemble(loss, scenes)")
     def __call__(self, x: Any, numbers: Sequence[int] | None = None) -> Any:
-        """Return the weighted sum at x over all scenes, or over those with some numbers."""
+        """Return the weighted sum at x over all scenes, or over the scenes with the indices `numbers`."""
         if numbers is None:
             numbers = range(self.count)
         numbers = list(numbers)
@@ -171,7 +173,7 @@ class Ensemble(Reconstructible):
         if not numbers:
             raise ValueError("ensemble needs a scene, got none")
         check_leaves("x", x, containers=False)
-        x = copied(x)  # the caller may write into arrays of x before a second derivative is computed
+        x = copied(x)  # second derivatives are computed later, when the caller may have modified the arrays of x
         entries = leaves(x)
         variable_places = [place for place, leaf in enumerate(entries) if isbox(leaf)]
         gradients: Any = []
@@ -228,7 +230,7 @@ class Ensemble(Reconstructible):
         return Rule("ensemble", forward, vjp, jvp)(*(entries[place] for place in variable_places))
 
     def _sum(self, task, point, numbers):
-        """Add up the results of a task over scenes, in their order."""
+        """Return the sum of the results of a task over scenes, added in the order of `numbers`."""
         chunks = []
         for begin in range(0, len(numbers), self._chunk):
             scenes = [(n, self._weights[n], self._scenes[n]) for n in numbers[begin : begin + self._chunk]]
@@ -250,7 +252,7 @@ class Ensemble(Reconstructible):
         return total
 
     def _submitted(self, chunk):
-        """Submit a task, with the pickled objects that some worker may not have."""
+        """Submit a task, with the pickled objects that at least one worker may not have in its cache."""
         task, loss, point, scenes, count = chunk
         pickles = dict([loss, *(pickled for _, _, pickled in scenes)])
         held = [*self._held_keys.values()]
@@ -262,7 +264,7 @@ class Ensemble(Reconstructible):
         return self._executor.submit(_run_pickled, [*pickles], data_of_key, task, loss[0], point, keys, count)
 
     def _answer(self, chunk, future):
-        """Return the result of a task; if its worker lacks an object, send the task again with all objects."""
+        """Return the result of a task. If its worker's cache lacks an object, submit the task again with the object."""
         keys, worker, parts = future.result()
         if parts is None:
             self._held_keys[worker] = set()
@@ -274,13 +276,16 @@ class Ensemble(Reconstructible):
 # ---- in a worker -----------------------------------------------------------------------------------------------------
 
 
-# Read-only unpickled objects by key, with the solvers that they have set up; the last used is the last entry.
+# Read-only unpickled objects by key, including the solvers that they have set up; the most recently used one is last.
 _cache: OrderedDict = OrderedDict()
 _cache_lock = RLock()  # a worker may have several threads
 
 
 def _run_pickled(keys, data_of_key, task, loss, point, scenes, count):
-    """Return the keys, the name of this worker, and the result of `_sum`, or None if the worker lacks an object."""
+    """Run a task in a worker.
+
+    Return the keys, the name of this worker, and the result of `_sum`, or None if an object is missing in the cache.
+    """
     worker = f"{node()} {os.getpid()}"
     unpickled = {}
     with _cache_lock:
@@ -298,7 +303,7 @@ def _run_pickled(keys, data_of_key, task, loss, point, scenes, count):
 
 
 def _sum(task, loss, point, scenes, count):
-    """Add up the results of a task over scenes (number, weight, scene), in their order."""
+    """Return the sum of the results of a task over scenes, a list of (number, weight, scene), in their order."""
     x, variable_places, tangents = point
     total = None
     x = mapped(frozen, x)
@@ -317,7 +322,7 @@ def _sum(task, loss, point, scenes, count):
 
 
 def _loss_of_values(loss, scene, x, variable_places, values):
-    """Return the loss of one scene, with other values at the variable leaves of x."""
+    """Return the loss of one scene, with the variable leaves of x replaced by `values`."""
     return loss(_placed(x, variable_places, values), scene)
 
 
@@ -330,7 +335,7 @@ def _value(loss, values, tangents):
 
 def _value_and_gradients(loss, values, tangents):
     """Return the value and the gradient of a loss, as a task of `_sum`."""
-    with unwarned():  # warnings are given for the gradient of the sum
+    with unwarned():  # warnings are issued once, for the gradient of the sum
         value, gradients = value_and_grad(loss)(values)
     return [value, *gradients]
 
@@ -342,20 +347,20 @@ def _hessian_product(loss, values, tangents):
 
 
 def _placed(x, variable_places, values):
-    """Return a tree with other values at its variable leaves."""
+    """Return the tree x with its variable leaves replaced by `values`."""
     entries, rebuild = flatten(x)
     return rebuild(placed(entries, variable_places, values))
 
 
 def _added(total, parts):
-    """Return the sums of two lists; the first may be None."""
+    """Return the elementwise sum of two lists; the first may be None."""
     if total is None:
         return parts
     return [a + b for a, b in zip(total, parts, strict=True)]
 
 
 def _packed(value):
-    """Return a key for the pickled bytes of an object, and these bytes."""
+    """Pickle an object; return the hash of the pickled bytes as its key, and the bytes."""
     data = _pickled(value)
     return sha256(data).hexdigest(), data
 
