@@ -1,7 +1,7 @@
-"""Values as HTML, for notebooks and for the page of a report: tables, curves and the entries of a matrix.
+"""HTML for notebooks and report pages: tables, curves and pictures of sparse matrices.
 
-Tables are plain HTML and pictures are SVG, without other packages and without a network. They use the text colour of
-the page, light or dark.
+Tables are plain HTML and pictures are SVG. They need no other package and no network access, and use the text colour of
+the page, so that they are readable on light and dark pages.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ if TYPE_CHECKING:
 
 __all__ = ["Markup", "cell", "curves", "facts", "folded", "paragraphs", "spy", "table", "text_of"]
 
-# Of Okabe and Ito, for readers with any colour vision.
+# Palette of Okabe and Ito, which colour-blind readers can distinguish.
 COLOURS = "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#999999"
-WIDTH = 420  # of a picture [pixels]
+WIDTH = 420  # size of a picture [pixels]
 HEIGHT = 260
 LEFT = 60  # margins for labels [pixels]
 BELOW = 40
-SHORT = 20  # characters of a cell that stay on one line
-SPOTS = 48  # largest number of squares a side in the picture of a matrix
+SHORT = 20  # table cells with at most this number of characters are not wrapped
+SPOTS = 48  # largest number of squares along one side of the picture of a matrix
 
 
 class Markup(str):
-    """Text that is HTML already."""
+    """A string that contains HTML and must not be escaped."""
 
     __slots__ = ()
 
@@ -37,7 +37,7 @@ class Markup(str):
 
 
 def text_of(value: Any, digits: int) -> str:
-    """Return a value as text: a float with this number of digits, an empty text for NaN and None."""
+    """Format a value as text: a float with this number of digits; NaN and None as an empty string."""
     if value is None:
         return ""
     if not isinstance(value, (float, np.floating)):
@@ -48,12 +48,12 @@ def text_of(value: Any, digits: int) -> str:
 
 
 def cell(value: Any) -> str:
-    """Return a value as HTML: a float with three digits, an empty text for NaN and None."""
+    """Format a value as HTML: a float with three digits; NaN and None as an empty string."""
     return value if isinstance(value, Markup) else escape(text_of(value, 3))
 
 
 def table(rows: Iterable[Iterable], head: Sequence = (), title: str = "") -> Markup:
-    """Return a table of rows of values, with the names of the columns as its head."""
+    """Return an HTML table with the given rows of values, column names (`head`) and caption (`title`)."""
     lines = []
     if title:
         lines.append(f"<caption>{cell(title)}</caption>")
@@ -64,7 +64,7 @@ def table(rows: Iterable[Iterable], head: Sequence = (), title: str = "") -> Mar
 
 
 def _in_table(value):
-    """Return a value as a cell of a table; a number or a word is not broken into lines."""
+    """Return a value as a cell of a table; a short text is not wrapped."""
     text = cell(value)
     if len(text) <= SHORT:
         return f'<td nowrap="nowrap">{text}</td>'
@@ -78,19 +78,19 @@ def facts(title: str, entries: dict) -> Markup:
 
 
 def paragraphs(lines: Iterable, tag: str = "p") -> Markup:
-    """Return lines as paragraphs, or as elements of another kind."""
+    """Return each line as an HTML element, by default as a paragraph."""
     return Markup("\n".join(f"<{tag}>{cell(line)}</{tag}>" for line in lines))
 
 
 def folded(title: str, lines: Sequence) -> Markup:
-    """Return a list of lines that a click on the title shows; an empty text without lines."""
+    """Return a list of lines that is hidden until the user clicks on the title; an empty string without lines."""
     if not lines:
         return Markup("")
     return Markup(f"<details><summary>{cell(title)}</summary><ul>\n{paragraphs(lines, 'li')}\n</ul></details>")
 
 
 def spy(matrix: Any) -> Markup:
-    """Return a picture of the places of the entries of a sparse matrix: a dark square holds many."""
+    """Return a picture of the sparsity pattern of a matrix, in which darker squares contain more entries."""
     rows, columns = matrix.shape
     entries = matrix.tocoo()
     size = max(rows, columns, 1)
@@ -110,13 +110,13 @@ def spy(matrix: Any) -> Markup:
 
 
 def curves(lines: dict, across: str, up: str, *, log: tuple[bool, bool] = (False, True)) -> Markup:
-    """Return a picture of curves; an empty text if no point can be drawn.
+    """Return a picture of curves; an empty string if no point can be drawn.
 
     Parameters
     ----------
     lines : dict
-        By the name of each curve, its points (x, y). Points that are not finite, or not positive on a logarithmic axis,
-        are not drawn.
+        Maps the name of each curve to its points (x, y). Points that are not finite, or not positive on a logarithmic
+        axis, are omitted.
     across, up : str
         Names of the axes.
     log : (bool, bool)
@@ -159,7 +159,7 @@ def curves(lines: dict, across: str, up: str, *, log: tuple[bool, bool] = (False
 
 
 def _end_labels(corner, log):
-    """Return the labels of both axes at a corner of the picture."""
+    """Return the labels of the two axes for a corner of the picture."""
     return [cell(float(10.0**end if is_log else end)) for end, is_log in zip(corner, log)]
 
 

@@ -1,4 +1,4 @@
-"""Progress bars. Only this module imports tqdm, and only if a bar is asked for."""
+"""Progress bars. Only this module imports tqdm, and only when a bar is shown."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ def bar(steps: Any = None, needed: bool = True, **options: Any) -> Any:
     ----------
     steps : iterable, optional
     needed : bool
-        Whether a missing tqdm is an error; if not, the steps are returned as they are.
+        Whether to raise an error if tqdm is not installed; otherwise the steps are returned without a bar.
     **options
-        Of tqdm.
+        Options of tqdm.
 
     Raises
     ------
     ImportError
-        If a bar is needed and tqdm is not installed.
+        If `needed` is True and tqdm is not installed.
     """
     try:
-        from tqdm.auto import tqdm  # a widget in a notebook
+        from tqdm.auto import tqdm  # `auto` shows a widget in a notebook
     except ImportError as error:
         if needed:
             raise ImportError("a progress bar needs tqdm; install sparsedp[plot], or leave progress out") from error
@@ -36,7 +36,7 @@ def bar(steps: Any = None, needed: bool = True, **options: Any) -> Any:
 
 
 def shown_steps(progress: bool | str, steps: Iterable, label: str) -> Iterable:
-    """Return the numbers of steps, with a progress bar if `progress` is True or the title of a bar."""
+    """Return an iterable over `steps`, with a progress bar if `progress` is True or a string (the title of the bar)."""
     if not progress:
         return steps
     title = f"{progress} {label}" if isinstance(progress, str) else label

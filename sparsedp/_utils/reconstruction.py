@@ -1,4 +1,4 @@
-"""How objects are pickled and copied: as the call that constructs them again. Caches are not included."""
+"""Pickling and copying of objects as the call that constructs them again, without their caches."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Reconstructible:
 
 
 class _Visits(local):
-    """The functions that the current thread is checking, for objects that contain themselves."""
+    """The functions that the current thread is checking; stops the recursion for objects that contain themselves."""
 
     def __init__(self):
         self.functions: set[int] = set()
@@ -59,9 +59,9 @@ _visits = _Visits()
 
 
 def _check_importable(owner, part):
-    """Refuse functions that another process cannot import.
+    """Raise TypeError for functions that another process cannot import.
 
-    Of a method only the class is checked: its object may hold `owner`, and pickle itself follows such cycles.
+    For a bound method only the class is checked, because its object may contain `owner`. pickle handles such cycles.
     """
     if isinstance(part, dict):
         part = list(part.values())
@@ -96,7 +96,7 @@ class ReconstructibleFunction(Reconstructible):
     build : callable
         ``build(*arguments)`` returns such a function.
     *arguments
-        Of `build`.
+        Arguments of `build`.
     """
 
     def __init__(self, function: Callable, build: Callable, *arguments: Any):
@@ -132,7 +132,7 @@ class Frozen:
     Attributes
     ----------
     meant : dict
-        For attribute names of other libraries, what to write instead.
+        Maps attribute names of other libraries to the expression that the error message proposes instead.
     """
 
     meant: Any = {}
@@ -152,7 +152,7 @@ class Frozen:
 
 
 class Value(Frozen):
-    """A frozen object that equals every other object of its class with the same `_key`."""
+    """A frozen object that is compared and hashed by its attribute `_key`."""
 
     _key: Any
 

@@ -1,4 +1,7 @@
-"""Validation of arguments: fields, numbers, functions and result arrays."""
+"""Validation of arguments: fields, numbers, functions and result arrays.
+
+Each function `check_*` raises an error if a value is invalid. Its argument `name` is the subject of the message.
+"""
 
 from __future__ import annotations
 
@@ -51,36 +54,36 @@ __all__ = [
 ]
 
 FLOAT = np.dtype(float)
-EPS = np.finfo(float).eps  # between 1 and the next number
+EPS = np.finfo(float).eps  # distance from 1 to the next larger float
 WRAP = "{0}; wrap what is computed in dp.interop.to_{0}(f), which keeps gradients"
-# By the package that the type of an array comes from: which library that is, and what to write instead.
+# Package that defines the type of an array -> name of the library, and advice for the error message.
 LIBRARIES = {
     "torch": WRAP.format("torch"),
     "jax": WRAP.format("jax"),
     "jaxlib": WRAP.format("jax"),
     "xarray": "xarray, whose coordinates would be lost; write dp.interop.from_xarray(grid, u)",
 }
-PRECISIONS = "fdFD"  # characters of the dtypes that fields and trees may have, see `check_precision`
+PRECISIONS = "fdFD"  # type characters of the dtypes of fields and trees, see `check_precision`
 PLAIN_LEAVES = {float, complex, int, bool, str, type(None)}
-BLOCK = 8192  # entries of one product of BLAS: up to 10000 it uses one thread
+BLOCK = 8192  # largest number of entries for one BLAS product, since BLAS uses several threads above 10000
 
 
 def field_array(op: Any, u: Any, batch: bool = False) -> np.ndarray:
-    """Return the argument of an operator as a contiguous native array of float32, float64 or a complex dtype.
+    """Convert the argument of an operator to an array in C order and native byte order, of float or complex dtype.
 
     Parameters
     ----------
     op : Operator
     u : array_like
     batch : bool
-        Whether leading axes are allowed, one field for each of their entries.
+        Whether leading axes are allowed, so that the array contains several fields.
 
     Raises
     ------
     ShapeError
-        If it is not a field on the domain.
+        If the array is not a field on the domain of the operator.
     TypeError
-        If it holds no numbers.
+        If the array is not numeric.
     """
     if type(u) is not np.ndarray:
         check_plain(op.name, u)
@@ -100,13 +103,13 @@ def field_array(op: Any, u: Any, batch: bool = False) -> np.ndarray:
 
 
 def _is_batch(shape, field_shape):
-    """Return whether the last axes are those of a field. A 0-d field has none, so every shape is a batch of it."""
+    """Return whether the last axes have the shape of a field; always true for a 0-d field, which has no axes."""
     lead = len(shape) - len(field_shape)
     return lead >= 0 and shape[lead:] == field_shape
 
 
 def _in_shape(op, u):
-    """Return advice for an array of a wrong shape from which its meaning can be inferred; else an empty text."""
+    """Return advice for an array whose wrong shape suggests what the user intended; else an empty string."""
     space = op.domain
     if u.ndim == 0:
         return f"; write np.full({space.shape}, {u})"
@@ -118,7 +121,7 @@ def _in_shape(op, u):
 
 
 def _array(op, u):
-    """Return an argument of an operator as an array."""
+    """Convert an argument of an operator to an array; raise ShapeError for a list of arrays of different shapes."""
     try:
         return np.asarray(u)
     except ValueError:  # a list of arrays of different shapes
@@ -129,14 +132,14 @@ def _array(op, u):
 
 
 def check_plain(name: str, *values: Any) -> None:
-    """Refuse masked arrays, whose mask NumPy would drop silently, and those of torch, jax and xarray."""
+    """Raise TypeError for masked arrays, whose mask NumPy would drop silently, and for arrays of other libraries."""
     if any(isinstance(value, np.ma.MaskedArray) for value in values):
         raise TypeError(f"{name} takes plain arrays, got a masked array; fill it first")
     check_native(name, *values)
 
 
 def check_native(name: str, *values: Any) -> None:
-    """Refuse tensors of torch and arrays of jax and xarray, whose gradients or coordinates would be lost."""
+    """Raise TypeError for arrays of torch, jax and xarray, whose gradients or coordinates would be lost."""
     for value in values:
         kind = type(value)
         if kind is np.ndarray:
@@ -147,12 +150,12 @@ def check_native(name: str, *values: Any) -> None:
 
 
 def check_precision(name: str, value: Any) -> None:
-    """Refuse arrays of half and of extended precision.
+    """Raise TypeError for arrays of half and of extended precision.
 
     The library computes with float32, float64, complex64 and complex128. Fields and trees of other precisions
-    (float16, longdouble, clongdouble) are refused: a longdouble would lose its digits
-    silently, and its bytes cannot be viewed as doubles. Integers and booleans are accepted. Settings such as dt, and
-    derivatives that a user's own function returns, are rounded to double precision instead.
+    (float16, longdouble, clongdouble) raise an error, because a longdouble would lose digits silently and its memory
+    cannot be viewed as float64. Integers and booleans are accepted. Settings such as dt, and derivatives returned by a
+    user's function, are not checked here; they are rounded to double precision.
     """
     dtype: Any = getattr(value, "dtype", None)
     if is_other_precision(dtype):
@@ -163,23 +166,23 @@ def check_precision(name: str, value: Any) -> None:
 
 
 def is_other_precision(dtype: Any) -> bool:
-    """Return whether a dtype of NumPy holds floating numbers that are neither of single nor of double precision."""
+    """Return whether a NumPy dtype is floating or complex, but of neither single nor double precision."""
     if not isinstance(dtype, np.dtype) or dtype.char in PRECISIONS:
         return False
     return dtype.kind in "fc" or dtype.name == "bfloat16"
 
 
 def check_leaves(name: str, tree: Any, containers: bool = True) -> None:
-    """Refuse leaves that are arrays of half or extended precision, or containers that are not trees.
+    """Raise TypeError for leaves of half or extended precision, and for containers that are not trees.
 
     Parameters
     ----------
     name : str
-        Root of the paths in messages.
+        Name of the tree, with which paths in error messages begin.
     tree : tree
     containers : bool
-        Whether a leaf is refused that is a container, a dataclass that is not a tree or a Mapping that is not a dict,
-        and holds floating numbers: these would silently be constants.
+        Whether to raise an error for a container with floating numbers that is not a tree, such as a Mapping that is
+        not a dict. It would be a leaf, and its numbers would silently be constants.
 
     Raises
     ------
@@ -204,7 +207,7 @@ def hidden_leaves(value: Any) -> list:
     """Return the leaves inside a container that is not a tree: some dataclasses, and Mappings that are not dicts."""
     hidden: list = []
     pending = [value]
-    seen = set()  # a dataclass may hold itself
+    seen = set()  # a dataclass may contain itself
     while pending:
         container = pending.pop()
         if id(container) in seen:
@@ -217,7 +220,7 @@ def hidden_leaves(value: Any) -> list:
 
 
 def _entries_of(container):
-    """Return the entries of a dataclass or Mapping as a list, which is empty for all other values."""
+    """Return the list of the entries of a dataclass or Mapping; an empty list for other values."""
     if isinstance(container, Mapping):
         return list(container.values())
     if is_dataclass(container) and not isinstance(container, type):
@@ -226,7 +229,7 @@ def _entries_of(container):
 
 
 def _is_floating(leaf):
-    """Whether a leaf is a floating number or array, traced or not."""
+    """Return True if a leaf is a floating number or array, traced or not."""
     if isinstance(leaf, (float, complex)):
         return True
     dtype = getattr(leaf, "dtype", None)
@@ -234,7 +237,7 @@ def _is_floating(leaf):
 
 
 def check_out(op: Any, out: Any, u: np.ndarray, dtype: np.dtype, shape: tuple[int, ...]) -> None:
-    """Refuse a result array of another shape or dtype, or one that shares memory with the argument `u`."""
+    """Raise an error for an array `out` of a wrong shape or dtype, or that shares memory with the argument `u`."""
     wanted = f"out=np.empty({shape}, {dtype.name!r})"
     check_type(f"{op.name}, as out,", out, np.ndarray, "an array", wanted)
     if out.shape != shape:
@@ -252,18 +255,18 @@ def check_finite(
     where: Callable[[int], Any] | None = None,
     advice: str = "",
 ) -> None:
-    """Refuse NaN and infinity in plain numbers; the message has their count and the place of the first one.
+    """Raise NonFiniteError for NaN and infinity; the message contains their number and the index of the first one.
 
     Parameters
     ----------
     name : str
     values : number or array
     needs : str
-        What the values must be.
+        Part of the message that says what is expected.
     where : callable, optional
-        ``where(number)`` describes the place of a flat entry; default: its index in `values`.
+        ``where(number)`` returns the description of the entry with this flat index. Default: its index in `values`.
     advice : str
-        Ends the message.
+        End of the message.
 
     Raises
     ------
@@ -281,19 +284,19 @@ def check_finite(
 
 
 def surely_finite(value: Any) -> bool:
-    """Whether a value is finite, in one pass without a temporary array; False also if its sum overflows."""
+    """Test cheaply whether all entries are finite, without a temporary array; may return False if sums overflow."""
     if type(value) is np.float64:
         return isfinite(value)
     if type(value) is np.ndarray and value.size <= BLOCK and value.dtype == FLOAT and value.flags.c_contiguous:
         flat = value.reshape(-1)
-        if isfinite(np.vdot(flat, flat)):  # one cheap call; a square may overflow where the value does not
+        if isfinite(np.vdot(flat, flat)):  # fast; if a square overflows, the sum below decides
             return True
     with np.errstate(all="ignore"):
         return bool(np.isfinite(np.sum(value)))
 
 
 def place(index: int, shape: tuple[int, ...]) -> Any:
-    """Return the index of an entry from its number in C order: a number in 1-D, else a tuple."""
+    """Convert a flat index in C order to the index of an entry: an int in 1-D, else a tuple."""
     indices = tuple(map(int, np.unravel_index(index, shape)))
     if len(indices) == 1:
         return indices[0]
@@ -301,7 +304,7 @@ def place(index: int, shape: tuple[int, ...]) -> Any:
 
 
 def check_function(name: str, thing: Any, example: str, count: int | None = None) -> None:
-    """Refuse a value that is not callable, or does not take this number of arguments."""
+    """Raise TypeError for a value that is not callable, or does not take `count` arguments."""
     if not callable(thing):
         raise TypeError(f"{name} takes a function, got {type(thing).__name__}; write {example}")
     if count is not None:
@@ -309,19 +312,19 @@ def check_function(name: str, thing: Any, example: str, count: int | None = None
 
 
 def check_type(name: str, thing: Any, kind: Any, wanted: str, example: str) -> None:
-    """Refuse a value that is not of a type; `wanted` is the type with its article."""
+    """Raise TypeError for a value that is not an instance of `kind`; `wanted` is its description: "an array"."""
     if not isinstance(thing, kind):
         raise TypeError(f"{name} takes {wanted}, got {type(thing).__name__}; write {example}")
 
 
 def check_shape(what: str, value: Any, shape: tuple[int, ...], advice: str = "") -> None:
-    """Refuse a value of another shape."""
+    """Raise ShapeError for a value of another shape."""
     if np.shape(value) != shape:
         raise ShapeError(f"{what} must have shape {shape}, got {np.shape(value)}{advice}")
 
 
 def check_on(name: str, value: Any, space: Any, advice: str = "") -> None:
-    """Refuse a value that is not a field on a space."""
+    """Raise ShapeError for a value that does not have the shape of a field on a space."""
     if np.shape(value) != space.shape:
         raise ShapeError(f"{name} takes a field on {space.described}, got an array of shape {np.shape(value)}{advice}")
 
@@ -330,13 +333,13 @@ KINDS = {"numbers": "biufc", "real numbers": "biuf", "integers": "iu", "True or 
 
 
 def check_kind(what: str, dtype: np.dtype, needs: str, advice: str = "") -> None:
-    """Refuse a dtype that is not of the needed kind, a key of `KINDS`."""
+    """Raise TypeError for a dtype that is not of the required kind `needs`, a key of `KINDS`."""
     if dtype.kind not in KINDS[needs]:
         raise TypeError(f"{what} must hold {needs}, got dtype {dtype}{advice}")
 
 
 def check_choice(name: str, word: Any, choices: Iterable, advice: str = "") -> None:
-    """Refuse a value that is not one of some choices; 1 does not count as True."""
+    """Raise ValueError for a value that is not one of the choices; 1 is not accepted in place of True."""
     choices = list(choices)
     if any(isinstance(word, type(choice)) and word == choice for choice in choices):
         return
@@ -347,7 +350,7 @@ def check_choice(name: str, word: Any, choices: Iterable, advice: str = "") -> N
 
 
 def advise(error: Exception, params: Any = (), example: str = "rollout(step, start, params, n)") -> None:
-    """Add advice to the message of an error of arithmetic with a list, or with params that are None."""
+    """Add advice to the message of an error that arithmetic with a list, or with params that are None, has raised."""
     text = str(error)
     if isinstance(error, TypeError) and "; write" not in text:
         if "'list'" in text or "multiply sequence" in text:
@@ -357,7 +360,7 @@ def advise(error: Exception, params: Any = (), example: str = "rollout(step, sta
 
 
 def check_takes(name: str, fun: Any, count: int, example: str) -> None:
-    """Refuse a function written in Python that does not take this number of arguments."""
+    """Raise TypeError for a Python function that cannot be called with `count` positional arguments."""
     if type(fun) is not FunctionType or fun.__code__.co_flags & CO_VARARGS:
         return
     most = fun.__code__.co_argcount
@@ -376,16 +379,16 @@ RANGES = {
 
 
 def check_number(name: str, value: Any, needs: str = "", advice: str = "", kind: str = "") -> float:
-    """Return a finite real number as a float; refuse all other values.
+    """Return a finite real number as a float; raise an error for all other values.
 
     Parameters
     ----------
     name : str
     value : Any
     needs : str
-        The range in which it must be, a key of `RANGES`.
+        The range of valid numbers, a key of `RANGES`.
     advice, kind : str
-        Ends of the messages for a number out of range, and for a value that is not a number.
+        End of the message for a number out of range, and end of the message for a value that is not a number.
     """
     if not is_number(value):
         raise TypeError(f"{name} must be one real number, got {_shown(value)}{kind}")
@@ -398,19 +401,19 @@ def check_number(name: str, value: Any, needs: str = "", advice: str = "", kind:
 
 
 def _shown(value):
-    """Return an argument as text for a message, an array by its shape."""
+    """Return the text for a value in a message: for an array its shape, otherwise its repr."""
     return f"an array of shape {value.shape}" if isinstance(value, np.ndarray) else repr(value)
 
 
 def check_whole(name: str, value: Any, least: int, advice: str = "") -> int:
-    """Return a whole number >= `least` as an int; refuse all other values."""
+    """Return a whole number >= `least` as an int; raise ValueError for all other values."""
     if not is_whole(value, least):
         raise ValueError(f"{name} must be a whole number >= {least}, got {_shown(value)}{advice}")
     return int(value)
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value is one real number, including NaN and infinity; True and False are not."""
+    """Return True if a value is one real number, including NaN and infinity but not True and False."""
     if type(value) is float:
         return True
     array = np.asarray(value)
@@ -418,20 +421,20 @@ def is_number(value: Any) -> bool:
 
 
 def is_whole(value: Any, least: int) -> bool:
-    """Whether a value is a whole number >= `least`, such as 2 or 2.0."""
-    return bool(is_number(value) and value % 1 == 0 and value >= least)  # the rest of NaN and infinity is NaN
+    """Return True if a value is a whole number >= `least`, such as 2 or 2.0."""
+    return bool(is_number(value) and value % 1 == 0 and value >= least)  # NaN % 1 and inf % 1 are NaN
 
 
 def number_beside(number: Any, *limits: float, digits: int = 6, style: str = "g") -> str:
-    """Format a number with enough digits to show on which side of some limits it lies.
+    """Format a number with enough digits to show whether it is smaller or larger than each of some limits.
 
     Parameters
     ----------
     number : float
     *limits : float
-        Other numbers of the same message, which are printed with the format ``:g``.
+        Other numbers in the same message, which are printed with the format ``:g``.
     digits : int
-        Least precision of the format.
+        Smallest number of digits.
     style : "g" or "e"
 
     Returns
@@ -455,6 +458,6 @@ def number_beside(number: Any, *limits: float, digits: int = 6, style: str = "g"
 
 
 def rounded_down(number: float) -> str:
-    """Return an upper bound > 0 as text with six digits, rounded down: rounded to nearest it could exceed the bound."""
+    """Format an upper bound > 0 with six digits, rounded down so that the printed number does not exceed the bound."""
     near = float(number) * (1 + 4 * EPS)
     return f"{float(Context(prec=6, rounding=ROUND_FLOOR).create_decimal(near)):.6g}"

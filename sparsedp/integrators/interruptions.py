@@ -1,26 +1,26 @@
 """Steps with error control that stop at given times (breaks) and at zero crossings (events).
 
 The interval of a step is divided into segments. A segment ends at the next break, at the next event, or at the end of
-the interval. Inside a segment the rate is smooth, and at both ends it is evaluated on the side of the segment: see
-`Side` in problem.py.
+the interval. Inside a segment the rate is smooth, and at both ends of the segment the rate is evaluated on its inner
+side: see `Side` in problem.py.
 
-The derivative with respect to a break b follows from the lengths of both segments, which are traced: with the rate f_-
-at the end of the first segment and f_+ at the start of the second,
+The lengths of the segments are traced. This is sufficient for derivatives of all orders with respect to a break b:
+differentiation of the two segments at b gives
 
     du/db = f_- - f_+,
 
-and its propagation to the end. Nothing else is needed for derivatives of any order.
+where f_- is the rate at the end of the first segment and f_+ the rate at the start of the second one.
 
-An event g(u, params, t) = 0 ends a step of length l with the step map S, g(S(u, l), params, t + l) = 0: see
-event_detection.py. Its derivative is given by the implicit function theorem,
+At an event g(u, params, t) = 0 a step of length l ends for which g(S(u, l), params, t + l) = 0, where S(u, l) is the
+state after a step of length l: see event_detection.py. The implicit function theorem gives its derivative,
 
     dl = -(g_u dS + g_p dp + g_t dt) / (g_u S_l + g_t).
 
-On the tape it is one iteration l <- l - g / (g_u S_l + g_t) with a constant denominator for each order of
-differentiation: each one makes the next order exact.
+On the tape this is the iteration l <- l - g / (g_u S_l + g_t) with a constant denominator. One iteration is recorded
+for each order of differentiation, because each iteration makes the derivatives of one more order exact.
 
-An event within rounding of the end of an interval belongs to this interval: the next one would take its zero for one
-that it starts from.
+An event at the end of an interval, up to rounding, belongs to this interval. The next interval would not find it, since
+an event at the start of an interval is ignored.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Interrupted"]
 
-MOST_EVENTS = 10_000  # in one interval
-REPEATS = 8  # of one event within rounding of the time, from which on it does not end
-SAME_STATE = 1e-9  # difference of two states, relative to their size, that counts as rounding
-SAME_DERIVATIVE = 1e-6  # relative difference of the derivatives of two times that counts as rounding
-ROUNDING = 64 * EPS  # of a time, and of a rate
+MOST_EVENTS = 10_000  # largest number of events in one interval
+REPEATS = 8  # raise an error if events occur more often than this (times their number) at the same time
+SAME_STATE = 1e-9  # two states with a smaller relative difference are regarded as equal
+SAME_DERIVATIVE = 1e-6  # derivatives of two times with a smaller relative difference are regarded as equal
+ROUNDING = 64 * EPS  # relative rounding error of times and rates
 
 
 class Segment(NamedTuple):
@@ -63,17 +63,17 @@ class Segment(NamedTuple):
     Attributes
     ----------
     path : list of AcceptedStep
-        None where the segment is of rounding length.
+        The steps; empty if the length of the segment is zero up to rounding.
     side : Side
-        Where the rate is evaluated.
+        Restricts the times and states at which the rate is evaluated.
     stop : int
-        The place of the break at its end, -1 for the end of the interval.
+        Position of the next break in the list of breaks, -1 for the end of the interval.
     event : Event or None
-        The event that ended it before that.
+        The event that ended the segment before this stop.
     length : float
-        Of the segment up to its stop.
+        Length of the time from the start of the segment to the stop.
     end, time : tree, float
-        The state and the time at a break.
+        State and time at the end of the segment, if it ends at the stop.
     """
 
     path: list[AcceptedStep]
@@ -92,13 +92,13 @@ class Interrupted(Scheme):
     ----------
     scheme : Adaptive
     breaks : callable or array
-        As `break_times` returns it.
+        The result of `break_times`.
     events : list of Event
 
     Attributes
     ----------
     taken : list of float
-        Lengths of the accepted steps in the last interval, as shares of it.
+        Lengths of the accepted steps in the last interval, as fractions of the interval.
     t_events : list of arrays
         For each event its times in the last interval.
     """
@@ -125,7 +125,7 @@ class Interrupted(Scheme):
         return run.u, run.t
 
     def breaks_within(self, params: Any, t: float, end: float) -> tuple[list[tuple[int, float]], bool]:
-        """Return the places and times of the breaks in (t, end], in order, and whether there is one at t."""
+        """Return the positions and times of the breaks in (t, end], in order, and whether there is a break at t."""
         if callable(self.breaks):
             times = np.array(self.break_times(params), float)
         else:
@@ -172,10 +172,11 @@ class Interrupted(Scheme):
         return end.tree(evaluate(anp.array([*map(end.deviation, states)])))
 
     def _continuous_breaks(self, segments: list[Segment], params: Any, length: float) -> set[int]:
-        """Return the places of the breaks at which the rate does not jump.
+        """Return the positions of the breaks at which the rate does not jump.
 
-        There the state has the derivative 0 in these times; the derivative of the discrete steps is an error, as large
-        as the tolerance. Second derivatives need not be 0.
+        The exact derivative of the state with respect to such a time is 0, so that the time can be a constant. The
+        derivative of the discrete steps would be an error of the size of the tolerance. Second derivatives need not be
+        0; therefore this is used for first derivatives only.
         """
         continuous = set()
         for segment, following in pairwise(segments):
@@ -189,14 +190,14 @@ class Interrupted(Scheme):
         return continuous
 
     def _traced_breaks(self, params: Any, segments: list[Segment], continuous: set[int]) -> Any:
-        """Return the breaks with their derivatives; refuse two at one time, whose order decides on the derivative."""
+        """Return the traced breaks; raise DerivativeError if two coincide, as the derivative depends on their order."""
         if not callable(self.breaks):
             return self.breaks
         times = self.break_times(params)
         times = [plain(time) if place in continuous else time for place, time in enumerate(times)]
         for place in [segment.stop for segment in segments if segment.stop >= 0]:
             for other, time in enumerate(times):
-                # The rate cannot be evaluated between adjacent numbers.
+                # Between two adjacent floats there is no time at which the rate could be evaluated.
                 coincide = abs(plain(time) - plain(times[place])) <= np.spacing(abs(plain(times[place])))
                 if other != place and coincide and (isbox(time) or isbox(times[place])):
                     raise DerivativeError(
@@ -206,7 +207,7 @@ class Interrupted(Scheme):
         return times
 
     def _replayed(self, segment: Segment, states: Sequence, params: Sequence, stops: Sequence) -> list[tuple]:
-        """Return the states and times after a segment, of all perturbed solutions."""
+        """Return the states and times after a segment, for the solution and the perturbed solutions."""
         event = segment.event
         starts = []
         for (u, t), run_params, stop in zip(states, params, stops, strict=True):
@@ -226,7 +227,7 @@ class Interrupted(Scheme):
         return [(event.state_after(new, run_params, time), time) for (new, time), run_params in pairs]
 
     def _event_at_start(self, event: Event, u: Any, params: Any, t: Any) -> tuple:
-        """Return the state and the time after an event that occurs where a segment begins, to rounding."""
+        """Return the state and the time after an event at the start of a segment, up to rounding."""
 
         def value(point: tuple, length: Any) -> Any:
             u, params, t = point
@@ -250,30 +251,33 @@ class Interrupted(Scheme):
 
 
 def _is_continuous(before: Any, after: Any, slow: Any) -> bool:
-    """Whether a rate on both sides of a break differs by rounding, of its size or of the rate that moves the state."""
+    """Return True if the rates on both sides of a break are equal up to rounding.
+
+    The difference is compared with the larger rate, and with `slow`, the state divided by the length of the interval.
+    """
     size = max(np.max(np.abs(rate), initial=0.0) for rate in (before, after, slow))
     return np.max(np.abs(np.subtract(before, after)), initial=0.0) <= ROUNDING * size
 
 
 def _short_step(problem: Problem, u: Any, params: Any, t: Any, length: Any) -> Any:
-    """Take a step of rounding length by the midpoint rule: its derivatives of two orders are exact."""
+    """Take a step of zero length (up to rounding) by the midpoint rule, whose first two derivatives are exact."""
     half = 0.5 * length
     middle = combine(u, (half, problem(u, params, t)))
     return combine(u, (length, problem(middle, params, t + half)))
 
 
 class _IntervalRun:
-    """The segments of one interval, on plain values.
+    """Computes the segments of one interval for plain values.
 
     Attributes
     ----------
     u, t : tree, float
-        At the end.
+        State and time at the end.
     segments : list of Segment
     taken : list of float
-        As in `Interrupted`.
+        See `Interrupted`.
     event_times : list of lists
-        For each event.
+        For each event its times.
     """
 
     def __init__(self, parent: Interrupted, arguments: tuple, is_traced: bool) -> None:
@@ -295,7 +299,7 @@ class _IntervalRun:
         self._ends_before(-1, end, is_after_break, np.inf)
 
     def _ends_before(self, place: int, stop: float, is_after_break: bool, latest: float) -> bool:
-        """Continue to a stop; return whether a terminal event came first."""
+        """Integrate up to a stop; return whether a terminal event occurred before it."""
         events = self.parent.events
         if is_after_break:
             earliest = np.nextafter(self.t, np.inf)
@@ -331,7 +335,7 @@ class _IntervalRun:
                 return True
 
     def _cross_segment(self, place: int, side: Side, stop: float) -> Event | None:
-        """Continue to a stop or to the first event; return the event."""
+        """Integrate up to a stop or to the first event before it; return the event or None."""
         length = stop - self.t
         start = self.u, Sided(self.params, side), self.t, length
         is_empty = not any(np.size(leaf) for leaf in leaves(self.u))
@@ -368,7 +372,7 @@ class _IntervalRun:
         return is_terminal
 
     def _check_order(self, first: Event, second: Event, u: Any) -> None:
-        """Refuse two events at one time where the state after them, or its derivative, depends on their order."""
+        """Raise an error if the state after two simultaneous events, or its derivative, depends on their order."""
         params = self.params
         t = self.t
         forward = second.state_after(first.state_after(u, params, t), params, t)
@@ -388,7 +392,7 @@ class _IntervalRun:
             )
 
     def _have_the_same_derivative(self, first: Event, second: Event, u: Any) -> bool:
-        """Whether the times of two events have the same derivative in the state, the params and the time."""
+        """Return True if the times of two events have equal derivatives with respect to state, params and time."""
         rates = self.parent.problem(u, self.params, self.t)
         point = (u, self.params, float(self.t))
         rows = []
