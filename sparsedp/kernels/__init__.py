@@ -1,7 +1,7 @@
-"""Compiled loops on plain arrays, and the NumPy formulas (`reference`) that run without numba.
+"""Compiled loops on plain arrays, and NumPy implementations of them (`reference`) that are used without numba.
 
-Arrays must be C-contiguous and hold float64; the caller checks and casts them. numba is imported at the first use of a
-compiled loop, never before. The environment variable ``SPARSEDP_NUMBA=0``, set before the first use, disables it.
+Arrays must be C-contiguous and of dtype float64, unless stated otherwise; callers check and cast them. numba is
+imported at the first use of a compiled loop. To disable it, set the environment variable ``SPARSEDP_NUMBA=0`` before.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def compiled() -> bool:
 
 @functools.cache
 def _available_threads() -> int:
-    """Return the number of processors that this process may use, at most as many as numba may use."""
+    """Return the number of processors that this process may use, limited by NUMBA_NUM_THREADS."""
     if hasattr(os, "sched_getaffinity"):
         usable = len(os.sched_getaffinity(0))
     else:
@@ -54,7 +54,7 @@ def _available_threads() -> int:
     return usable
 
 
-_chosen_threads: list[int] = []  # empty: all available
+_chosen_threads: list[int] = []  # the number that `set_threads` was given; empty for all available threads
 
 
 def threads() -> int:
@@ -67,7 +67,7 @@ def threads() -> int:
 def set_threads(n: int | None = None) -> None:
     """Set the number of threads that the compiled loops use.
 
-    Results do not depend on it: they are bit-identical.
+    The results of the loops are bit-identical for every number of threads.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def set_threads(n: int | None = None) -> None:
     _chosen_threads[:] = [n]
 
 
-_import_module = functools.cache(importlib.import_module)  # without the cache it takes longer than a small loop
+_import_module = functools.cache(importlib.import_module)  # cached: import_module takes longer than a small loop
 
 
 def run(module: str, name: str, rows: int, work: int, threads: int, *args: Any) -> bool:
@@ -116,15 +116,15 @@ def run(module: str, name: str, rows: int, work: int, threads: int, *args: Any) 
     Parameters
     ----------
     module, name : str
-        A module of this package and the name of its loop.
+        Name of a module of this package, and name of a loop in it.
     rows : int
-        Number of rows, over which the threads are distributed.
+        Number of rows, which are distributed over the threads.
     work : int
-        Number of values, which determines whether several threads pay.
+        Number of values to process. Several threads are used only if it is large enough.
     threads : int
-        Largest number of threads.
+        Maximum number of threads.
     *args
-        Arguments of the loop, without the range of rows.
+        Arguments of the loop except the last two, the range of rows.
     """
     if not compiled():
         return False
@@ -141,11 +141,11 @@ def summed(shape: tuple[int, int, int], axes: Sequence[Tridiagonal | None], shif
     Parameters
     ----------
     shape : (n0, n1, n2)
-        Of `u` and `out`, float64 arrays that must not overlap.
+        Shape of `u` and `out`, float64 arrays that must not overlap.
     axes : sequence of three
-        `Tridiagonal` T_a of n_a rows, or None for an axis without a matrix.
+        For each axis a, the `Tridiagonal` T_a with n_a rows, or None if the sum has no term for this axis.
     shift : float
-        Multiple of `u` itself.
+        Factor of `u` itself.
 
     Examples
     --------
@@ -170,7 +170,7 @@ def summed(shape: tuple[int, int, int], axes: Sequence[Tridiagonal | None], shif
 
 
 def along_axis(u: NDArray, out: NDArray, rows: Rows, scale: float, accumulate: bool) -> None:
-    """Set out = scale M u, or add it to `out`, for a sparse 1-D matrix M along the middle axis.
+    """Set `out` to scale M u, or add scale M u to it, for a sparse matrix M that acts along the middle axis.
 
     Parameters
     ----------
@@ -209,17 +209,18 @@ def along_axis(u: NDArray, out: NDArray, rows: Rows, scale: float, accumulate: b
 
 
 def sweep(x: NDArray, lower: NDArray, upper: NDArray, inverses: NDArray) -> None:
-    """Solve tridiagonal systems along the first axis in place, for pivots that are already eliminated.
+    """Solve tridiagonal systems along the first axis in place, for given pivots of the elimination.
 
-    Down the rows x_i = (x_i - lower_i x_(i-1)) inverses_i, then up x_i -= upper_i x_(i+1) inverses_i.
+    First, for increasing i, x_i = (x_i - lower_i x_(i-1)) inverses_i; then, for decreasing i,
+    x_i -= upper_i x_(i+1) inverses_i.
 
     Parameters
     ----------
     x : float64 array, shape (n, m)
-        C-contiguous; one system in each column.
+        C-contiguous. Each column is the right-hand side of one system and is replaced by its solution.
     lower, upper : float64 arrays, shape (n,)
     inverses : float64 array, shape (n, m)
-        1 / pivots.
+        The inverse pivots of each system.
 
     Examples
     --------

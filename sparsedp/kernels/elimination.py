@@ -11,12 +11,12 @@ if TYPE_CHECKING:
 
 __all__ = ["eliminate"]
 
-BAND = 32768  # values of a band of columns at a time: solution and pivots stay in the L2 cache
+BAND = 32768  # number of values in a band of columns: its solution and pivots stay in the L2 cache
 
 
 @kernel("write2 read1 read1 read2")
 def eliminate(x: NDArray, lower: NDArray, upper: NDArray, inverses: NDArray, start: int, stop: int) -> None:
-    """Eliminate downwards and substitute upwards, for columns `start` to `stop`; see `sparsedp.kernels.sweep`."""
+    """Forward elimination and back substitution in columns `start` to `stop`; see `sparsedp.kernels.sweep`."""
     n = x.shape[0]
     width = max(32, BAND // n)
     for left in range(start, stop, width):

@@ -1,26 +1,25 @@
 """Upwind fluxes: a stage of an Eulerian transport scheme along all axes, its transpose, and the limiters.
 
-A component of the field is one flat array with up to three axes. The loops run over tiles, at most TILE cells of a row
-along the last axis. Along that axis a tile is cut into three pieces: the cell at the lower end of the row, the inner
-cells, the cell at the upper end. Along the other axes a tile is one piece. For all cells of a piece, the values beyond
-their sides are at the same distance in memory: across the end of a periodic axis too, and at a wall the cell itself
-stands for the ghost cell (where an inflow value is given, it is multiplied by 0). One inner loop therefore serves all
-boundary conditions and dimensions. Where lengths differ or sides are closed, the velocity or the cotangent is first
-multiplied into a line buffer, with 0 on closed sides.
+A component of the field is one flat array with up to three axes. The loops run over tiles: at most TILE consecutive
+cells of a row along the last axis. For the fluxes along the last axis a tile is divided into three pieces: the cell at
+the lower end of the row, the inner cells, and the cell at the upper end. For the other axes a tile is one piece. All
+cells of a piece have the same offset in memory to their neighbour beyond a side, also across the end of a periodic
+axis. At a wall the cell itself stands for the ghost cell, multiplied by 0 if an inflow value is given. One inner loop
+therefore handles all boundary conditions and dimensions. If lengths differ or sides are closed, the velocity or the
+cotangent is first multiplied by the inverse lengths into a line buffer, with 0 on closed sides.
 
 With Courant numbers C on the lower and upper side of a cell, p = max(C, 0), m = min(C, 0),
 
     u'     = (1 - leaves) u + enters
     leaves = p_lower - m_upper  [+ C_upper - C_lower in flux form],   enters = p_lower x_below - m_upper x_above.
 
-x_below = u_below + ahead_below is the value at the side from the cell below, x_above = u_above - behind_above from the
-cell above; with slopes, p_upper ahead + m_lower behind leaves the cell too. A scheme is one function, such as
-`van_leer`, and one entry of SCHEMES. From the differences a, b to the cells below and above and from c, e, the
-distances to them over half the width (2 between equal cells), the function returns
+x_below = u_below + ahead_below is the value at the lower side, computed from the cell below, and x_above = u_above -
+behind_above the value at the upper side, computed from the cell above. With slopes, p_upper ahead + m_lower behind is
+also subtracted from u'. A scheme is one limiter function, such as `van_leer`, and one entry of SCHEMES. The arguments
+of the limiter are the differences a and b of u to the cells below and above, and the distances c and e to these cells
+divided by half the width (2 between equal cells). All are numbers or arrays. It returns
 
-    ahead, behind, d ahead/da, d ahead/db, d behind/da, d behind/db,
-
-for numbers and arrays.
+    ahead, behind, d ahead/da, d ahead/db, d behind/da, d behind/db.
 """
 
 from __future__ import annotations
@@ -47,31 +46,32 @@ __all__ = [
     "vjp",
 ]
 
-TILE = 512  # cells at a time: a line buffer stays in the cache from one loop to the next
-LINE = TILE + 72  # length of a line buffer: the cache keeps few lines that start a power of 2 apart
-NONE = uint64(0)  # starts of the first four line buffers
+TILE = 512  # number of cells processed at a time: a line buffer stays in the cache from one loop to the next
+# Length of a line buffer. It is not a power of 2: buffers at such distances would evict each other from the cache.
+LINE = TILE + 72
+NONE = uint64(0)  # the starts of the first four line buffers
 ONE = uint64(LINE)
 TWO = uint64(2 * LINE)
 THREE = uint64(3 * LINE)
 
 # Columns of `axes`, which has one row of properties for each axis of a component.
-N = 0  # cells along the axis
-STRIDE = 1  # distance of neighbours in the field
-ON_SIDES = 2  # whether the velocity stands on sides, not in cells
-SPEED = 3  # start of its velocities
-EXTRA = 4  # number of velocities beyond one a cell, in a block of the cells along this axis and the later ones
-WALL = 5  # starts of the lower and the upper wall in the inflow values (two columns), or ITSELF or ROUND
-COLUMN = 7  # its first column in `table`
-VARIES = 8  # whether it has a column for each position along it
-UNEVEN = 9  # whether lengths or open sides differ within the component
+N = 0  # number of cells along the axis
+STRIDE = 1  # offset between neighbours in the flat field
+ON_SIDES = 2  # whether the velocity is given on sides, not in cells
+SPEED = 3  # start of the velocities of this axis
+EXTRA = 4  # by how many the velocities outnumber the cells, in a block of the cells along this axis and the later ones
+WALL = 5  # starts of the inflow values of the lower and of the upper wall (two columns), or ITSELF or ROUND
+COLUMN = 7  # first column of the axis in `table`
+VARIES = 8  # whether `table` has a column for each position along the axis
+UNEVEN = 9  # whether lengths differ, or sides are closed, anywhere in the component
 PROPERTIES = 10
-ITSELF = -1  # beyond the end of the axis is the value of the cell itself
-ROUND = -2  # beyond the end of the axis is the other end
+ITSELF = -1  # the ghost cell beyond the wall has the value of the cell itself
+ROUND = -2  # the axis is periodic
 
 # Rows of `table`; int64, so that `weigh` is compiled for one type.
-OWN = int64(0)  # 1 over the length for the lower and the upper side (two rows), from the cell itself
-THEIRS = int64(2)  # the same from the cell beyond
-DISTANCE = int64(4)  # c and e of the limiter
+OWN = int64(0)  # 1 / length for the lower and for the upper side (two rows), with the length of the cell itself
+THEIRS = int64(2)  # 1 / length for these sides, with the length of the cell beyond (two rows)
+DISTANCE = int64(4)  # c and e of the limiter (two rows)
 
 
 def van_leer(a: Any, b: Any, c: Any, e: Any) -> tuple[Any, ...]:
@@ -80,8 +80,9 @@ def van_leer(a: Any, b: Any, c: Any, e: Any) -> tuple[Any, ...]:
     Notes
     -----
     With q = a / (a + b), p = 1 - q, E = q e^2, C = p c^2, m = (c + e - 2) c e the slope is (a + b) R, R = N / D,
-    N = q p (E + C), D = q E + m q p + p C. Its derivative in a is (p (2 E + C) - R (2 E + m p)) / D, in b likewise.
-    It is 0 where a and b differ in sign. For equal cells it is a b / (a + b). See `sparsedp.advection.eulerian`.
+    N = q p (E + C), D = q E + m q p + p C. Its derivative in a is (p (2 E + C) - R (2 E + m p)) / D; exchange p with q
+    and E with C for the derivative in b. The slope is 0 if the signs of a and b differ. For equal
+    cells it is a b / (a + b). See `sparsedp.advection.eulerian`.
 
     References
     ----------
@@ -96,7 +97,7 @@ def van_leer(a: Any, b: Any, c: Any, e: Any) -> tuple[Any, ...]:
     m = (c + e) * (c * e) - c * e * 2.0
     high = q * (e * e)
     low = p * (c * c)
-    inverse = 1.0 / (q * (high + m * p) + p * low)  # divisions take most of the time
+    inverse = 1.0 / (q * (high + m * p) + p * low)  # a single division, because divisions take most of the time
     ratio = q * p * (high + low) * inverse
     slope = total * ratio
     scale = same_sign * inverse
@@ -112,13 +113,14 @@ class Scheme(NamedTuple):
     Attributes
     ----------
     limiter : callable or None
-        ``limiter(a, b, c, e)`` as in the head of this module; None for first order.
+        ``limiter(a, b, c, e)`` as in the module docstring; None for a first-order scheme.
     stages : tuple of float
-        For each stage the share s: the next field is s times the first field plus (1 - s) times an Euler step.
+        For each stage a weight s: the stage returns s times the field at the beginning of the step plus (1 - s) times
+        an Euler step from the result of the stage before.
     max_courant : float
-        Largest stable sum of the Courant numbers of a cell.
+        Largest stable CFL number of a cell.
     symmetric : bool
-        Whether `ahead` and `behind` are the same.
+        Whether `ahead` and `behind` are equal.
     """
 
     limiter: Callable[..., tuple[Any, ...]] | None = None
@@ -132,24 +134,27 @@ SCHEMES = {"upwind": Scheme(), "van_leer": Scheme(van_leer, stages=(0.0, 0.5), m
 
 # ---- pieces of a tile ------------------------------------------------------------------------------------------------
 #
-# Indices are unsigned: signed ones would be tested for being negative, which keeps loops from being vectorised.
+# Indices are unsigned: numba tests whether signed indices are negative, and a loop with such tests is not vectorised.
 
 
 class Side(NamedTuple):
-    """One side of the cells of a piece; all indices are unsigned and count from the first cell of the tile."""
+    """The lower or the upper side of the cells of a piece.
 
-    begin: Any  # first cell of the piece in the tile
-    end: Any  # one after its last cell
-    beyond: Any  # index in the field of the cell on the other side
+    All indices are unsigned. Those of arrays are for the first cell of the tile: add j for cell j of the tile.
+    """
+
+    begin: Any  # first cell of the piece, as a position in the tile
+    end: Any  # one after the last cell of the piece
+    beyond: Any  # index in the field of the neighbour beyond the side
     speed: Any  # index of the velocity
     wall: Any  # index of the inflow value
     column: Any  # column of the table
     inner: float  # 0.0 at a wall, where `beyond` is the cell itself; else 1.0
-    shown: float  # 0.0 at a wall with an inflow value; else 1.0
+    shown: float  # factor of the value at `beyond`: 0.0 at a wall with an inflow value; else 1.0
 
 
 def tile_of(axes: NDArray, part: int) -> tuple[Any, ...]:
-    """Return the row of a tile, its first cell and its number of cells; the latter two also as unsigned numbers."""
+    """Return the row of a tile, its first cell and its number of cells, and the latter two as unsigned integers."""
     length = axes[-1, N]
     tiles = -(-length // TILE)
     row = part // tiles
@@ -169,7 +174,7 @@ def side_of(axes: NDArray, a: int, piece: int, upper: Any, tile: tuple[Any, ...]
     wall = axes[a, WALL + upper]
     block, first, size, _, _ = tile
     line = first
-    if a < len(axes) - 1:  # divisions take most of the time here
+    if a < len(axes) - 1:  # not on the last axis, because divisions take most of the time here
         line = first // stride
         block = line // n
     position = line - block * n
@@ -223,7 +228,10 @@ def side_of(axes: NDArray, a: int, piece: int, upper: Any, tile: tuple[Any, ...]
 
 
 def share(flow: float) -> float:
-    """Return the share of the cell beyond a side in the value there, by the velocity into the cell; 1/2 at rest."""
+    """Return the weight of the cell beyond a side in the upwind value at the side: 1, 1/2 or 0 for flow >, = or < 0.
+
+    `flow` is the velocity through the side into the cell.
+    """
     return 0.5 * (flow > 0.0) + 0.5 * (flow >= 0.0)
 
 
@@ -240,7 +248,7 @@ def weigh(
     free: NDArray,
     c: Any,
 ) -> None:
-    """Set a line buffer to x times a row of the table for the cells of a piece, and to 0 on closed sides."""
+    """For the cells of a piece, set a line buffer to x times a row of the table, and to 0 if the side is closed."""
     b = side.begin
     e = side.end
     at = side.column
@@ -271,10 +279,11 @@ def to_velocity(
     sides: tuple[Side, Side],
     places: tuple[Any, ...],
 ) -> Any:
-    """Set (`fresh`) or add the cotangent of w for the sides of a piece, and return how many of them are not finite.
+    """Compute the cotangent of w on the sides of a piece, and return how many of its values are not finite.
 
-    `given` holds the cotangents of the cells for their lower and upper sides and of the cells beyond, from the indices
-    `places` on. A side has the value of the cell that the flow comes from; at rest it has the mean.
+    It is written to `gw` if `fresh`, else added to `gw`. `given` holds cotangents of cells, which start at the four
+    indices `places`: of the cells themselves, weighted for their lower and for their upper sides, and of the cells
+    beyond these sides. The value at a side is that of the upstream cell, or the mean of both cells where w is 0.
     """
     below, above = sides
     rest = 1.0 - flux
@@ -282,7 +291,7 @@ def to_velocity(
     bad = 0
     m = below.speed
     q = above.beyond
-    if not on_sides:  # the velocity in a cell is that of both its sides
+    if not on_sides:  # the velocity of a cell applies to both its sides
         for j in range(below.begin, below.end):
             near = share(w[m + j])
             low = (below.shown * u[below.beyond + j] - u[c + j]) * given[places[0] + j]
@@ -296,7 +305,7 @@ def to_velocity(
         x = places[upper]
         i = places[2 + upper]
         if upper and on_sides and inner:
-            continue  # the velocity on an upper side is that on the lower side of the cell beyond
+            continue  # it is the lower side of the next cell
         sign = 1.0 - 2.0 * upper
         back = on_sides * inner
         if on_sides:
@@ -323,8 +332,8 @@ def to_velocity(
     return bad
 
 
-limiter = van_leer  # in `_slopes`: replaced by the function of the scheme for which the loop is compiled
-# A product and a sum are contracted to one instruction: the same bits on every machine.
+limiter = van_leer  # called by `_slopes`; `slope_loop` replaces it by the limiter of a scheme
+# "contract": a product and a sum become one instruction (fused multiply-add), so that all machines get the same bits.
 OPTIONS: dict[str, Any] = {
     "uses": (tile_of, side_of, weigh, share, to_velocity),
     "fastmath": {"contract"},
@@ -337,9 +346,9 @@ OPTIONS: dict[str, Any] = {
 # u, g        flat arrays over the cells: the field, a cotangent
 # inflow      flat array, one value for each point at a wall
 # w           flat array, axis by axis: the velocity on the sides or in the cells
-# free        for each side (lower, upper, axis by axis) whether it is open at the cells; no columns if all are
-# slopes      for each axis `behind` and `ahead`, or one array if they are the same; no cells for first order
-# partials    for each of the slopes its derivatives in a and b
+# free        whether sides are open: rows for lower and upper sides of each axis; no columns if all are
+# slopes      for each axis `behind` and `ahead`, or one array if both are equal; empty for a first-order scheme
+# partials    the derivatives of each of the slopes in a and b
 # dt          the time step
 # table, axes see above
 # flux        1 in flux form, 0 in advective form
@@ -367,7 +376,7 @@ def stage(
 ) -> None:
     """Set out = keep u0 + (1 - keep) u'.
 
-    `wrong` is set, for each tile, to the number of weights below `least` and of results that are not finite.
+    `wrong` is set, for each tile, to the number of weights below `least` plus the number of non-finite results.
     """
     memory = np.empty((2, LINE))
     lines = np.empty(2 * LINE)
@@ -394,7 +403,7 @@ def stage(
             if a == len(axes) - 1:
                 pieces = 3
             for piece in range(pieces):
-                below = side_of(axes, a, piece, int64(0), tile)  # int64: compiled for one type
+                below = side_of(axes, a, piece, int64(0), tile)  # int64, so that it is compiled for one type
                 above = side_of(axes, a, piece, int64(1), tile)
                 b = below.begin
                 e = below.end
@@ -466,12 +475,12 @@ def vjp(
     start: int,
     stop: int,
 ) -> None:
-    """Pull the cotangent g of u' back to u (with constant slopes), to the inflow and to w.
+    """Compute the cotangents of u (for constant slopes), of the inflow and of w from the cotangent g of u'.
 
     `gu` is set to the cotangent of u. The cotangent of the inflow is added to `ginflow`. `gw` is set to the cotangent
-    of w (`fresh`) or increased by it. `gu` and `gw` are empty where they are not wanted. The cotangents of a and b
-    replace the last slopes of `partials`. `wrong` is set, for each tile, to the number of cotangents of u and w that
-    are not finite.
+    of w if `fresh`; otherwise the cotangent is added to it. An empty `gu` or `gw` is not computed. The cotangents of a
+    and b overwrite the last slope's derivatives in `partials`; `slope_vjp` reads them there. `wrong` is set, for each
+    tile, to the number of cotangents of u and w that are not finite.
     """
     memory = np.empty((3, LINE))
     lines = np.empty(4 * LINE)
@@ -508,7 +517,8 @@ def vjp(
                 sides = (below, above)
                 if b == e:
                     continue
-                # Where `given` holds the cotangents of the cells (x, y: lower, upper side) and of those beyond (i, k).
+                # Starts in `given` of the cotangents of the cells (x, y: for lower and upper sides) and of the cells
+                # beyond these sides (i, k).
                 x = c
                 y = c
                 i = below.beyond
@@ -572,7 +582,7 @@ def vjp(
                     bad += to_velocity(
                         w, gw, fresh, u, inflow, slopes, given, ratio, flux, a, on_sides, c, sides, places
                     )
-            if partials.size:  # from the cotangents of `behind` and `ahead` to those of a and b
+            if partials.size:  # cotangents of a and b from those of `behind` and `ahead`
                 for difference in range(2):
                     for j in range(size):
                         total = partials[a, 0, difference, c + j] * of_slopes[0, j]
@@ -590,7 +600,10 @@ def vjp(
 def slope_vjp(
     partials: NDArray, free: NDArray, axes: NDArray, gu: NDArray, ginflow: NDArray, start: int, stop: int
 ) -> None:
-    """Add the cotangents of a and b, the differences to the cells below and above, to those of u and inflow."""
+    """Add the contributions of the slopes to the cotangents of u and of the inflow.
+
+    They follow from the cotangents of a and b, the differences to the cells below and above, in `partials`.
+    """
     line = np.empty(LINE)
     last = partials.shape[1] - 1
     for part in range(start, stop):
@@ -618,7 +631,7 @@ def slope_vjp(
 
 
 def _slopes(u, inflow, free, table, axes, slopes, partials, start, stop):
-    """Set the slopes given by `limiter` and, if `partials` is not empty, their derivatives."""
+    """Set `slopes` to the results of `limiter` and, if `partials` is not empty, `partials` to their derivatives."""
     memory = np.empty((2, LINE))
     limited = np.empty((6, LINE))  # behind, ahead, and the derivatives of both in a and b
     lines = np.ones(3 * LINE)
@@ -658,7 +671,7 @@ def _slopes(u, inflow, free, table, axes, slopes, partials, start, stop):
 
 
 def slope_loop(name: str, function: Callable[..., tuple[Any, ...]], **options: Any) -> Kernel:
-    """Return the compiled loop over the slopes of a limiter; `options` are those of `Kernel`."""
+    """Return the loop `_slopes` for a limiter as a `Kernel`, to which `options` are passed."""
     words = "read1 read1 mask2 read2 index2 write3 write4"
     return Kernel(_slopes, words, given={"limiter": function}, name=f"slopes_{name}", **{**OPTIONS, **options})
 

@@ -3,9 +3,10 @@
 The departure point of the point (i, j, k) is (i, j, k) - scale w, in index coordinates. The flat array `samples` is a
 field with ghost cells; `axes` and `tables` are those of `interpolation_weights.Points`.
 
-The loops work on TILE points at a time, counted by `start` and `stop`: the data of a tile stay in the L1 cache, and
-every inner loop runs over a tile, for one axis or one sample of the stencil. The same loops therefore serve 1-D to 3-D,
-linear and cubic interpolation. Indices are unsigned: signed ones would be tested for being negative.
+The loops process tiles of TILE points; `start` and `stop` are a range of tiles. The data of a tile stay in the L1
+cache. Every inner loop runs over the points of a tile, for one axis or one sample of the stencil, so that the same code
+is used in 1-D to 3-D and for linear and cubic interpolation. Indices are unsigned, because numba tests whether signed
+indices are negative.
 """
 
 from __future__ import annotations
@@ -26,10 +27,11 @@ __all__ = ["interpolate", "scatter"]
 
 @njit(**INNER)
 def _stencils(w, scale, axes, tables, left, right, first, begin, weights, rows):
-    """Set the first sample of the stencil of each point in left:right and the weights of its samples by axis.
+    """Set `first`, the first sample of the stencil of each point in left:right, and `weights` of the samples by axis.
 
-    There are always three axes: the weights of axes that the field does not have are 1. `begin` is the number of the
-    first of the four samples that counts: for slopes at the points it is the one before the cell.
+    There are always three axes: the weights of axes that the field does not have are 1. `begin` is set to the position
+    among the four samples of the first one with a weight. It is 0 if slopes at points are needed, because the mean of
+    the one-sided slopes uses the sample before the cell.
     """
     count = right - left
     dim = len(w)
@@ -53,7 +55,7 @@ def _stencils(w, scale, axes, tables, left, right, first, begin, weights, rows):
         at_points = 0
         low = 1.0 - PAD
         high = n + PAD - 2.0
-        for j in range(number.size):  # the index along this axis is a remainder; the half makes it exact
+        for j in range(number.size):  # index along this axis: a remainder; adding 0.5 makes it exact
             above = np.floor((rest[j] + 0.5) * inverse)
             p = rest[j] - above * n - s * displacement[j]
             rest[j] = above
@@ -93,10 +95,10 @@ def interpolate(
     start: int,
     stop: int,
 ) -> None:
-    """Set out = W samples, and `bounds`, if it has room, to the least and greatest sample of the cell of each point.
+    """Set out = W samples and, unless it is empty, `bounds` to the least and greatest sample of the cell of each point.
 
-    `tables` holds the weights of the value. If it also holds those of the slope, out[axis] is set to -scale g times the
-    slope of the interpolant along the axis: the derivative of g . (W samples) in w.
+    `tables` holds the weights of the value. If it also holds the weights of the slope, out[axis] is set instead to
+    -scale g times the slope of the interpolant along the axis, which is the derivative of g . (W samples) in w.
     """
     first = np.empty(TILE, np.int64)
     begin = np.empty(3, np.int64)
@@ -123,7 +125,7 @@ def interpolate(
                 for j in range(count):
                     value[j] = slope[j] = 0.0
                 near = samples[i * axes[0, 1] + k * axes[1, 1] :]
-                for m in range(begin[2], 4 - begin[2], 2):  # in pairs: half the passes over the sums
+                for m in range(begin[2], 4 - begin[2], 2):  # two samples at a time, to halve the passes over the sums
                     line = near[m:]
                     a = weights[0, 2, m]
                     b = weights[0, 2, m + 1]
@@ -137,7 +139,7 @@ def interpolate(
                         if slopes:
                             slope[j] += c[j] * one + d[j] * two
                 corner_end = 1
-                if 0 < i < 3 and 0 < k < 3:  # samples of the cell itself
+                if 0 < i < 3 and 0 < k < 3:  # samples at the corners of the cell
                     corner_end = 3
                 for m in range(1, corner_end):
                     line = near[m:]
@@ -145,7 +147,7 @@ def interpolate(
                         sample = line[np.uint64(first[j])]
                         least[j] = sample if sample < least[j] else least[j]
                         greatest[j] = sample if sample > greatest[j] else greatest[j]
-                for axis in range(len(out)):  # its factor is the slope, the others are values
+                for axis in range(len(out)):  # slope weights along this axis, value weights along others
                     if slopes:
                         steep = axis + 3 - dim
                     else:
@@ -169,7 +171,7 @@ def interpolate(
 def scatter(
     w: NDArray, scale: NDArray, axes: NDArray, tables: NDArray, g: NDArray, samples: NDArray, start: int, stop: int
 ) -> None:
-    """Add W^T g to the samples; for one thread, because points share samples."""
+    """Add W^T g to `samples`; for one thread only, because several points add to the same sample."""
     first = np.empty(TILE, np.int64)
     begin = np.empty(3, np.int64)
     # of value and slope by axis and sample

@@ -1,12 +1,13 @@
 """Interpolation at departure points, its transpose and its gradient, for a field with ghost cells around it.
 
 The departure point of the point (i, j, k) of a field is (i, j, k) - scale w, in index coordinates. The field has PAD
-ghost cells beyond each end of each axis, so that no loop tests for walls. Periodic axes wrap; on others a departure
-point beyond the first ghost cell gets the value of the ghost cells, and a slope of 0.
+ghost cells beyond each end of each axis, so that no loop needs to test for walls. Departure points beyond the end of a
+periodic axis are shifted by its period. On other axes, a departure point beyond the first ghost cell gets the value of
+the ghost cells and a slope of 0.
 
-`sparsedp.kernels.interpolation` has the compiled loops. `entries`, the entries of the matrix W of the interpolation, is
-their reference, runs without numba, and gives the matrix of a step. Arrays are flat, contiguous float64, and not
-checked. Displacements may be NaN.
+`sparsedp.kernels.interpolation` has the compiled loops. `entries` computes the entries of the interpolation matrix W.
+It is the reference for the loops, replaces them without numba, and gives the matrix of a step. Arrays must be flat,
+contiguous and of dtype float64; this is not checked. Displacements may be NaN.
 """
 
 from __future__ import annotations
@@ -26,19 +27,20 @@ if TYPE_CHECKING:
 
 __all__ = ["NO_BOUNDS", "PAD", "TILE", "Points", "bound_shares", "entries", "interpolate", "scatter"]
 
-PAD = 3  # ghost cells: what cubic interpolation reads beyond the clamped departure points
-TILE = 256  # points; up to 24 rows of 2 KB are in use at a time, which fit the L1 cache together with the samples
+PAD = 3  # number of ghost cells, as cubic interpolation needs beyond the clamped departure points
+TILE = 256  # points processed at a time. Up to 24 rows of 2 KB are in use, which fit into the L1 cache with the samples
 
 EMPTY = np.empty(0)
 NO_BOUNDS = np.empty((2, 0))
 
-# The weights of the four samples, from the one before the cell on: coefficients of 1, t, t^2, t^3 in the fraction t of
-# the cell. At a point (t = 0) only the second sample counts; the slope there is the mean of both sides.
+# The weights of the four samples, of which the second and the third are the ends of the cell: coefficients of 1, t, t^2
+# and t^3, where t in [0, 1] is the position in the cell. At a point (t = 0) the value is the second sample, and the
+# slope is the mean of both one-sided slopes.
 WEIGHTS = {
     "linear": ((0, 0, 0, 0), (1, -1, 0, 0), (0, 1, 0, 0), (0, 0, 0, 0)),
     "cubic": ((0, -0.5, 1, -0.5), (1, 0, -2.5, 1.5), (0, 0.5, 2, -1.5), (0, 0, -0.5, 0.5)),
 }
-WEIGHTS_AT_POINTS = ((0, 1, 0, 0), (-0.5, 0, 0.5, 0))  # of value and slope
+WEIGHTS_AT_POINTS = ((0, 1, 0, 0), (-0.5, 0, 0.5, 0))  # weights of the value and of the slope
 
 
 class Points(NamedTuple):
@@ -54,9 +56,10 @@ class Points(NamedTuple):
     samples : int
         Number of points and ghost cells.
     axes : int array, shape (3, 5)
-        For each axis: number of points, stride, whether it is periodic, and the range of the four samples that count.
+        For each axis: number of points, stride, whether it is periodic, and the range (begin, end) of those of the four
+        samples that have a weight.
     weights : array, shape (2, 4, 5)
-        Of the value and of the slope: for each sample the four coefficients, and the weight at a point.
+        Row 0 for the value and row 1 for the slope: for each sample the four coefficients and the weight at t = 0.
     """
 
     shape: tuple[int, ...]
@@ -89,7 +92,7 @@ class Points(NamedTuple):
 
     @property
     def strides(self) -> NDArray[np.int64]:
-        """Strides of the axes of the field among the samples."""
+        """Strides of the axes of the field in the flat array of samples."""
         return self.axes[-len(self.shape) :, 1]
 
 
@@ -100,18 +103,21 @@ def _run(name: str, points: Points, threads: int, *args: Any) -> bool:
 
 
 def _cells(points: Points, w: NDArray, scale: NDArray, subset: Any = slice(None)) -> tuple[NDArray, NDArray]:
-    """Return the first samples of the stencils of departure points, and the fractions of a cell (axis, point)."""
+    """For each departure point, return the first sample of its stencil and its positions t (axis, point)."""
     n, stride, periodic = points.axes[-len(w) :, :3].T[:, :, None]
     place = np.unravel_index(np.arange(points.size)[subset], points.shape) - scale[:, None] * w[:, subset]
     with np.errstate(invalid="ignore"):
         place = np.where(periodic, place - n * np.floor(place / n), place)
-        place = np.minimum(np.where(place >= 1 - PAD, place, 1 - PAD), n + PAD - 2)  # NaN goes to the lower end
+        place = np.minimum(np.where(place >= 1 - PAD, place, 1 - PAD), n + PAD - 2)  # NaN becomes the lower end
     cell = np.minimum(np.floor(place), n).astype(int)
     return np.sum(stride * (cell + PAD - 1), axis=0), place - cell
 
 
 def entries(points: Points, w: NDArray, scale: NDArray, along: int | None = None) -> Iterator[tuple[NDArray, NDArray]]:
-    """Yield the columns of W (`along`: of the slope along an axis): for each point a sample and its weight."""
+    """Yield the entries of W, one sample of the stencil at a time: for each point the sample index and the weight.
+
+    If `along` is an axis, yield the entries of the matrix of the slope along this axis instead.
+    """
     first, fractions = _cells(points, w, scale)
     rows = []
     for axis, t in enumerate(fractions):
@@ -141,11 +147,11 @@ def interpolate(
     w : array, shape (axes, points)
         Displacements.
     scale : array, shape (axes,)
-    out : array, shape (points,), with `g` (axes, points)
+    out : array, shape (points,), or (axes, points) if `g` is given
     g : array, optional
-        `out` is then set to the derivative of g . (W samples) in w.
+        If it is given, `out` is set to the derivative of g . (W samples) in w instead.
     bounds : array, shape (2, points), optional
-        Set to the least and the greatest sample of the cells of the departure points.
+        Set to the least and the greatest sample of the cell of each departure point.
     """
     if g is None:
         rows = out[None]
@@ -166,9 +172,9 @@ def interpolate(
 
 
 def scatter(points: Points, w: NDArray, scale: NDArray, g: NDArray, samples: NDArray) -> NDArray:
-    """Add W^T g, the transpose of `interpolate`, to the samples, and return them.
+    """Add W^T g, the transpose of `interpolate`, to `samples`, and return `samples`.
 
-    Points share samples, so it runs on one thread.
+    It runs on one thread, because several points add to the same sample.
     """
     if not _run("scatter", points, 1, w, scale, points.axes, points.weights[:1], g, samples):
         for index, weight in entries(points, w, scale):
@@ -177,7 +183,7 @@ def scatter(points: Points, w: NDArray, scale: NDArray, g: NDArray, samples: NDA
 
 
 def _corners(points: Points, w: NDArray, scale: NDArray, subset: Any = slice(None)) -> NDArray:
-    """Return the samples of the cells of departure points, one row for each corner."""
+    """Return the indices of the samples at the corners of the cells of departure points, one row for each corner."""
     steps = np.array(list(product((1, 2), repeat=len(w)))) @ points.strides
     return steps[:, None] + _cells(points, w, scale, subset)[0]
 
@@ -190,9 +196,10 @@ def bound_shares(
     Returns
     -------
     corners : int array, shape (corners, points)
-        Numbers of the samples of the cells.
+        Indices of the samples of the cells.
     least, greatest : array, shape (corners, points)
-        Derivative of the least and of the greatest sample in each of them; equal samples share it.
+        Derivatives of the least and of the greatest sample with respect to each of these samples. If several samples
+        are the least (or the greatest), they get equal parts.
     """
     corners = _corners(points, w, scale, subset)
     cells = samples[corners]

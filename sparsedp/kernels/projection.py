@@ -1,8 +1,8 @@
-"""Compiled passes of the projection: the net flow out of cells, and a pressure gradient added on faces.
+"""Compiled passes of the projection: the net flow out of cells, and the addition of a pressure gradient on faces.
 
-The loops are serial, row by row: they are short beside the transforms. x0, x1, x2 are the components of a face field
-with three axes; a component is empty if the axis does not exist. On a periodic axis the last cell and the first face
-are neighbours.
+The loops run on one thread, because they take little time compared with the transforms of the pressure solve. x0, x1
+and x2 are the components of a face field with three axes; a component is empty if the grid lacks the axis. On a
+periodic axis the first face is also the upper face of the last cell.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["net_flow", "push"]
 
 
-@kernel("read1 read3 read3 read3 read2 read2 read2 write3", fastmath={"reassoc"})  # sums of squares in any order
+@kernel("read1 read3 read3 read3 read2 read2 read2 write3", fastmath={"reassoc"})  # lets sums of squares be vectorised
 def net_flow(
     x: NDArray,
     x0: NDArray,
@@ -32,7 +32,8 @@ def net_flow(
 ) -> tuple[float, float]:
     """Set b = lower v[i] + upper v[i + 1] summed over the axes; return the sums of squares of b and of x.
 
-    The rows of `lines` hold lower and upper of the cells. x holds all components in one array.
+    The two rows of `lines` of an axis hold `lower` and `upper` for each cell along it. x is the flat array of all
+    components.
     """
     last = b.shape[2] - 1
     lower = lines2[0]
@@ -79,7 +80,7 @@ def push(
     start: int,
     stop: int,
 ) -> None:
-    """Set out = keep x + below p[f - 1] + above p[f]; the rows of `lines` hold keep, below and above of the faces."""
+    """Set out = keep x + below p[f - 1] + above p[f] on each face f; the rows of `lines` are keep, below and above."""
     n0, n1, n2 = p.shape
     flat_shape = 1, len(out0), n1 * n2
     first = (
@@ -87,7 +88,7 @@ def push(
         p.reshape(1, n0, n1 * n2),
         lines0,
         out0.reshape(flat_shape),
-    )  # as if the axis were the second
+    )  # reshaped, so that axis 0 is the middle axis of three
     for faces, cells, lines, out in (first, (x1, p, lines1, out1)):
         n = cells.shape[1]
         for i in range(out.shape[0]):
@@ -117,5 +118,5 @@ def push(
             inner_keep = keep[1:]
             for j in range(n2 - 1):
                 inner[j] = inner_keep[j] * old[j] + low[j] * near[j] + high[j] * ahead[j]
-            for f in range(0, out.size, n2):  # the walls, or the face at both ends
+            for f in range(0, out.size, n2):  # the faces on the walls; on a periodic axis the one at both ends
                 out[f] = keep[f] * x[f] + below[f] * near[(f - 1) % n2] + above[f] * near[f % n2]

@@ -1,4 +1,4 @@
-"""The compiled loops as NumPy formulas of a few lines: reference for their tests, and fallback without numba."""
+"""NumPy implementations of compiled loops: the reference for their tests, and the fallback without numba."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ __all__ = [
 
 
 class Rows(NamedTuple):
-    """A sparse 1-D matrix of `rows` x `cols`, stored twice: by rows and by diagonals.
+    """A sparse matrix of shape (rows, cols), stored twice: by rows and by diagonals.
 
     By rows (CSR): entries of row i are `data[indptr[i]:indptr[i + 1]]` at columns `indices[...]`.
     By diagonals: `out[i] += values[d, i] * u[i + offsets[d]]` for `start[d] <= i < stop[d]`.
-    Each diagonal is contiguous, because an (n, 3) array halves the speed. For a matrix with too many diagonals
-    `offsets` is empty, and only the rows are stored.
+    Each diagonal is contiguous, because with an (n, 3) array the loop is half as fast. If a matrix has too many
+    diagonals, `offsets` is empty, and the matrix is stored only by rows.
     """
 
     rows: int
@@ -42,10 +42,10 @@ class Rows(NamedTuple):
 
 
 class Tridiagonal(NamedTuple):
-    """A square 1-D matrix whose row i holds only columns i - 1, i, i + 1 (cyclic).
+    """A square matrix whose row i has entries only in the columns i - 1, i and i + 1 (cyclic).
 
     Row i of the product is `lower[i] u[i - 1] + centre[i] u[i] + upper[i] u[i + 1]`, indices modulo n.
-    Where `lower[0]` or `upper[-1]` is zero, the far end must not be read: 0 * NaN is NaN.
+    If `lower[0]` or `upper[-1]` is 0, the value at the other end must not be read, because 0 * NaN is NaN.
     """
 
     lower: np.ndarray  # float64, n
@@ -66,12 +66,12 @@ def kronecker_sum(u: NDArray, out: NDArray, axes: Sequence[Tridiagonal | None], 
         total[1:] += lower[1:] * field[:-1]
         total[:-1] += upper[:-1] * field[1:]
         for end, band, far_end in ((0, lower, -1), (-1, upper, 0)):
-            if band[end] != 0:  # else the far end must not be read: 0 times NaN is NaN
+            if band[end] != 0:  # if it is 0, the other end must not be read, as it may be NaN
                 total[end] += band[end] * field[far_end]
 
 
 def product_along(u: NDArray, out: NDArray, rows: Rows, scale: float, accumulate: bool) -> None:
-    """Set out = scale M u or add it along the middle axis; see `sparsedp.kernels.along_axis`."""
+    """Set `out` to scale M u, or add scale M u to it; see `sparsedp.kernels.along_axis`."""
     matrix = sp.csr_array((rows.data, rows.indices, rows.indptr), shape=(rows.rows, rows.cols))
     other_axes = (len(u), u.shape[2])
     flat = np.moveaxis(u, 1, 0).reshape(rows.cols, other_axes[0] * other_axes[1])

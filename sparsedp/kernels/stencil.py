@@ -1,7 +1,7 @@
-"""Compiled loops of the matrix-free operators: three-point sums, a matrix along an axis, differences through faces.
+"""Compiled loops of the matrix-free operators: tridiagonal sums, a matrix along an axis, fluxes through faces.
 
-A field has three axes; rows run along the last one. Every loop first takes views of rows and then runs over them, so
-that the inner loops are vectorised. A value with the coefficient 0 is not read, because 0 times NaN is NaN.
+A field has three axes; a row lies along the last one. Every loop first takes views of rows and then iterates over them,
+so that the compiler can vectorise the inner loops. A value with the coefficient 0 is not read, because 0 * NaN is NaN.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 __all__ = ["across_rows", "along_rows", "kronecker_sum", "through_faces"]
 
-TILE = 1024  # values of a row at a time, which stay in the L1 cache for all diagonals
+TILE = 1024  # number of values of a row that are processed at a time: they stay in the L1 cache for all diagonals
 
 
-@kernel("read3 write3 read2 read2 read2 flag real", fastmath={"contract"})  # a product and a sum are one instruction
+@kernel("read3 write3 read2 read2 read2 flag real", fastmath={"contract"})  # fused multiply-add
 def kronecker_sum(
     u: NDArray,
     out: NDArray,
@@ -32,9 +32,10 @@ def kronecker_sum(
     start: int,
     stop: int,
 ) -> None:
-    """Set out = shift u + sum of T_a u, T_a tridiagonal and cyclic along axis a: rows lower, centre, upper.
+    """Set out = shift u + sum over a of T_a u, where T_a is tridiagonal and cyclic along axis a.
 
-    `uniform`: the rows are the same for all cells except the first and the last of the last axis.
+    `far`, `middle` and `along` hold T_0, T_1 and T_2, each as the rows lower, centre and upper. `uniform` states that
+    the entries of T_2 are equal for all cells except the first and the last.
     """
     n0, n1, n = u.shape
     rows = n0 * n1
@@ -54,7 +55,7 @@ def kronecker_sum(
         weight = shift + far[1, i] + middle[1, k]
         line = cells[row]
         result = totals[row]
-        # Where there is no neighbour, the cell itself is read, times 0.
+        # A missing neighbour has the coefficient 0; the row itself is read in its place.
         row_below1 = row
         row_above1 = row
         row_below0 = row
@@ -71,8 +72,8 @@ def kronecker_sum(
         above1 = cells[row_above1]
         below0 = cells[row_below0]
         above0 = cells[row_above0]
-        # For uniform cells three numbers replace three rows that would fill the cache; in 2-D there is nothing to read
-        # along axis 0. Three loops, because the compiler vectorises loops without a branch.
+        # On uniform cells three numbers replace three rows of coefficients, which would occupy the cache. In 2-D there
+        # are no neighbours along axis 0. There are three loops, because only loops without a branch are vectorised.
         one = min(1, last)
         low = lower[one]
         mid = weight + centre[one]
@@ -110,7 +111,10 @@ def across_rows(
     start: int,
     stop: int,
 ) -> None:
-    """Set out = scale M u or add it, for M sparse along the middle axis, row by row of the field."""
+    """Set out = scale M u or, if `add`, add it, for a sparse M (CSR) along the middle axis.
+
+    `start` and `stop` are a range of rows of `out`.
+    """
     lines = out.shape[1]
     for row in range(start, stop):
         i = row // lines
@@ -120,7 +124,7 @@ def across_rows(
         last = indptr[k + 1]
         if first == last and not add:
             result[:] = 0.0
-        for entry in range(first, last, 2):  # two at a time, because most rows of an operator have two
+        for entry in range(first, last, 2):  # two at a time, because most rows of M have two entries
             more = min(entry + 1, last - 1)
             one = scale * data[entry]
             values = u[i, indices[entry]]
@@ -150,7 +154,10 @@ def along_rows(
     start: int,
     stop: int,
 ) -> None:
-    """Set out = scale M u or add it, for M along the rows, by diagonals; `start` and `stop` count entries of out."""
+    """Set out = scale M u or, if `add`, add it, for M along the last axis, stored by diagonals.
+
+    `start` and `stop` are a range of entries of `out`.
+    """
     n = out.shape[1]
     for row in range(start // n, -(-stop // n)):
         for left in range(max(start - row * n, 0), min(stop - row * n, n), TILE):
@@ -182,12 +189,13 @@ def through_faces(
     start: int,
     stop: int,
 ) -> None:
-    """Set out = L diag(k) R u in one pass, R from cells to faces and L back; fluxes through faces are not stored.
+    """Set out = L diag(k) R u in one pass, with R from cells to faces and L from faces to cells.
 
-    The flux through face f, between the cells f - 1 and f, is k_f (r_below_f u_(f-1) + r_above_f u_f). The cells get it
-    times l_below_f and l_above_f. These are the four rows of `lines` of each axis, with one more entry than there are
-    cells along it. k has as many faces or, on a periodic axis, as many as cells: the last face is then the first.
-    `closed`: the flux through faces with k = 0 is 0, even where the cells hold NaN.
+    The array of fluxes on all faces is not stored. The flux through face f, between the cells f - 1 and f, is
+    k_f (r_below_f u_(f-1) + r_above_f u_f). It is added to these cells with the factors l_below_f and l_above_f. The
+    four rows of `lines` of an axis are r_below, r_above, l_below and l_above, with one more entry than there are cells
+    along the axis. k has one value for each face. On a periodic axis the last face is the first one, so that k has as
+    many values as there are cells. If `closed`, the flux through faces with k = 0 is 0 even if a cell holds NaN.
     """
     n0, n1, n = u.shape
     cells = u.reshape(n0 * n1, n)
@@ -206,7 +214,7 @@ def through_faces(
         ahead = line[1:]
         for f in range(n - 1):
             inside[f] = conduct[f] * (below[f] * line[f] + above[f] * ahead[f])
-        for f in (0, n):  # the walls, or the face at both ends
+        for f in (0, n):  # the faces at both ends: walls or, on a periodic axis, the same face
             if lines2[0, f] != 0.0:
                 low = lines2[0, f] * line[(f - 1) % n]
             else:
@@ -231,7 +239,7 @@ def through_faces(
         next_ones = carried[1:]
         for j in range(n):
             result[j] = to_above[j] * carried[j] + to_below[j] * next_ones[j]
-        for side in range(4):  # across rows: the face below and above in axis 1, then in axis 0
+        for side in range(4):  # lower and upper face along axis 1, then along axis 0
             upper = side % 2
             if side < 2:
                 count = n1
@@ -248,7 +256,7 @@ def through_faces(
             weight = line[3 - upper, f]
             below_f = line[0, f]
             above_f = line[1, f]
-            # Beyond a wall there is no cell: the cell itself is read, times 0.
+            # A missing cell beyond a wall has the coefficient 0; the row itself is read in its place.
             row_low = row
             row_high = row
             if below_f != 0.0:

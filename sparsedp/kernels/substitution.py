@@ -1,4 +1,4 @@
-"""Compiled substitution: systems that are triangular in a given order of their rows."""
+"""Compiled substitution for sparse systems that are triangular after a permutation of rows and columns."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ def forward(
 ) -> None:
     """Solve A x = b for the rows in order[start:stop], one after the other.
 
-    x[i] = (b[i] - sum over j != i of A[i, j] x[j]) / A[i, i]; the x[j] that a row reads are computed before.
+    x[i] = (b[i] - sum over j != i of A[i, j] x[j]) / A[i, i]. The order must be such that each x[j] is computed before
+    a row needs it.
     """
     for number in range(start, stop):
         i = order[number]
@@ -39,7 +40,8 @@ def backward(
 ) -> None:
     """Solve A^T x = r for the rows of A in order[start:stop], from the last one to the first.
 
-    x[i] = r[i] / A[i, i], then r[j] -= A[i, j] x[i] for all j != i. Afterwards r is r - A^T x for all other unknowns.
+    x[i] = r[i] / A[i, i], then r[j] -= A[i, j] x[i] for all j != i. As a result, A^T x of the computed x is subtracted
+    from the entries of r that belong to the other unknowns.
     """
     for number in range(stop - 1, start - 1, -1):
         i = order[number]

@@ -1,7 +1,7 @@
-"""Compilation and execution of compiled loops: one signature each, cached on disk, run by a pool of threads.
+"""Compilation and execution of compiled loops. Each has one signature, is cached on disk and runs on a thread pool.
 
-Threads are Python's own: a loop releases the GIL while it runs, and compiles in a fraction of the time that numba needs
-for its own parallel loops. The distribution of rows over threads does not change the bits of a result.
+The threads are Python threads; a loop releases the GIL while it runs. Such a loop compiles in a fraction of the time
+that numba needs for its own parallel loops. The results are bit-identical for every number of threads.
 """
 
 from __future__ import annotations
@@ -23,23 +23,26 @@ if TYPE_CHECKING:
 
 __all__ = ["INNER", "SERIAL", "Kernel", "kernel", "loops"]
 
-SERIAL = 524_288  # values: below, a few tenths of a millisecond, a second thread costs more than it saves
+# Number of values below which one thread is used. They take a few tenths of a millisecond, and starting a second thread
+# costs more time than it saves.
+SERIAL = 524_288
 
-# Options of functions that only compiled ones call: without the wrappers for calls from Python they compile faster.
+# Options of functions that are called only by compiled functions. Without wrappers for Python they compile faster.
 INNER = {"error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
-loops: list[Kernel] = []  # all loops that the imported modules define
+loops: list[Kernel] = []  # all loops that are defined in modules imported so far
 
 NOTICE = "sparsedp: compiling loops for this machine, once; `python -m sparsedp compile` does all of them\n"
 _noticed: list[bool] = []
 
-# numba gives one type two numbers where two threads create it at once, and then finds no signature for its arguments.
+# If two threads create the same type at the same time, numba assigns two type codes to it and then does not find the
+# compiled signature for its arguments. This lock prevents that.
 _type_creation = RLock()
 
 
 @contextlib.contextmanager
 def _announced() -> Iterator[None]:
-    """Within this context, announce on stderr the first function that is not cached on disk and must be compiled."""
+    """Print NOTICE on stderr when a function is compiled in this context, once in a process."""
     from numba.core import event
 
     class Notice(event.Listener):
@@ -57,12 +60,15 @@ def _announced() -> Iterator[None]:
 
 @functools.cache
 def _pool(size: int, process: int) -> ThreadPoolExecutor:
-    """Return the threads beside the calling one, which wait between loops; a forked process gets new threads."""
+    """Return the pool of threads that work in addition to the calling one. It is kept between loops.
+
+    `process` is the process id: a forked process gets a new pool, because threads do not survive a fork.
+    """
     return ThreadPoolExecutor(size, "sparsedp")
 
 
 def _types(words: str) -> Iterator[Any]:
-    """Yield the numba types for words such as "read3 write1 real int flag"; see `Kernel`."""
+    """Yield the numba types for a string such as "read3 write1 real int flag"; see `Kernel`."""
     from numba import types
 
     numbers = {"int": types.int64, "real": types.float64, "flag": types.boolean}
@@ -85,7 +91,7 @@ def _types(words: str) -> Iterator[Any]:
 
 
 def _example(kind: Any, writable: bool) -> Any:
-    """Return an argument of a numba type; an array is empty and read-only unless `writable`."""
+    """Return an example argument of a numba type. An array is empty, and read-only unless `writable`."""
     from numba.np.numpy_support import as_dtype
 
     if not hasattr(kind, "ndim"):
@@ -97,7 +103,7 @@ def _example(kind: Any, writable: bool) -> Any:
 
 @functools.cache
 def _with_compiled(functions: tuple[Callable, ...]) -> dict[str, Any]:
-    """Return the globals of a module in which some of its functions are compiled, to be inlined where called."""
+    """Return a copy of the globals of a module in which the given functions are compiled and will be inlined."""
     from numba import njit
 
     names = dict(functions[0].__globals__)
@@ -115,7 +121,7 @@ def kernel(words: str, **options: Any) -> Callable[[Callable], Kernel]:
     words : str
         Types of the arguments of the loop except the last two; see `Kernel`.
     **options
-        As for `Kernel`.
+        Passed to `Kernel`.
     """
 
     def decorate(loop: Callable) -> Kernel:
@@ -132,26 +138,28 @@ class Kernel:
     loop : function
         Its last two arguments are the range of rows to work on, `start` and `stop`.
     words : str
-        The types of its other arguments: read1 to read4 (float64, may be read-only), write1 to write4 (float64), index1
-        to index4 (int64), place1 to place4 (int32, may be read-only), mask1 to mask4 (bool), real, int, flag. An array
-        marked with ~ is of float32 in `single`, where ^ replaces the mark. An array marked with + is of complex128 in
-        `complex`, where * replaces the mark.
+        The types of the other arguments. Arrays, ending with the number of dimensions: read1 to read4 (float64), write1
+        to write4 (float64), index1 to index4 (int64), place1 to place4 (int32) and mask1 to mask4 (bool); all except
+        write1 to write4 may be read-only. Scalars: real, int and flag (bool). A prefix ~ marks arrays that have
+        dtype float32 in `single`, which replaces it by ^. A prefix + marks arrays that have dtype complex128 in
+        `complex`, which replaces it by *.
     uses : tuple of functions
         The functions that the loop calls, including those that they call. They are compiled once for all loops that
         use them, and must be in the same file as the loop: numba invalidates its cache by the time stamp of that file.
     given : dict, optional
-        {name: function} for functions that only this loop calls by that name.
+        {name: function}. The loop calls these functions by these names; other loops may use the names for other
+        functions.
     name : str, optional
-        Distinguishes loops with the same code and other `given` functions.
+        Name of the loop, to distinguish loops with the same code but different `given` functions.
     **options
-        Of numba's ``njit``.
+        Passed to numba's ``njit``.
 
     Attributes
     ----------
     single : Kernel
-        The same loop for arrays of float32 where its words have a ~.
+        The same loop with float32 for the arrays that `words` marks with ~.
     complex : Kernel
-        The same loop for arrays of complex128 where its words have a +.
+        The same loop with complex128 for the arrays that `words` marks with +.
     """
 
     single: Kernel
@@ -185,7 +193,7 @@ class Kernel:
 
     @property
     def compiled(self) -> Any:
-        """The compiled loop; None, after one warning, if it cannot be compiled."""
+        """The compiled loop. If compilation fails, a warning is issued once and the value is None."""
         if not self._is_compiled:
             with _type_creation:
                 if not self._is_compiled:
@@ -198,7 +206,7 @@ class Kernel:
             dispatcher = self._compile()
             self._register_types(dispatcher)
             return dispatcher
-        except Exception as error:  # any problem of LLVM or numba on this machine
+        except Exception as error:  # whatever LLVM or numba raises on this machine
             message = f"The compiled kernels do not work here ({error}); NumPy is used instead."
             warnings.warn(message, RuntimeWarning, stacklevel=5)
             return None
@@ -213,17 +221,18 @@ class Kernel:
         for name, function in self.given.items():
             names[name] = njit(forceinline=True, **options)(function)
         loop = FunctionType(self.loop.__code__, names, self.name)
-        loop.__qualname__ = self.name  # the cache is keyed by it
+        loop.__qualname__ = self.name  # numba uses it as the key of its cache
         with _announced():
             try:
                 return njit([signature], cache=use_cache, **options)(loop)
-            except (OSError, RuntimeError):  # there is no place for the cache
+            except (OSError, RuntimeError):  # no directory for the cache is writable
                 return njit([signature], **options)(loop)
 
     def _register_types(self, dispatcher: Any) -> None:
         """Let numba create and store the types of all arguments, writable and read-only, without running the loop.
 
-        It determines the types of a call before it looks for a signature, and no signature has two strings at its end.
+        The loop is called with strings as its last two arguments. numba determines the types of the arguments before it
+        looks for a signature; it finds none for strings and raises TypeError.
         """
         for writable in (True, False):
             arguments = [_example(kind, writable) for kind in _types(self.words)]
@@ -231,9 +240,10 @@ class Kernel:
                 dispatcher(*arguments, "start", "stop")
 
     def run(self, rows: int, work: int, threads: int, *args: Any) -> None:
-        """Call the loop on slabs that cover range(rows), on one thread for less than SERIAL values of work.
+        """Run the loop over range(rows), split into one part for each thread; on one thread if `work` is below SERIAL.
 
-        An exception of a slab is raised when all slabs have ended: no thread writes into the arrays after that.
+        An exception in one part is raised only after all parts have ended, so that no thread still writes into the
+        arrays.
 
         Parameters
         ----------
@@ -241,7 +251,7 @@ class Kernel:
         work : int
             Number of values to process.
         threads : int
-            Largest number of threads.
+            Maximum number of threads.
         *args
             Arguments of the loop except the last two.
         """
