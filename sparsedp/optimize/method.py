@@ -1,4 +1,4 @@
-"""The interface of the methods of `minimize`."""
+"""The base class of the methods of `minimize`."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ __all__ = ["Method"]
 
 
 class Method(ABC):
-    """A method of `minimize`: a dataclass whose fields are its options.
+    """Base class of the methods of `minimize`. A method is a dataclass whose fields are its options.
 
-    A method keeps no state of a run. `begin` and `advance` return states: named tuples of plain arrays and numbers
-    that hold everything the next step depends on, with the current point as their first field, `current`. A
-    checkpoint stores the fields in their order.
+    A method object does not store the state of a run. Instead, `begin` and `advance` return the state, a named tuple of
+    arrays and numbers that contains everything that the next step depends on. Its first field, `current`, is the
+    current point. Checkpoints store the fields of the state in their order.
 
     Attributes
     ----------
     name : str
-        What a user writes as ``method=``.
+        The value of the argument `method` of `minimize`.
     uses_residuals : bool
-        Whether the loss returns residuals, of which half the sum of squares is minimized.
+        True for least-squares methods: the loss returns residuals, and half the sum of their squares is minimized.
     """
 
     name: ClassVar[str]
@@ -34,11 +34,11 @@ class Method(ABC):
 
     @property
     def compares_losses(self) -> bool:
-        """Whether steps are accepted by comparing losses, which losses of different batches do not allow."""
+        """Whether steps are accepted by comparing losses; if so, batches cannot be used, as their losses differ."""
         return True
 
     def composed(self, loss: Callable[..., Any]) -> Callable[..., Any]:
-        """Return the loss as a function of the unknowns, given the loss that the user wrote."""
+        """Return the loss as a function of the unknowns, given the user's loss."""
         return loss
 
     @abstractmethod

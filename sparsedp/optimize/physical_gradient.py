@@ -1,4 +1,4 @@
-"""Physical gradients: an inverse simulator as the derivative rule of a simulator."""
+"""Physical gradients: the backward pass of a simulator is replaced by its inverse simulator."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ def physical_gradient(
     rate: float = 1.0,
     name: str = "physical gradient",
 ) -> Callable[[Any], Any]:
-    r"""Give a simulator a derivative rule that uses its inverse simulator.
+    r"""Return a simulator whose backward pass uses an inverse simulator instead of the derivative.
 
     Parameters
     ----------
     physics : callable
-        ``physics(x)`` returns y; arrays. Plain NumPy is enough.
+        ``physics(x)`` maps an array x to an array y. It is not differentiated, so any NumPy code can be used.
     inverse : callable
-        ``inverse(y, x)`` returns an x for which physics(x) is near y, near the present x. It may be local, approximate,
-        damped or learned.
+        ``inverse(y, x)`` returns an array x' close to x for which physics(x') is close to y. It may be approximate, for
+        example a few damped iterations or a trained network.
     rate : float
-        Step in y per cotangent: 1 / (second derivative of the loss in y).
+        Step size in y; 1 / (second derivative of the loss with respect to y) is a good value.
     name : str
-        Appears in counts.
+        Name of the function in the counts of `explain`.
 
     Returns
     -------
     callable
-        ``f(x)``, differentiable once; it works on one sample and on a batch alike.
+        ``f(x)``, which can be differentiated once. If `physics` and `inverse` accept batches, so does f.
 
     Raises
     ------
@@ -58,16 +58,16 @@ def physical_gradient(
 
     Notes
     -----
-    The value is y = physics(x). For a cotangent g = dL/dy the rule returns
+    The forward pass computes y = physics(x). For a cotangent g = dL/dy the backward pass returns
 
-        x - inverse(y - rate g, x),
+        x - x*,    x* = inverse(y - rate g, x),
 
-    the difference of x and the input from which the simulator would reach a better result. For the network that
-    computed x this is the gradient of the proxy loss |x - x*|^2 / 2 with x* = inverse(y - rate g, x) held fixed. So
-    each network keeps its own gradient, and the scale of the physics does not matter. For L = |y - t|^2 / 2 and rate 1
-    the target is t itself, and gradient descent with rate 1 on x solves the problem in one step.
+    where x* is an input for which the simulator gives a better output. If a network computed x, its gradient is that of
+    the proxy loss |x - x*|^2 / 2 with constant x*. Thus the network is differentiated as usual, while the scaling of
+    the physics has no effect on the step. For L = |y - t|^2 / 2 and rate 1, x* = inverse(t, x), so that one step of
+    gradient descent with learning rate 1 on x solves the problem if the inverse is exact.
 
-    This is an update, not the derivative of the physics; dp.check.gradient reports the difference.
+    The result is an update direction, not the derivative of the physics. Therefore dp.check.gradient reports an error.
 
     References
     ----------
@@ -100,14 +100,14 @@ def physical_gradient(
 
 @dataclass
 class PhysicalGradient(Method):
-    """Gradient descent with rate 1 on x, with the derivative rule of `physical_gradient`.
+    """Gradient descent with learning rate 1 on x, with the backward pass of `physical_gradient`.
 
     Parameters
     ----------
     physics, inverse : callable
-        As for dp.physical_gradient; required. The loss is a function of y = physics(x).
+        As for dp.physical_gradient. Required. The loss is a function of y = physics(x).
     rate : float
-        Factor of the step in y.
+        Step size in y.
 
     Notes
     -----
@@ -134,11 +134,11 @@ class PhysicalGradient(Method):
 
     @property
     def compares_losses(self) -> bool:
-        """Never: every admissible step is taken."""
+        """False: every step to a point with a finite loss is accepted."""
         return False
 
     def composed(self, loss: Callable[..., Any]) -> Callable[..., Any]:
-        """Return the loss as a function of x, given that of y."""
+        """Return the loss as a function of x, given the loss as a function of y = physics(x)."""
 
         def loss_of_x(x, *batch):
             return loss(self._simulator(x), *batch)

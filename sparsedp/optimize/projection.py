@@ -1,4 +1,4 @@
-"""The option project= of minimize: an affine projection of the unknowns."""
+"""The argument `project` of `minimize`: an affine projection of the unknowns."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Projection"]
 
-TEST_LENGTH = 2.0**20  # of the longest test direction, in units of the start
-ACCURACY = 1e-6  # relative difference from an affine map that a projection by an iterative solve may have
+TEST_LENGTH = 2.0**20  # length of the longest test direction, relative to the start
+ACCURACY = 1e-6  # tolerated relative deviation from an affine map, because the projection may use iterative solves
 NOT_AFFINE = (
     "project must be a projection onto a linear or affine space, but {}; with other maps a search may stop where the "
     "loss has no minimum. Write bounds=(lower, upper) to keep x in a box"
@@ -27,7 +27,7 @@ NOT_AFFINE = (
 
 
 class Projection:
-    """A map P of trees like start with P(P(x)) = P(x) that is affine: P(a x + (1 - a) y) = a P(x) + (1 - a) P(y).
+    """An affine projection P, that is, P(a x + (1 - a) y) = a P(x) + (1 - a) P(y) and P(P(x)) = P(x).
 
     Parameters
     ----------
@@ -40,12 +40,13 @@ class Projection:
     ShapeError
         If the function does not return a tree like start.
     ValueError
-        If it is not affine or not idempotent at a few test points.
+        If the function is not affine or not idempotent at a few test points.
 
     Notes
     -----
-    The loss of P(x) is smooth where the loss is, and its gradient is P^T times the gradient of the loss. Where it is 0,
-    the point P(x) is stationary among all points of the range of P. This does not hold for other maps, such as np.clip.
+    loss(P(x)) is as smooth as the loss, and its gradient with respect to x is the transpose of the linear part of P
+    times the gradient of the loss at P(x). If this gradient is 0, then P(x) is a stationary point of the loss in the
+    range of P. For other maps, such as np.clip, this is not true.
     """
 
     def __init__(self, function: Callable[[Any], Any], packing: Packing, start: Any):
@@ -63,7 +64,7 @@ class Projection:
         self._compare(self._image(near), near, norm(near), "project(project(x)) is not project(x)")
 
     def result(self, vector: NDArray[np.float64]) -> Any:
-        """Return P of a flat point as a tree.
+        """Return P(x) as a tree, given x as a flat vector.
 
         Raises
         ------
@@ -77,7 +78,7 @@ class Projection:
         return self._projected(self._packing.unpack(vector))
 
     def loss(self, loss: Callable[..., Any]) -> Callable[..., Any]:
-        """Return the loss of P(x), given the loss of the user."""
+        """Return the function loss(P(x)), given the user's loss."""
 
         def loss_of_projection(x, *batch):
             return loss(self._function(x), *batch)
@@ -85,7 +86,7 @@ class Projection:
         return loss_of_projection
 
     def gradient(self, gradient: Callable[..., Any]) -> Callable[..., Any]:
-        """Return the gradient of the loss of P(x), given the gradient of the user's loss."""
+        """Return the gradient of loss(P(x)), given the gradient of the user's loss."""
 
         def gradient_of_projection(x, *batch):
             image, pull = vjp(self._function, x)
@@ -94,16 +95,16 @@ class Projection:
         return gradient_of_projection
 
     def _projected(self, x):
-        """Return P of a tree, with the entries of dicts in the order of the start."""
+        """Return P(x) for a tree x, with dict entries in the same order as in x."""
         entries = paired(self._function(x), x, "project(x)", advice="; return a tree like start", shapes=True)
         return flatten(x)[1](entries)
 
     def _image(self, vector):
-        """Return P of a flat point as a flat point."""
+        """Return P(x) as a flat vector, given x as a flat vector."""
         return self._packing.pack(self._projected(self._packing.unpack(vector)))
 
     def _compare(self, values, predicted, size, reason):
-        """Raise ValueError with a reason if two flat points differ by more than rounding."""
+        """Raise ValueError with the given reason if two flat vectors differ by more than the tolerance."""
         accuracy = max(ACCURACY, 1e3 * self._packing.eps)
         if not norm(values - predicted) <= accuracy * max(size, norm(predicted), norm(self._start)):
             raise ValueError(NOT_AFFINE.format(reason))

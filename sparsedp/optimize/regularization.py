@@ -1,4 +1,4 @@
-"""Regularization of cell fields: total variation and smoothness, without walls and obstacles."""
+"""Regularization of cell fields: total variation and smoothness. Slopes at walls and obstacles do not contribute."""
 
 from __future__ import annotations
 
@@ -25,38 +25,39 @@ if TYPE_CHECKING:
 
 __all__ = ["smoothness", "total_variation"]
 
-SAFE_SHARE = 2.0**-500  # of the largest slope: in units above it the square of the slope does not overflow
+SAFE_SHARE = 2.0**-500  # slopes are divided by at least this multiple of the largest one, so that squares are finite
 
 
 def total_variation(grid: Grid, eps: float, solid: ArrayLike | None = None) -> Callable[[Any], Any]:
-    """Build the total variation of a cell field: the integral of the size of its slope.
+    """Return a function that computes the smoothed total variation of a cell field, the integral of |grad u|.
 
-    As a penalty it removes oscillations and keeps edges.
+    As a penalty it removes oscillations and preserves edges.
 
     Parameters
     ----------
     grid : Grid
     eps : float
-        Slopes well above it count by their size, those below by their square: > 0 [unit / length].
+        Smoothing parameter, > 0 [unit / length]. The integrand is close to |grad u| where |grad u| is much larger than
+        eps, and close to |grad u|^2 / (2 eps) where it is much smaller.
     solid : bool array, shape `grid.shape`, optional
-        Cells that are excluded, with the jumps to them.
+        True for cells that are excluded. Slopes on their faces do not contribute.
 
     Returns
     -------
     callable
-        ``tv(u)`` takes u of shape `grid.shape` [unit] and returns a number [unit length^(dim - 1)], differentiable to
-        every order.
+        ``tv(u)`` takes u of shape `grid.shape` [unit] and returns a number [unit length^(dim - 1)]. It can be
+        differentiated to any order.
 
     Raises
     ------
     ValueError
-        If eps is not a number > 0, from 1e-150 to 1e150.
+        If eps is not a number between 1e-150 and 1e150.
     ShapeError
         If `solid` has another shape than the grid.
     TypeError
-        On use, if u is complex.
+        When the function is called, if u is complex.
     NonFiniteError
-        On use, if a slope is NaN or infinite.
+        When the function is called, if a slope is NaN or infinite.
 
     See Also
     --------
@@ -64,9 +65,10 @@ def total_variation(grid: Grid, eps: float, solid: ArrayLike | None = None) -> C
 
     Notes
     -----
-    The value is the sum over cells of volume (sqrt(g^2 + eps^2) - eps). g^2 is the sum over the axes of the mean of the
-    squared slopes on the faces of a cell that are neither walls nor at a solid: a ramp counts the same in the corner.
-    A jump across one face enters both of its cells by half, and counts sqrt(2) times its height.
+    The value is the sum over cells of volume (sqrt(g^2 + eps^2) - eps). Here g^2 is the sum over the axes of the mean
+    squared slope on those faces of the cell that are neither walls nor faces of a solid cell. Therefore a linear field
+    has the same g^2 in all cells, also next to walls. A jump across one face contributes to g^2 in both cells of the
+    face, each time as a mean of two faces; in total it counts sqrt(2) times its height.
 
     References
     ----------
@@ -79,44 +81,44 @@ def total_variation(grid: Grid, eps: float, solid: ArrayLike | None = None) -> C
     >>> print(f"{tv(np.array([0.0, 0.0, 3.0, 3.0])):.3f}")
     4.243
     """
-    if not (is_number(eps) and 1e-150 < eps < 1e150):  # its square is a number
+    if not (is_number(eps) and 1e-150 < eps < 1e150):  # so that eps^2 neither underflows nor overflows
         raise ValueError(f"total_variation needs eps > 0, a slope that counts as small, got {eps!r}")
     squared_slope, volumes = _squared_slope(grid, "total_variation", solid)
 
     def integral(u):
         square, unit = squared_slope(u, eps)
         scaled_eps = eps / unit
-        # The quotient equals sqrt(g^2 + eps^2) - eps and has no cancellation.
+        # This quotient equals sqrt(g^2 + eps^2) - eps, but avoids cancellation.
         return unit * anp.sum(volumes * square / (anp.sqrt(square + scaled_eps**2) + scaled_eps))
 
     return ReconstructibleFunction(integral, total_variation, grid, eps, constant(solid))
 
 
 def smoothness(grid: Grid, solid: ArrayLike | None = None) -> Callable[[Any], Any]:
-    """Build the smoothness of a cell field: half the integral of its squared slope.
+    """Return a function that computes half the integral of |grad u|^2 of a cell field, the squared H1 seminorm / 2.
 
-    As a penalty it spreads rough features.
+    As a penalty it favours smooth fields.
 
     Parameters
     ----------
     grid : Grid
     solid : bool array, shape `grid.shape`, optional
-        Cells that are excluded, with the jumps to them.
+        True for cells that are excluded. Slopes on their faces do not contribute.
 
     Returns
     -------
     callable
-        ``h1(u)`` takes u of shape `grid.shape` [unit] and returns a number [unit^2 length^(dim - 2)], differentiable to
-        every order.
+        ``h1(u)`` takes u of shape `grid.shape` [unit] and returns a number [unit^2 length^(dim - 2)]. It can be
+        differentiated to any order.
 
     Raises
     ------
     ShapeError
         If `solid` has another shape than the grid.
     TypeError
-        On use, if u is complex.
+        When the function is called, if u is complex.
     NonFiniteError
-        On use, if a squared slope is NaN or beyond 1.8e308.
+        When the function is called, if a squared slope is NaN or overflows.
 
     See Also
     --------
@@ -142,11 +144,10 @@ def smoothness(grid: Grid, solid: ArrayLike | None = None) -> Callable[[Any], An
 
 
 def _squared_slope(grid, name, solid):
-    """Return a function that computes the squared slope of a field in each cell, and the volumes of the cells.
+    """Return a function that computes the squared slope g^2 of a field in each cell, and the volumes of the cells.
 
-    The volume of a solid cell is 0. The function takes a field and optionally a slope that counts as small. It returns
-    the squared slope divided by the square of a power of two, and that power: near the small slope, or larger where a
-    square would overflow; 1 without a small slope.
+    Solid cells get volume 0. The function ``squared_slope(u, small=None)`` returns g^2 / unit^2 and `unit`. If `small`
+    is given, `unit` is a power of two near `small`, or larger if the squares would overflow; otherwise it is 1.
     """
     check_grid(name, grid)
     slope = gradient(grid)
@@ -156,7 +157,7 @@ def _squared_slope(grid, name, solid):
     faces = cell_and_face.col
     axis_of_face = np.repeat(np.arange(grid.dim), np.diff(grid.faces.offsets))
     cell_and_axis = grid.dim * cells + axis_of_face[faces]
-    weights = 1 / np.bincount(cell_and_axis)[cell_and_axis]  # of a mean over the faces of a cell along an axis
+    weights = 1 / np.bincount(cell_and_axis)[cell_and_axis]  # weights of the mean over the open faces along an axis
     matrix = sp.csr_array((weights, (cells, faces)), cell_and_face.shape)
     mean = from_matrix(matrix, grid.faces, grid.cells, name="mean over faces")
     volumes = grid.volumes

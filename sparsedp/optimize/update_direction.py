@@ -1,4 +1,4 @@
-r"""Update directions J^T (J J^T + damping)^(-power) g between the gradient and Gauss-Newton."""
+r"""Update directions J^T (J J^T + damping I)^(-power) g, which include gradient descent and Gauss-Newton."""
 
 from __future__ import annotations
 
@@ -25,25 +25,26 @@ if TYPE_CHECKING:
 
 __all__ = ["Direction", "DirectionFamily", "forms_jacobian", "update_direction"]
 
-FORMS = {"auto": None, "dense": True, "krylov": False}  # whether the Jacobian is formed; None: if it is small
-SETTLED = 1e-9  # relative change of the direction at which the bidiagonalization stops
-EXHAUSTED = 1e-13  # relative size below which a new basis vector is rounding
-CANCELLED = 0.1  # a vector that keeps less than this share in a pass of Gram-Schmidt gets a second pass
-FIRST_COMPARISON = 4  # step of the bidiagonalization after which the direction is first computed, by an SVD
-ROW_BLOCK = 32  # rows of a basis for which memory is allocated at a time
-SHOWN = 5  # singular values in the text of a direction
+FORMS = {"auto": None, "dense": True, "krylov": False}  # whether the Jacobian is formed; None: only if it is small
+SETTLED = 1e-9  # the bidiagonalization stops when the relative change of the direction is below this
+EXHAUSTED = 1e-13  # a new basis vector of relative norm below this consists of rounding errors
+CANCELLED = 0.1  # Gram-Schmidt is repeated for vectors whose norm it reduces below this fraction
+FIRST_COMPARISON = 4  # number of bidiagonalization steps before the direction is computed for the first time
+ROW_BLOCK = 32  # number of basis vectors for which memory is allocated at a time
+SHOWN = 5  # number of singular values that str() of a direction shows
 
 
 class Direction(NamedTuple):
-    """An update direction and the singular values from which it was built.
+    """An update direction and the singular values from which it was computed.
 
     Attributes
     ----------
     step : tree like x, or (n,) array
+        The direction.
     spectrum : array
-        The singular values that were computed, largest first.
+        The computed singular values of J, in descending order.
     kept : int
-        How many of them were used.
+        The number of singular values that were used, that is, not truncated.
     method : str
         "dense" or "krylov".
     """
@@ -70,17 +71,17 @@ class DirectionFamily:
     power : float
         From 0 to 1.
     damping : float
-        >= 0, added to the squares of the singular values.
+        >= 0, added to the squared singular values.
     truncation : float
-        Singular values below this share of the largest are ignored.
+        Singular values below this multiple of the largest one are ignored.
     rank : int, optional
-        Most steps of the bidiagonalization. Default: until the direction has settled.
+        Maximum number of bidiagonalization steps. Default: iterate until the direction has converged.
 
     Notes
     -----
-    Where J is formed, its singular values come group by group from Gram matrices, as exact as from an SVD. Otherwise
-    the bidiagonalization of Golub and Kahan with full reorthogonalization needs products with J and J^T alone, and
-    memory rank (m + n).
+    If J is formed, its singular values are computed from Gram matrices, in groups of similar size, with the accuracy of
+    an SVD. Otherwise the Golub-Kahan bidiagonalization with full reorthogonalization is used. It needs only products
+    with J and J^T, and memory for rank (m + n) numbers.
     """
 
     def __init__(self, power: float = 0.75, damping: float = 0.0, truncation: float = 1e-10, rank: int | None = None):
@@ -92,15 +93,15 @@ class DirectionFamily:
             self.rank = check_whole("rank", rank, 1, "; leave it out for no limit")
 
     def __call__(self, linearization: Linearization, g: NDArray[np.float64]) -> Direction:
-        """Return the flat direction for a flat cotangent g of the outputs."""
+        """Return the direction for a cotangent g of the outputs, both as flat arrays."""
         if linearization.dense:
             return self.dense(linearization.jacobian(), g)
         return self.krylov(linearization, g)
 
     def dense(self, jacobian: NDArray[np.float64], g: NDArray[np.float64]) -> Direction:
-        """Return the direction from J itself, m x n.
+        """Return the direction, given the matrix J of shape m x n.
 
-        It is (J^T J + damping)^(-power) J^T g, or the same with J J^T where that is smaller.
+        It is (J^T J + damping I)^(-power) J^T g, or J^T (J J^T + damping I)^(-power) g if m <= n.
         """
         jacobian_unit = safe_unit(largest(jacobian))
         g_unit = safe_unit(largest(g))
@@ -119,13 +120,14 @@ class DirectionFamily:
         return Direction(self._in_units(step, jacobian_unit, g_unit), jacobian_unit * s, kept, "dense")
 
     def krylov(self, linearization: Linearization, g: NDArray[np.float64]) -> Direction:
-        """Return the direction from products with J and J^T.
+        """Return the direction, computed from products with J and J^T only.
 
         Notes
         -----
-        The bidiagonalization that starts with g gives J Q = P B with orthonormal P, Q and a lower bidiagonal B of one
-        row more than columns. The direction is Q (B^T B + damping)^(-power) B^T P^T g: exact after min(m, n) steps, and
-        usually settled long before. The part of g outside the range of J stays in P and has no effect.
+        The bidiagonalization with starting vector g gives J Q = P B, where P and Q have orthonormal columns and B is
+        lower bidiagonal, with one more row than columns. The direction is Q (B^T B + damping I)^(-power) B^T P^T g. It
+        is exact after min(m, n) steps, and usually converges much earlier. The component of g orthogonal to the range
+        of J has no effect.
 
         References
         ----------
@@ -140,7 +142,7 @@ class DirectionFamily:
         next_comparison = FIRST_COMPARISON
         weights = np.zeros(0)
         g_length = left.add(g)
-        entries: list[float] = []  # of B: diagonal, below it, diagonal, ...
+        entries: list[float] = []  # entries of B, alternating: on the diagonal, below the diagonal
         while len(entries) < 2 * most_steps:
             if len(entries) % 2 == 0:
                 entry = right.add(linearization.vjp(left.last))
@@ -160,7 +162,7 @@ class DirectionFamily:
         return Direction(weights @ right.rows[: len(weights)], s, kept, "krylov")
 
     def _from_bidiagonal(self, g_length, entries):
-        """Return the direction in the basis Q, the singular values of B, and how many of them were used."""
+        """Return the coefficients of the direction in the basis Q, the singular values of B, and the number used."""
         place = np.arange(len(entries))
         steps = (len(entries) + 1) // 2
         bidiagonal = np.zeros((steps + 1, steps))
@@ -172,21 +174,21 @@ class DirectionFamily:
         return self._in_units(step, unit, g_length), unit * s, kept
 
     def _in_units(self, step, jacobian_unit, g_unit):
-        """Return the direction for J times jacobian_unit and g times g_unit, given that for J and g."""
+        """Rescale a direction that was computed from J / jacobian_unit and g / g_unit to that of J and g."""
         return step * g_unit * jacobian_unit ** (1.0 - 2.0 * self.power)
 
     def _factors(self, s, unit):
-        """Return (s^2 + damping / unit^2)^(-power), 0 for ignored singular values, and how many are used."""
+        """Return (s^2 + damping / unit^2)^(-power), or 0 for truncated singular values, and the number of others."""
         used = (s > self.truncation * np.max(s, initial=0.0)) & (s > 0)
         factors = np.zeros_like(s)
-        with np.errstate(over="ignore"):  # a damping that is large beside J gives a step of 0
+        with np.errstate(over="ignore"):  # if the damping is much larger than J, it overflows and the step is 0
             damping = np.sqrt(self.damping) / np.float64(unit)
         factors[used] = np.hypot(s[used], damping) ** (-2 * self.power)
         return factors, int(np.count_nonzero(used))
 
 
 class _OrthonormalRows:
-    """Orthonormal rows; memory is allocated in blocks."""
+    """A growing set of orthonormal vectors, stored as rows; memory is allocated in blocks."""
 
     last: NDArray[np.float64]
 
@@ -199,9 +201,9 @@ class _OrthonormalRows:
         return self._memory[: self._count]
 
     def add(self, vector):
-        """Append the normalized part of a vector that is orthogonal to the rows, and return the length of that part."""
+        """Orthogonalize a vector against the rows, append it normalized, and return its norm before normalization."""
         rest = vector - (self.rows @ vector) @ self.rows
-        if length(rest) <= CANCELLED * length(vector):  # a second pass removes the rounding
+        if length(rest) <= CANCELLED * length(vector):  # repeat, because cancellation left rounding errors
             rest = rest - (self.rows @ rest) @ self.rows
         if self._count == len(self._memory):
             self._memory = np.concatenate([self._memory, np.empty((ROW_BLOCK, vector.size))])
@@ -213,7 +215,7 @@ class _OrthonormalRows:
 
 
 def forms_jacobian(form: str) -> bool | None:
-    """Return whether a form of the direction forms the Jacobian; None: if it is small."""
+    """Return whether the Jacobian is formed for a value of the option `form`; None: only if it is small."""
     check_choice("method", form, FORMS)
     return FORMS[form]
 
@@ -226,28 +228,31 @@ def update_direction(
     apart: bool = False,
     **options: Any,
 ) -> Direction:
-    """Compute the direction J^T (J J^T + damping)^(-power) g, with the spectrum of J.
+    """Compute the update direction J^T (J J^T + damping I)^(-power) g, and the singular values of J.
 
     Parameters
     ----------
     outputs : callable
-        ``outputs(x)`` returns an array of m numbers; J is its Jacobian at x.
-    x : array, or any nesting of them
-        With n floating numbers.
+        ``outputs(x)`` returns an array y of m numbers. J is its Jacobian at x.
+    x : array, or any nesting of arrays
+        Contains n floating-point numbers.
     g : array like outputs(x), optional
-        The cotangent, dL/dy. Default: the outputs themselves, the gradient of half their sum of squares.
+        The gradient dL/dy of a loss L with respect to the outputs. Default: y itself, which is the gradient of half the
+        sum of squares of y.
     method : "auto", "dense" or "krylov"
-        Whether J is formed; "auto": if it is small.
+        "dense" computes the matrix J; "krylov" uses products with J and J^T only. "auto" selects "dense" if J is small.
     apart : bool
         As in `minimize`.
     **options
-        power=0.75, damping=0.0; truncation=1e-10: singular values below this share of the largest are ignored;
-        rank=None: the most that are used.
+        The exponent ``power=0.75`` and ``damping=0.0`` in the formula above. ``truncation=1e-10``: singular values
+        below this multiple of the largest one are ignored. ``rank=None``: maximum number of bidiagonalization steps of
+        the method "krylov".
 
     Returns
     -------
     Direction
-        `.step`, a tree like x; `.spectrum`, `.kept`, `.method`; str() shows the spectrum. Update x <- x - rate step.
+        The direction `step`, a tree like x, to be used as x <- x - rate step; also `spectrum`, `kept` and `method`.
+        str() of the result shows the singular values.
 
     Raises
     ------
@@ -262,9 +267,10 @@ def update_direction(
 
     Notes
     -----
-    With the singular values s of J the gradient J^T g is multiplied by (s^2 + damping)^(-power) in each singular
-    direction. power 0: the gradient. 1/2: all directions equally far. 3/4: half-inverse gradients, the part of g in
-    each direction times s^(-1/2). 1: Gauss-Newton, or Levenberg-Marquardt with damping.
+    In each singular direction of J, with singular value s, the gradient J^T g is multiplied by
+    (s^2 + damping)^(-power). Special cases are power=0, the gradient; power=0.5, where the step length in a singular
+    direction does not depend on s; power=0.75, half-inverse gradients; and power=1, Gauss-Newton, or
+    Levenberg-Marquardt if the damping is positive.
 
     References
     ----------
