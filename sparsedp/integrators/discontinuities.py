@@ -1,18 +1,18 @@
-"""Jumps, pulses and steep layers of a rate inside a step with error control.
+"""Detection of jumps, pulses and steep layers of a rate inside a step with error control.
 
-An error estimate compares evaluations of the rate at a few times. Between them it sees nothing: backward Euler, whole
-and in halves, never evaluates the rate at the start of a step. So the rate is also evaluated at both ends and in the
-middle of each step, and where it depends on the time at further times in between. Where nearly all of its change lies
-in a small part of the step, this part is divided into eight, the one with the largest deviation from an even change is
-divided again, and so on. In each division the deviation falls by 64 for a smooth rate, by 8 at a kink, and not at all
-at a jump.
+An error estimate compares evaluations of the rate at a few times, and misses changes between them. For example,
+backward Euler never evaluates the rate at the start of a step. So the rate is also evaluated at both ends and in the
+middle of each step and, if it depends on the time, at more times in between. If nearly all of its change lies in a
+small part of the step, this part is divided into eight parts. The one with the largest deviation from a uniform change
+is divided again, and so on. Each division reduces this deviation by a factor of 64 for a smooth rate, by 8 at a kink,
+and by 1 at a jump.
 
-A step across a jump of size J is refused until length * J is below the tolerance, a step across a layer until it is
-resolved. Values then meet the tolerance. The derivative of steps across a jump lacks a term, J times the derivative of
-the time of the jump, for every choice of steps: it is refused.
+A step across a jump of size J is rejected until length * J is less than the tolerance, and a step across a steep layer
+until the layer is resolved. Values then meet the tolerance. The derivative of steps across a jump lacks a term for
+every choice of steps, namely J times the derivative of the time of the jump, so that a DerivativeError is raised.
 
-Between the known states of a step the path is a straight line. It is not the solution; but a continuous rate is
-continuous along it, too.
+Between the known states of a step, states are interpolated linearly. The interpolant is not the solution, but a
+continuous rate is continuous along it.
 """
 
 from __future__ import annotations
@@ -53,21 +53,21 @@ REFUSALS = UnstableStepError, NonFiniteError, ConvergenceError
 
 
 class RateInspector:
-    """Looks at the rate inside the steps over one interval.
+    """Searches for jumps, pulses and steep layers of the rate inside the steps over one interval.
 
     Parameters
     ----------
     scheme : Adaptive
     params, t, h
-        Of the interval, plain.
+        Params, start and length of the interval; plain values.
 
     Attributes
     ----------
     jumps : list of pairs
-        (time, whether it jumps in time) for each jump in an accepted step.
+        For each jump in an accepted step its time, and whether the rate jumps in time (not with the state).
     resolution : list of pairs
-        For each step that was searched the error of the change of the rate by the quadrature of the scheme, and the
-        change.
+        For each step that was searched the change of the rate, second, and the error, first, with which the quadrature
+        formula of the scheme integrates the derivative of the rate.
     """
 
     def __init__(self, scheme: Any, params: Any, t: Any, h: Any) -> None:
@@ -91,7 +91,7 @@ class RateInspector:
         return [np.asarray(leaf) for leaf in leaves(self.problem(u, self.params, time))]
 
     def rate_at_state(self, u: Any, time: Any) -> Any:
-        """Return the rate at one of the last states of the steps, evaluated once."""
+        """Return the rate at a state of a step; cached for the last three states."""
         for state, rate in self.recent:
             if state is u:
                 return rate
@@ -102,7 +102,7 @@ class RateInspector:
     # ------------------------------------------------------------ steps before they are accepted
 
     def shorter_share(self, step: Any) -> float | None:
-        """Return the share of its length to which a step has to be shortened, or None: it is accepted."""
+        """Return the fraction of its length to which a step must be shortened, or None if it is accepted."""
         self.evaluations += EVALUATIONS
         try:
             with np.errstate(all="ignore"):
@@ -114,7 +114,7 @@ class RateInspector:
             return None
 
     def _share_by_changes(self, path: _StepPath) -> float | None:
-        """Search the larger one of both changes, and probe in between."""
+        """Search the half of the step in which the rate changes more, then evaluate the rate at further times."""
         first, last = path.norms(path.changes)
         if max(first, last) > UNEVEN * min(first, last) and max(first, last) > NEGLIGIBLE * path.scale:
             start, stop = (0.0, path.between) if first > last else (path.between, 1.0)
@@ -124,7 +124,7 @@ class RateInspector:
         return self._share_by_probes(path, first + last)
 
     def _share_by_probes(self, path: _StepPath, change: float) -> float | None:
-        """Evaluate a rate that depends on the time in between: it may have a pulse there."""
+        """Evaluate a rate that depends on the time at further times inside a step, to detect pulses."""
         if not self.scheme.takes_time:
             return None
         count = int(min(np.ceil(path.length / GAP), EFFORT * self.evaluations - self.probes))
@@ -151,7 +151,7 @@ class RateInspector:
         return None
 
     def _share_by_search(self, path: _StepPath, start: float, stop: float) -> float | None:
-        """Locate the change of the rate between two shares of a step, and return the share that resolves it."""
+        """Locate the change of the rate between two positions in a step; return the fraction that resolves it."""
         change = steepest_change(path, start, stop)
         if change is None or change.size <= self._rounding(path):
             return None
@@ -181,7 +181,7 @@ class RateInspector:
         return NOISE * largest
 
     def _record_jump(self, path: _StepPath, change: _Change) -> None:
-        """Keep the time of a jump, and whether the rate jumps in time when the state is held."""
+        """Record the time of a jump, and whether the rate also jumps in time if the state is constant."""
         start, stop = change.start, change.stop
         is_in_time = False
         if self.scheme.takes_time:
@@ -197,7 +197,7 @@ class RateInspector:
     # ------------------------------------------------------------ steps with a derivative
 
     def search(self, step: Any) -> None:
-        """Look for smaller jumps, and for layers that are not resolved, in an accepted step."""
+        """Search an accepted step for smaller jumps, and for steep layers that the steps do not resolve."""
         self.resolution.append((0.0, 0.0))
         try:
             with np.errstate(all="ignore"):
@@ -236,7 +236,7 @@ class RateInspector:
         return 0.0, 0.0
 
     def unresolved_step(self) -> int | None:
-        """Return the number of the step where the rate changes faster than steps resolve, or None."""
+        """Return the index of a step in which the rate changes faster than the steps resolve, or None."""
         errors, changes = np.array(self.resolution).T
         window = np.ones(min(WINDOW, len(errors)))
         total = np.convolve(changes, window, "same")
@@ -248,7 +248,7 @@ class RateInspector:
 
 
 class _StepPath:
-    """The states of a step along straight lines, and the rates there.
+    """Linear interpolation of the states of a step, and the rates at the interpolated states.
 
     Parameters
     ----------
@@ -260,13 +260,13 @@ class _StepPath:
     Attributes
     ----------
     length, done : float
-        As shares of the interval.
+        Length of the step and time before it, as fractions of the interval.
     between : float
-        Share of the step at which a state inside it is known.
+        Position of the known state inside the step, as a fraction of the step.
     changes : list of arrays
-        Of the rate, up to there and from there on, along a first axis.
+        Changes of the rate between successive known states, along the first axis.
     scale : float
-        The largest of the rates.
+        Largest norm of the rates at the known states.
     """
 
     def __init__(self, inspector: RateInspector, step: Any, is_straight: bool = False) -> None:
@@ -301,7 +301,7 @@ class _StepPath:
         return float(self.norms([row[None] for row in rate])[0])
 
     def state(self, share: float) -> Any:
-        """Return the state at a share, on straight lines between the known states."""
+        """Return the state at a fraction of the step, by linear interpolation of the known states."""
         if share in self.trees:
             return self.trees[share]
         late = int(len(self.places) > 2 and share > self.between)
@@ -335,7 +335,7 @@ class _StepPath:
 
 
 class _Change(NamedTuple):
-    """A change of a rate: its size, the shares of the step between which it is, and whether it is a jump."""
+    """A change of a rate: its size, its start and stop as fractions of the step, and whether it is a jump."""
 
     size: float
     start: float
@@ -344,19 +344,19 @@ class _Change(NamedTuple):
 
 
 def steepest_change(path: _StepPath, start: float, stop: float, is_thorough: bool = False) -> _Change | None:
-    """Locate where a rate changes most unevenly between two shares of a step.
+    """Locate the steepest change of a rate between two positions in a step (fractions of the step).
 
     Parameters
     ----------
     path : _StepPath
     start, stop : float
     is_thorough : bool
-        Look for jumps that are smaller than the smooth change between the shares.
+        Also search for jumps that are smaller than the smooth change between the two positions.
 
     Returns
     -------
     _Change or None
-        A jump, or a layer; None: the rate is smooth there.
+        A jump or a steep layer; None if the rate is smooth there.
     """
     last_size = 0.0
     steady = 0

@@ -1,9 +1,9 @@
-"""Jacobians of a small function at many points, by reverse mode.
+"""Jacobians of a small function at many points, in reverse mode.
 
-A tape is traversed once, with all cotangents side by side along a last axis; and tapes of the same calls are traversed
-together, side by side along the axis before it. The time of a small function is the overhead of Python for each call,
-which is then spent once. Where a call is not known here its cotangents are propagated one after the other, and its tape
-by itself.
+All rows of a Jacobian are computed in one backward pass over a tape, with the cotangents batched along the last axis.
+Tapes with the same calls (at different points) are also processed together, batched along the axis before it. For a
+small function most of the time is the overhead of Python for each call, which batching divides by the batch size. If a
+call is not supported here, its cotangents are propagated one after the other, and its tape is not batched with others.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["jacobians_of"]
 
-# Functions of each entry, and those that select entries of one array: copied, omitted, or in another order.
+# Elementwise functions. SELECTIONS below are functions whose result consists of entries of one array.
 ENTRYWISE = {
     anp.add,
     anp.subtract,
@@ -47,25 +47,27 @@ ENTRYWISE = {
     anp.minimum,
     anp.where,
 }
-PLACES = ITEM, ARRAY  # their pullbacks act on the first axes: more axes at the end do not matter
+PLACES = ITEM, ARRAY  # the pullbacks of these act on the first axes, so that batch axes may follow
 SELECTIONS = {ITEM, anp.reshape, anp.ravel, anp.roll, anp.repeat, anp.transpose}
 
 
 def jacobians_of(fun: Callable, trees: Sequence, moving: Sequence[bool]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values of a function at many trees of floating values, and its derivatives in the moving leaves.
+    """Return the values and the Jacobians of a function at several points, each of which is a tree.
 
     Parameters
     ----------
     fun : callable
-        ``fun(tree)``: a tree of m real numbers in all.
+        ``fun(tree)`` returns a tree with m real numbers in total.
     trees : list of trees
-        Of the same structure and shapes; plain.
+        The points: plain trees of equal structure and shapes.
     moving : list of bool
         For each leaf, whether it is differentiated.
 
     Returns
     -------
-    (array (trees, m), array (trees, m, differentiated numbers))
+    values : array, shape (number of trees, m)
+    jacobians : array, shape (number of trees, m, k)
+        Derivatives with respect to the k entries of the differentiated leaves.
 
     Examples
     --------
@@ -73,7 +75,7 @@ def jacobians_of(fun: Callable, trees: Sequence, moving: Sequence[bool]) -> tupl
     >>> rows.tolist()
     [[[5.0, 2.0], [1.0, 0.0]]]
     """
-    batched_calls: dict = {}  # of nodes whose own pullbacks do not take many cotangents: see `_batched`
+    batched_calls: dict = {}  # node whose own pullback does not accept batched cotangents -> result of `_batched`
 
     def witness(node: Any, fun: Any, *call: Any) -> None:
         if not (node.vjp in by_entry or (node.held and fun in PLACES)):
@@ -93,7 +95,7 @@ def jacobians_of(fun: Callable, trees: Sequence, moving: Sequence[bool]) -> tupl
 
 
 def _groups(tapes: list, batched_calls: dict) -> list[list[int]]:
-    """Return the numbers of tapes that are traversed together."""
+    """Return groups of indices of tapes that can be processed together."""
     if len(tapes) == 1:
         return [[0]]
     groups: list[tuple[list, list[int]]] = []
@@ -109,7 +111,7 @@ def _groups(tapes: list, batched_calls: dict) -> list[list[int]]:
 
 
 def _kinds(tape: Any, batched_calls: dict) -> list:
-    """Return the kinds of the calls of a tape, and of which results these are: equal for tapes of one group."""
+    """Return a description of the calls of a tape and their arguments, which is equal for tapes of one group."""
     places: dict = {node: place for place, node in enumerate((None, *tape.roots, *tape.nodes))}
     kinds: list = [places[end] for end in tape.ends]
     for node in tape.nodes:
@@ -126,10 +128,10 @@ def _kinds(tape: Any, batched_calls: dict) -> list:
 
 
 def _rows(tapes: list, size: int, batched_calls: dict) -> list:
-    """Return for each root the derivatives of all numbers of the result, (*shape, tapes, size), or None."""
+    """Return for each root the derivatives of all entries of the result, of shape (*shape, tapes, size), or None."""
     count = len(tapes)
     first = tapes[0]
-    sums: dict = {}  # (sum so far, whether it may be written to)
+    sums: dict = {}  # node -> (sum of its cotangents, whether the sum may be modified in place)
 
     def add(parent: Any, g: Any) -> None:
         total, is_ours = sums.get(parent, (None, False))
@@ -165,7 +167,7 @@ def _rows(tapes: list, size: int, batched_calls: dict) -> list:
 
 
 def _pulled(nodes: Sequence, g: Any, batched_calls: dict) -> Any:
-    """Return the cotangents of the parents of calls of one kind, from those of their results."""
+    """Return the batched cotangents of the arguments of a group of equal calls, given those of their results."""
     node = nodes[0]
     if node not in batched_calls:
         return node.vjp(g, *_side_by_side([node.held for node in nodes]))
@@ -181,22 +183,22 @@ def _pulled(nodes: Sequence, g: Any, batched_calls: dict) -> Any:
 
 
 class Several(list):
-    """Cotangents of a call with several results, one after the other: they have no common shape."""
+    """List of the cotangents of a call with several results, which cannot be stacked to one array."""
 
     def __add__(self, other: Any) -> Several:
-        """Return the sum, entry by entry."""
+        """Return the elementwise sum."""
         return Several(added((one, False), two)[0] for one, two in zip(self, other, strict=True))
 
 
 def _joined(column: list) -> Any:
-    """Return cotangents of one tape, side by side."""
+    """Stack the cotangents of one tape along the batch axes."""
     if isinstance(column[0], (tuple, list)):
         return Several(column)
     return np.stack(column, -1)[..., None, :]
 
 
 def _side_by_side(rows: Sequence) -> list:
-    """Return the values that calls of a function hold, side by side."""
+    """Stack the `held` values of several calls of one function along the batch axes."""
     columns: list = []
     for column in zip(*rows, strict=True):
         x = column[0]
@@ -207,7 +209,7 @@ def _side_by_side(rows: Sequence) -> list:
     return columns
 
 
-# ---- calls that take many cotangents ---------------------------------------------------------------------------------
+# ---- calls with batched cotangents -----------------------------------------------------------------------------------
 
 
 def _batched(node: Any, fun: Any, value: Any, args: Any, options: Any, nums: Any) -> tuple | None:
@@ -216,12 +218,12 @@ def _batched(node: Any, fun: Any, value: Any, args: Any, options: Any, nums: Any
     Returns
     -------
     kind : list
-        Equal for calls that can be traversed together.
+        Equal for calls that can be processed together.
     held : sequence
-        The values of this call.
+        The values that the pullback of this call needs.
     act : callable
-        ``act(g, rows)``: from cotangents (*shape of the value, calls, many) and the held values of each call, those of
-        the arguments.
+        ``act(g, rows)`` returns the cotangents of the arguments. `g` has the shape (*shape of the result, calls,
+        cotangents), and `rows` are the `held` values of each call.
     """
     traced = [args[num] for num in nums]
     if any(type(x) not in REAL or dtype_of(x) is not FLOAT for x in (value, *traced)):
@@ -247,7 +249,7 @@ def _batched(node: Any, fun: Any, value: Any, args: Any, options: Any, nums: Any
 
 
 def _entrywise(node: Any, fun: Any, value: Any, args: Any, nums: Any, shapes: list) -> tuple:
-    """Multiply by the slope in each entry; broadcast arguments are summed."""
+    """Return the batched form of an elementwise function: a product with its derivative, summed if broadcast."""
     shape = np.shape(value)
     if all(other == shape for other in shapes):
         slopes = node.vjp(np.ones(shape), *node.held)
@@ -270,7 +272,7 @@ def _summed(g: np.ndarray, shape: tuple) -> np.ndarray:
 
 
 def _selection(fun: Any, args: Any, options: Any, nums: Any, shape: tuple) -> tuple:
-    """Add to the entries that were selected, by their numbers."""
+    """Return the batched form of a function that selects entries: cotangents are added to the selected entries."""
     numbers = np.arange(int(np.prod(shape))).reshape(shape)
     arguments = [numbers if num in nums else arg for num, arg in enumerate(args)]
     places = np.asarray(fun.fun(*arguments, **options))

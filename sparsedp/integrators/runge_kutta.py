@@ -1,33 +1,36 @@
-"""Runge-Kutta steps: explicit ones by a table of numbers, implicit ones by a few stages x of x = b + h f(x, t).
+"""Runge-Kutta steps: explicit ones from a table of weights, implicit ones from stages x that solve x = b + h f(x, t).
 
-Where the rate is c L u and nothing else, an explicit step of order p in p stages is the Taylor polynomial of order p of
-exp(z L), z = h c, times u: one node on the tape. Horner's rule would take two to three times as long.
+If the rate is c L u only, an explicit step of order p with p stages is u times the Taylor polynomial of order p of
+exp(z L), with z = h c. Such a step is one node on the tape; with a node for each stage of Horner's rule it would take
+two to three times as long.
 
-Implicit: backward Euler, Crank-Nicolson, TR-BDF2, imex. A linear problem, f = c L x + s(t), solves
-x = (1 - h c L)^-1 (b + h s); a nonlinear one finds the root.
+The implicit methods are backward Euler, Crank-Nicolson, TR-BDF2 and imex. In a linear problem, f = c L x + s(t), a
+stage is the linear solve x = (1 - h c L)^-1 (b + h s). In a nonlinear problem a stage is found by Newton's method.
 
 Crank-Nicolson is x = 2 w - u with w = (1 - z/2 L)^-1 (u + h/4 (s_0 + s_1)): one solve, no product with L.
 TR-BDF2 takes Crank-Nicolson over g h, g = 2 - sqrt(2), then x = b + d h f(x) with d = g/2 and
 b = u + (y - u) / (g (2 - g)): both stages have the same factor 1 - d z L.
 
-imex, for u' = c L u + N(u, t) + s(t), is ARS(2,2,2), order 2, with the L-stable implicit part d = 1 - 1/sqrt(2),
-e = 1 - 1/(2 d), z = c h. A source s(t) belongs to the operator, as the boundary values that it carries: it is implicit,
-at the time of each stage,
+imex, for u' = c L u + N(u, t) + s(t), is the method ARS(2,2,2) of order 2, whose implicit part is L-stable, with
+d = 1 - 1/sqrt(2), e = 1 - 1/(2 d), z = c h. The source s(t) is treated implicitly like the operator, because it usually
+contains the boundary values of the operator. It is evaluated at the time of each stage,
 
     x1 = u + h d N(u) + d (z L x1 + h s(t + d h)),
     x2 = u + h (e N(u) + (1 - e) N(x1)) + (1 - d) (z L x1 + h s(t + d h)) + d (z L x2 + h s(t + h)),
 
-two solves with one factor; z L x1 + h s is taken from the first equation, without a product.
+These are two solves with the same factorisation. z L x1 + h s is computed from the first equation, without a product
+with L.
 
-The linear solve of all of them is x of (1 - z L) x = b, differentiable in z and b. With S = (1 - z L)^-1 and x = S b,
+All linear stages solve (1 - z L) x = b, and are differentiable in z and b. With S = (1 - z L)^-1 and x = S b,
 
     dx = S (db + dz L x),          so with y = S^T g:   b_bar = y,   z_bar = y . L x.
 
-The transposed solve is a rule of the same form with L^T: derivatives of every order follow. One set-up
-serves all stages, steps and adjoint solves of one z. For z = 0, x is b, and nothing is set up or solved.
+The transposed solve is a rule of the same form with L^T, so that derivatives of every order exist. One set-up is used
+for all stages, steps and adjoint solves with the same z. For z = 0 the result is b, without set-up or solve.
 
-The null space of L (the mean, where nothing flows through the walls) is separated before the solve and added
-after it: 1 - z L has the eigenvalue 1 there beside those of size z |L|, and would lose it to rounding.
+The component of b in the null space of L (the mean, if there is no flux through the walls) is removed before the solve
+and added to the result. In this component 1 - z L has the eigenvalue 1, while other eigenvalues are of size z |L|, so
+that the solve would lose digits of it.
 
 References
 ----------
@@ -86,9 +89,9 @@ class Scheme:
     Attributes
     ----------
     order : int
-        Of accuracy in time.
+        Order of accuracy in time.
     dyadic : bool
-        Whether error control takes halves of halves of an interval, so that few set-ups are needed.
+        Whether error control restricts step lengths to an interval divided by powers of two, to need few set-ups.
     info : SolveLog or None
         Records of the last solves and set-up.
     """
@@ -106,14 +109,14 @@ class Scheme:
 
 
 class Table(NamedTuple):
-    """Weights of a Runge-Kutta step of order p in p stages.
+    """Weights of an explicit Runge-Kutta step of order p with p stages.
 
     Attributes
     ----------
     stages : tuple
-        For each stage after the first, its weights of the earlier rates.
+        For each stage after the first, the weights of the rates of earlier stages.
     weights : tuple
-        Of the result.
+        Weights of the rates in the result.
     order : int
     reach : float
         Length of the stable interval on the negative real axis.
@@ -141,7 +144,7 @@ class Explicit(Scheme):
         super().__init__(problem, name, self.table.order)
 
     def __call__(self, u: Any, params: Any, t: Any, h: Any, first: Any = None) -> Any:
-        """Return the state after a step; `first`: the rate at its start, if it is known."""
+        """Return the state after a step; `first` is the rate at its start, if the caller has evaluated it."""
         rates = [self.problem(u, params, t) if first is None else first]
         for row in self.table.stages:
             rates.append(self.problem(_advanced(u, h, row, rates), params, later(t, sum(row) * h)))
@@ -172,7 +175,7 @@ class Polynomial(Scheme):
 
 
 def taylor(op: Operator, name: str, order: int, power: int = 0) -> Rule:
-    """Return the rule of L^power T_order(z L) u in (z, u), with the Taylor polynomial T of the exponential.
+    """Return the rule of (z, u) for L^power T_order(z L) u, with the Taylor polynomial T of the exponential.
 
     Its derivative in z is the same rule with order - 1 and power + 1.
     """
@@ -184,7 +187,7 @@ def taylor(op: Operator, name: str, order: int, power: int = 0) -> Rule:
     slope = partial(taylor, op, name, order - 1, power + 1)
 
     def forward(z: Any, u: Any) -> Any:
-        z = float(z)  # a NumPy scalar would round float32
+        z = float(z)  # a Python float, so that products with float32 fields are computed in float32
         if order >= 0:
             total = u
         else:
@@ -245,19 +248,19 @@ def family(name: str, forward: Callable, slope: Callable[[], Rule], transposed: 
 
 
 class Resolvent:
-    """Solves (1 - z L) x = b, with z >= 0 a number and b a field on the domain of L.
+    """Solves (1 - z L) x = b for a number z >= 0 and a field b on the domain of L.
 
     Parameters
     ----------
     op : Operator
         L, from a space to itself.
     name : str
-        For messages and counts.
+        Name in error messages and counts.
     settings : SolveSettings
     most : int
-        Number of set-ups that are kept.
+        Number of cached set-ups.
     log : SolveLog, optional
-        Where its solves are recorded.
+        Log in which the solves are recorded.
 
     Attributes
     ----------
@@ -283,7 +286,7 @@ class Resolvent:
     def _solved(self, transposed: bool, checked: bool, b: Any, z: Any) -> Any:
         if z == 0:
             note(f"{self.name}.solve", "skipped", "dt or coefficient 0, no solve and no set-up")
-            return self._one.apply(b)  # whole numbers become floating ones
+            return self._one.apply(b)  # converts integers to floats
         inverse = self._inverse(float(z))
         if transposed:
             return inverse.T.apply(b)
@@ -311,11 +314,14 @@ class Resolvent:
         return self._named(((P @ inverse - self._one) @ P + self._one).structure)
 
     def _check_sign(self, system: Any) -> None:
-        """Refuse an L under which a field grows as fast as 1 / z or faster: a step would change its sign."""
+        """Raise UnstableStepError if L has an eigenvalue of 1 / z or more: a step would change the sign of its field.
+
+        Only symmetric operators are checked, by a few power iterations.
+        """
         if system.complex or not system.symmetric:
             return
         x = system.masked(np.random.default_rng(system.seed).standard_normal(system.local_size))
-        for _ in range(8):  # towards the field that changes fastest
+        for _ in range(8):  # power iteration with z L
             change = x - system.masked(system.applied(x))  # z L x
             if system.total(x @ (system.weights * (x - change))) < 0:
                 raise UnstableStepError(
@@ -329,7 +335,7 @@ class Resolvent:
 
     @cached_property
     def _projection(self) -> Operator | None:
-        """Return the projection along the null space of L; None where there is none, or L is unsymmetric."""
+        """Return the projection along the null space of L; None if there is no null space or L is not symmetric."""
         system = self.op.backend.implementation(System)(self.op, self.settings.rtol, None)
         if not self.op.structure.has_entries or system.complex or system.weights is None:
             return None
@@ -353,7 +359,7 @@ def backward_euler(stages: Stages, u: Any, params: Any, t: Any, h: Any) -> Any:
 
 
 def crank_nicolson(stages: Stages, u: Any, params: Any, t: Any, h: Any) -> Any:
-    """Order 2, A-stable: stiff components keep their size and change their sign (they ring)."""
+    """Order 2, A-stable: stiff components keep their size and change their sign in each step."""
     return stages.trapezium(u, params, t, h)
 
 
@@ -367,7 +373,7 @@ def imex(stages: Stages, u: Any, params: Any, t: Any, h: Any) -> Any:
     """Order 2: the rate explicit, operator and source implicit (L-stable)."""
 
     def advanced(*pairs: tuple) -> Any:
-        """Return u plus the multiples of rates, where there is a rate."""
+        """Return u plus the sum of factor * rate over pairs whose rate is not None."""
         return combine(u, *(pair for pair in pairs if pair[1] is not None))
 
     first = stages.problem.rate_value(u, params, t)
@@ -388,7 +394,7 @@ IMPLICIT = {
 
 
 class Stages(Scheme):
-    """An implicit step by its stages, solve and trapezium."""
+    """An implicit step that is composed of two kinds of stages, `solve` and `trapezium`."""
 
     solve: Callable
     trapezium: Callable
@@ -403,7 +409,7 @@ class Stages(Scheme):
 
 
 class Linear(Stages):
-    """Stages of u' = c L u + source by one factor, hierarchy or transform for each L and h c.
+    """Stages of u' = c L u + source, with one set-up (factorisation, hierarchy or transform) for each L and h c.
 
     Parameters
     ----------
@@ -412,7 +418,7 @@ class Linear(Stages):
         One of IMPLICIT.
     settings : SolveSettings
     most : int
-        As `Resolvent` takes it.
+        Number of cached set-ups per term.
     """
 
     dyadic = True
@@ -425,7 +431,7 @@ class Linear(Stages):
             self.resolvents[op] = Resolvent(op, f"stepper({name})", settings, most * len(problem.stiff), self.info)
 
     def _resolved(self, h: Any, params: Any, b: Any, *shares: tuple) -> Any:
-        """Return (1 - h c L)^-1 (b + the sum of factor * s(t) over pairs (factor, t)), field by field."""
+        """Return (1 - h c L)^-1 (b + the sum of factor * s(t) over pairs (factor, t)) for each field."""
         if self.problem.source is not None:
             b = combine(b, *((factor, self.problem.source_value(params, t)) for factor, t in shares))
 
@@ -437,7 +443,7 @@ class Linear(Stages):
         return self.problem.on_fields(solved, h, params, b)
 
     def solve(self, guess: Any, b: Any, params: Any, t: Any, h: Any) -> Any:
-        """Return x of x = b + h (c L x + s(t))."""
+        """Return the solution x of x = b + h (c L x + s(t))."""
         return self._resolved(h, params, b, (h, t))
 
     def trapezium(self, u: Any, params: Any, t: Any, h: Any) -> Any:
@@ -447,7 +453,7 @@ class Linear(Stages):
 
 
 class Nonlinear(Stages):
-    """Stages of u' = f(u, params, t) by Newton's method, with one adjoint solve for each.
+    """Stages of u' = f(u, params, t) by Newton's method; the VJP of each stage takes one adjoint solve.
 
     Parameters
     ----------
@@ -477,15 +483,15 @@ class Nonlinear(Stages):
 
     def __call__(self, u: Any, params: Any, t: Any, h: Any) -> Any:
         """Return the state after a step."""
-        # The stages share a Jacobian while that is good enough; none outlives the step.
+        # The stages of one step share a Jacobian as long as Newton's method converges with it.
         with self.root.series():
             return super().__call__(u, params, t, h)
 
     def solve(self, guess: Any, b: Any, params: Any, t: Any, h: Any) -> Any:
-        """Return x of x = b + h f(x, t)."""
+        """Return the solution x of x = b + h f(x, t)."""
         try:
             return self.root(untraced(guess), b, h, params, t)
-        except ConvergenceError as error:  # often there is no root: a quadratic rate may leave none for a large dt
+        except ConvergenceError as error:  # often there is no root, for example for a quadratic rate and a large dt
             error.args = f"{error}; take a smaller dt, or give stepper a tolerance", *error.args[1:]
             raise
 
@@ -496,7 +502,7 @@ class Nonlinear(Stages):
 
 
 def residual_jacobian(jacobian: Callable, timed: bool) -> Callable:
-    """Return the derivative 1 - h df/du of a stage's residual, from the user's df/du."""
+    """Return a function for the Jacobian 1 - h df/du of the residual of a stage, given the user's df/du."""
 
     def of_residual(x: Any, b: Any, h: Any, params: Any, t: Any) -> Any:
         if type(params) is Sided:
@@ -511,5 +517,5 @@ def residual_jacobian(jacobian: Callable, timed: bool) -> Callable:
 
 
 def as_matrix(J: Any) -> Any:
-    """Return a user's Jacobian as a sparse matrix."""
+    """Convert a user's Jacobian to a sparse matrix."""
     return (J if isinstance(J, Operator) else from_matrix(J)).matrix
