@@ -1,12 +1,12 @@
-"""Checks that all ranks do the same, and errors that all ranks raise together.
+"""Checks that all ranks perform the same operations, and exceptions that are raised on all ranks together.
 
-Each communication of ranks begins with one message of 32 bytes from every rank to all. It holds the mark of the rank
-and up to 24 bytes to be reduced. The mark is a checksum of everything that must be the same on all ranks (calls,
-numbers, arrays that every rank has), or a code that says that the rank has failed. Therefore
+Each communication begins with one MPI_Allgather, in which every rank sends 32 bytes: its mark (8 bytes) and up to 24
+bytes of data, such as a number to be reduced. The mark is a checksum of everything that must be the same on all ranks
+(calls, numbers, arrays), or a code which says that an exception was raised on this rank. Therefore
 
-- a rank that fails says so in its next message, and all ranks raise its error with its message;
-- unseeded random numbers, and a branch that only one rank takes, raise an error at the next message;
-- a reduction needs one message, as many as without these checks.
+- if one rank raises an exception, the others learn of it in the next communication, and all ranks raise it;
+- if ranks use different random numbers or take different branches, the next communication raises an error;
+- a reduction needs a single communication, as it would without these checks.
 """
 
 from __future__ import annotations
@@ -35,25 +35,25 @@ from sparsedp.autodiff.tape import plain
 
 __all__ = ["Agreement", "end_all", "end_all_after_error", "state"]
 
-ROOM = 24  # bytes beside the mark
-FAILED = (-1).to_bytes(8, "little", signed=True)
-PATIENCE = 15.0  # seconds that a failed rank waits for the others: they may be inside PETSc and never answer
+ROOM = 24  # bytes of data in a message, in addition to the mark
+FAILED = (-1).to_bytes(8, "little", signed=True)  # the mark of a rank that raised an exception
+PATIENCE = 15.0  # seconds after which a failed rank aborts the program if others, perhaps inside PETSc, do not answer
 
 
 @dataclass
 class ProcessState:
-    """What this process has exchanged with others.
+    """The state of the communication in this process.
 
     Attributes
     ----------
     messages : int
         Number of messages so far.
     last : Agreement or None
-        The one that was built or used last.
+        The Agreement that was created or used last.
     messages_before_call : int or None
-        Number of messages before the outermost running call; None outside of calls.
+        Number of messages before the outermost call of `together` that is running; None if there is none.
     unrecorded : list of tuples
-        (name, arguments) of running calls that are not in a mark yet.
+        (name, arguments) of running calls of `together` that have not been added to a mark yet.
     """
 
     messages: int = 0
@@ -66,13 +66,13 @@ state = ProcessState()
 
 
 class Agreement:
-    """Checks that the ranks of a communicator do the same; reductions and errors of all ranks.
+    """Communication between the ranks of a communicator, with checks that all ranks perform the same operations.
 
     Parameters
     ----------
     comm : mpi4py.MPI.Comm
     where : str
-        Description of this rank that is added to its errors.
+        Description of this rank, which is added to the messages of its exceptions.
     """
 
     def __init__(self, comm: MPI.Comm, where: str) -> None:
@@ -84,10 +84,10 @@ class Agreement:
         self._mine = np.zeros(8 + ROOM, np.uint8)
         self._all = np.zeros((comm.size, 8 + ROOM), np.uint8)
 
-    # ------------------------------------------------------------ what must be the same
+    # ------------------------------------------------------------ checks that ranks agree
 
     def record(self, label: str, content: bytes) -> None:
-        """Add an action or argument of this rank to its mark, which the next message compares with other ranks."""
+        """Add an action or argument to the mark of this rank. The next message compares the marks of all ranks."""
         while state.unrecorded:
             name, arguments = state.unrecorded.pop(0)
             for number, tree in enumerate(arguments):
@@ -96,19 +96,19 @@ class Agreement:
         self._log.append((label, self._mark))
 
     def record_leaves(self, root: str, what: str, tree: Any) -> None:
-        """Add the leaves of a tree, traced or not, to the mark; distributed fields are compared already."""
+        """Add the numbers, arrays and strings of a tree to the mark; distributed fields need no comparison."""
         for name, leaf in zip(labels(tree, root), leaves(tree)):
             value = plain(leaf)
             if isinstance(value, (Number, np.ndarray, np.generic, str)):
                 self.record(f"{name} of {what}", folded(np.asarray(value)))
 
     def synchronize(self, label: str, content: bytes = b"") -> bytes:
-        """Send one message from each rank to all; return the bytes `content` of all ranks, in their order.
+        """Exchange one message between all ranks; return the bytes `content` of all ranks, in the order of the ranks.
 
         Raises
         ------
         Exception
-            The error of the lowest rank that failed, on all ranks.
+            If a rank has failed: the exception of the lowest failed rank, on all ranks.
         ValueError
             If the marks of the ranks differ.
         """
@@ -124,7 +124,7 @@ class Agreement:
         return self._all[:, 8 : 8 + len(content)].tobytes()
 
     def _send(self, head: bytes, content: bytes) -> bytes:
-        """Send a mark and bytes from this rank to all; return the marks of all ranks."""
+        """Send a mark and some bytes to all ranks; return the marks of all ranks."""
         state.messages += 1
         state.last = self
         self._mine[: 8 + len(content)] = np.frombuffer(head + content, np.uint8)
@@ -132,7 +132,7 @@ class Agreement:
         return self._all[:, :8].tobytes()
 
     def _refuse(self):
-        """Raise an error that names the first difference between the logs of the ranks."""
+        """Raise ValueError, with the first difference between the logs of the ranks in its message."""
         logs = zip_longest(*self.comm.allgather(list(self._log)), fillvalue=("nothing", 0))
         entries = next(entries for entries in logs if len(set(entries)) > 1)
         rank = next(rank for rank, entry in enumerate(entries) if entry != entries[0])
@@ -156,10 +156,13 @@ class Agreement:
         self._mark = 0
         self._log.clear()
 
-    # ------------------------------------------------------------ numbers
+    # ------------------------------------------------------------ reductions
 
     def reduce(self, number: ArrayLike, act: np.ufunc) -> Any:
-        """Reduce the numbers of all ranks by a ufunc, in their order: every rank gets the same bits."""
+        """Reduce a number or array over all ranks by a ufunc, in the order of the ranks.
+
+        The result is therefore bitwise the same on all ranks.
+        """
         count("ranks", "reduction")
         number = np.asarray(number)
         content = number.tobytes()
@@ -172,17 +175,17 @@ class Agreement:
         return act.reduce(numbers, axis=0)[()]
 
     def gather(self, value: Any, label: str = "gather") -> list[Any]:
-        """Return the values of all ranks as a list, on every rank."""
+        """Return a list of the values of all ranks, on every rank."""
         self.synchronize(label)
         return self.comm.allgather(value)
 
     # ------------------------------------------------------------ errors
 
     def run(self, label: str, act: Callable, *args: Any, at_once: bool = False) -> Any:
-        """Call ``act(*args)``, which may fail on one rank only; if it does, raise the error on all ranks.
+        """Call ``act(*args)``. If it raises an exception on one rank, raise the exception on all ranks.
 
-        Inside `together`, the outermost call informs the other ranks. With `at_once` they are informed here, because
-        the caller catches the error and continues.
+        Inside `together`, the outermost call communicates the exception to the other ranks. With `at_once` it is
+        communicated here; this is needed if the caller catches the exception and continues.
         """
         informs = at_once or state.messages_before_call is None
         try:
@@ -198,7 +201,7 @@ class Agreement:
         return result
 
     def fail(self, error: Exception) -> None:
-        """Raise an error on all ranks: the error of the lowest rank that failed, with the rank in its message."""
+        """Raise the exception of the lowest failed rank on all ranks, with the number of the rank in its message."""
         if hasattr(error, "on_all_ranks"):
             raise error
         watch = Timer(PATIENCE, end_all, (type(error), error, error.__traceback__))
@@ -208,7 +211,7 @@ class Agreement:
         self._raise_together(error, watch)
 
     def _raise_together(self, error=None, watch=None):
-        """Exchange the errors of all ranks and raise the first; `error` is None on a rank without one."""
+        """Exchange the exceptions of all ranks and raise the first. `error` is None on a rank that has not failed."""
         entry = None
         if error is not None:
             where = f" (on rank {self.comm.rank}{self.where})"
@@ -226,22 +229,25 @@ class Agreement:
 
 
 def _marked(error):
-    """Mark an error that all ranks raise: callers on the stack do not exchange it again."""
+    """Flag an exception that is raised on all ranks, so that enclosing calls do not communicate it again."""
     error.on_all_ranks = True
     return error
 
 
 def _packed(error, where):
-    """Return an error that other ranks can raise: of the nearest base class that takes one message."""
+    """Return a copy of an exception that can be pickled, with `where` added to its message.
+
+    Its class is the nearest base class whose constructor accepts a single message.
+    """
     for kind in type(error).__mro__:
         try:
             return pickle.loads(pickle.dumps(kind(f"{error}{where}")))
         except Exception:
-            continue  # the class takes other arguments, or cannot be unpickled on other ranks
+            continue  # the constructor needs other arguments, or the exception cannot be pickled: try the base class
 
 
 def end_all(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """End all ranks with the error of one, so that no rank waits for its messages."""
+    """Print an exception of this rank and abort all ranks, so that no rank waits for messages of this one."""
     comm = MPI.COMM_WORLD
     text = "".join(traceback.format_exception(kind, error, trace))
     sys.stderr.write(f"rank {comm.rank} of {comm.size}: {text}")
@@ -250,7 +256,7 @@ def end_all(kind: type[BaseException], error: BaseException, trace: TracebackTyp
 
 
 def end_all_after_error() -> None:
-    """End all ranks at the exit of this one if an uncaught error ended it."""
+    """Abort all ranks if an uncaught exception ended this one. Called when the process exits."""
     error = getattr(sys, "last_value", None)
     if error is not None:
         end_all(type(error), error, error.__traceback__)

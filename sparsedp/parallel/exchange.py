@@ -1,4 +1,4 @@
-"""Exchange of numbers between ranks: each rank gathers the numbers that it reads, by a PetscSF."""
+"""Exchange of field entries between ranks: each rank gathers the entries that it needs, by a PetscSF."""
 
 from __future__ import annotations
 
@@ -18,31 +18,33 @@ from sparsedp.parallel.partition import Box, Partition, Shapes, lengths, slices
 
 __all__ = ["Exchange", "Windows", "exchange_of_boxes", "keep_petsc_communicator"]
 
-KINDS = {"f": MPI.FLOAT, "d": MPI.DOUBLE, "D": MPI.C_DOUBLE_COMPLEX}  # PETSc adds up no complex64
+KINDS = {"f": MPI.FLOAT, "d": MPI.DOUBLE, "D": MPI.C_DOUBLE_COMPLEX}  # PETSc cannot add complex64
 
 PETSC_COMMUNICATOR = MPI.Comm.Create_keyval()
 
 
 def keep_petsc_communicator(comm: MPI.Comm) -> None:
-    """Keep PETSc's own copy of a communicator. Called by all ranks together.
+    """Keep PETSc's duplicate of a communicator alive. All ranks must call this function together.
 
-    Otherwise PETSc frees the copy with the last object on it. Python drops that object at different times on different
-    ranks, so a rank that has to build a new copy would wait for the others.
+    Otherwise PETSc would free the duplicate together with the last object that uses it. Python deletes that object at
+    different times on different ranks, so that some ranks would have to create a new duplicate, which is a collective
+    operation, and would wait forever for the others.
     """
     if comm.Get_attr(PETSC_COMMUNICATOR) is None:
         comm.Set_attr(PETSC_COMMUNICATOR, PETSc.Comm(comm).duplicate())
 
 
 class Windows(NamedTuple):
-    """A window in each component of a flat array.
+    """A rectangular window in each component of a flat array.
 
     Attributes
     ----------
     size : int
-        Of the array.
+        Size of the flat array.
     shapes : list of tuples of int
-        Of the components.
+        Shapes of the components.
     windows : list of tuples of slices
+        One window for each component.
     """
 
     size: int
@@ -51,7 +53,10 @@ class Windows(NamedTuple):
 
 
 class Exchange:
-    """The linear map from a flat block to the numbers that this rank reads. Built by all ranks together.
+    """The linear map from the block of this rank to the entries of the whole field that this rank needs.
+
+    All ranks must create it together. Entries can be given in two ways: by index, which are communicated, and by
+    windows of this rank's own block, which are copied.
 
     Parameters
     ----------
@@ -59,13 +64,13 @@ class Exchange:
     parts : list of shapes
         Shapes of the components of the whole field.
     size : int
-        Number of entries that are read.
+        Number of entries in the result.
     leaves, entries : int arrays
-        For the entries that are exchanged: their places in the result, and their numbers in the whole flat field.
+        The communicated entries: their indices in the result, and their indices in the whole flat field.
     shapes : list of tuples of int
-        For the entries that are copied: the shapes of the components of the result.
+        The copied entries: the shapes of the components of the result.
     windows, block_windows : lists of tuples of slices
-        For the entries that are copied: their windows in the components of the result and of the block.
+        The copied entries: their windows in the components of the result and of the block.
     """
 
     def __init__(
@@ -86,22 +91,22 @@ class Exchange:
         self.read = Windows(size, shapes, windows)
         self.block = Windows(layout.size(parts), layout.shapes(parts), block_windows)
         if self.busy:
-            PETSc.garbage_cleanup(layout.comm)  # frees the objects that Python has dropped, on all ranks together
+            PETSc.garbage_cleanup(layout.comm)  # frees PETSc objects without references, a collective operation
             self._forest = PETSc.SF().create(layout.comm)
             remote = np.stack([ranks, places], axis=1).astype(PETSc.IntType)
             self._forest.setGraph(self.block.size, leaves.astype(PETSc.IntType), remote)
             self._forest.setUp()
 
     def forward(self, flat: NDArray) -> NDArray:
-        """Return the numbers that are read, flat, for a flat block."""
+        """Return the needed entries as a flat array, given the flat block of this rank."""
         return self._exchange("bcast", MPI.REPLACE, flat, self.placed(flat))
 
     def backward(self, read: NDArray) -> NDArray:
-        """Apply the transpose: add the cotangents of the numbers read to the entries that they were read from."""
+        """Apply the transpose of `forward`: send cotangents back to the owners of the entries, and add them there."""
         return self._exchange("reduce", MPI.SUM, read, self.taken(read))
 
     def placed(self, flat: NDArray) -> NDArray:
-        """Return the numbers that are read from the block of this rank itself, zeros elsewhere."""
+        """Return the result of `forward` without communication: entries of other ranks are 0."""
         return _copied(flat, self.block, self.read)
 
     def taken(self, read: NDArray) -> NDArray:
@@ -109,7 +114,7 @@ class Exchange:
         return _copied(read, self.read, self.block)
 
     def _exchange(self, operation: str, combine: Any, values: NDArray, out: NDArray) -> NDArray:
-        """Exchange entries with other ranks by an operation of PetscSF, combining them with the entries of `out`."""
+        """Communicate entries by an operation of PetscSF, and combine them with the entries of `out`."""
         if self.busy:
             self.agreement.synchronize("exchange")
             if np.may_share_memory(out, values):
@@ -123,7 +128,10 @@ class Exchange:
 
 
 def _copied(flat: NDArray, source: Windows, target: Windows) -> NDArray:
-    """Copy windows of a flat array into windows of another, zero elsewhere; without a copy if one fills the other."""
+    """Copy windows of a flat array into windows of a new one, which is 0 elsewhere.
+
+    If a single contiguous window fills the whole target, return a view of it without copying.
+    """
     parts = components(flat, source.shapes)
     pieces = [part[window] for part, window in zip(parts, source.windows)]
     if len(pieces) == 1 and pieces[0].size == target.size and pieces[0].flags.c_contiguous:
@@ -137,13 +145,13 @@ def _copied(flat: NDArray, source: Windows, target: Windows) -> NDArray:
 
 
 def exchange_of_boxes(layout: Partition, parts: Shapes, boxes: Sequence[Box]) -> Exchange:
-    """Return the Exchange for a box of each component, which may reach into other blocks."""
+    """Return the Exchange that reads one box of each component; the boxes may extend into blocks of other ranks."""
     leaves = [np.zeros(0, np.int64)]
     entries = [np.zeros(0, np.int64)]
     windows = []
     block_windows = []
-    start = 0  # of the component in the result
-    first = 0  # of the component in the whole field
+    start = 0  # index of the component's first entry in the result
+    first = 0  # index of the component's first entry in the whole flat field
     for part, box in zip(parts, boxes, strict=True):
         own = layout.box(part)
         inner = [(max(a, c), max(min(b, d), a, c)) for (a, b), (c, d) in zip(box, own)]

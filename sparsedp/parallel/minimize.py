@@ -1,8 +1,8 @@
-"""minimize for fields on ranks, by PETSc's optimizer TAO.
+"""minimize() for distributed fields, by PETSc's optimizer TAO.
 
-The unknowns are a distributed vector of PETSc. Each rank holds its blocks of the fields; rank 0 holds the unknowns that
-every rank holds, such as numbers and NumPy arrays. Evaluations, the history and the stopping test are the same as
-on one process.
+The unknowns form a distributed PETSc vector. Each rank contributes its blocks of the distributed fields. Unknowns that
+exist on every rank, such as numbers and NumPy arrays, are stored in the part of rank 0 only. Evaluations, the history
+and the convergence test use the same code as on one process.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ if TYPE_CHECKING:
 
 __all__ = ["minimize_on_ranks"]
 
-MOST_EVALUATIONS = 2**31 - 1  # TAO also counts evaluations; only iterations are limited
-LARGEST_BOUNDS = PETSc.NINFINITY, PETSc.INFINITY  # what TAO takes for no bound
-STATIONARY = 1e-6  # share of the gradient at the start below which a search that fails has reached rounding
+MOST_EVALUATIONS = 2**31 - 1  # disables TAO's limit of evaluations; only iterations are limited
+LARGEST_BOUNDS = PETSc.NINFINITY, PETSc.INFINITY  # TAO ignores bounds with these values
+STATIONARY = 1e-6  # a failed line search is attributed to rounding if the relative gradient is below this
 
 
 class LocalUnknowns:
-    """The part of a tree of unknowns that this rank holds.
+    """The part of a tree of unknowns that this rank contributes to the distributed vector.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class LocalUnknowns:
         self.start = start
 
     def blocks(self, tree: Any) -> Any:
-        """Return the tree of local blocks; unknowns that every rank holds are empty on all ranks but rank 0."""
+        """Return the tree of local blocks. Unknowns that exist on every rank are empty arrays except on rank 0."""
 
         def block(leaf):
             if isinstance(leaf, DistributedField):
@@ -62,7 +62,7 @@ class LocalUnknowns:
         return mapped(block, tree)
 
     def tree(self, blocks: Any) -> Any:
-        """Return the tree of fields, and of unknowns that every rank holds, from the blocks. All ranks call it."""
+        """Return the tree of unknowns, given the tree of local blocks. All ranks must call it together."""
 
         def unknown(leaf, block):
             if isinstance(leaf, DistributedField):
@@ -75,14 +75,14 @@ class LocalUnknowns:
 
 
 class DistributedObjective(Objective):
-    """The loss as a function of the unknowns that the ranks hold.
+    """The loss as a function of the distributed vector of unknowns.
 
     Parameters
     ----------
     loss : callable
     unknowns : LocalUnknowns
     packing : Packing
-        Of the local blocks.
+        The map between the tree of local blocks and flat vectors.
     box : Box
     """
 
@@ -91,8 +91,8 @@ class DistributedObjective(Objective):
         self.unknowns = unknowns
 
     def _value_and_gradient(self, vector):
-        """Return the loss and the local part of its gradient; all ranks refuse one that is not finite."""
-        with unwarned():  # a gradient that is not finite is refused below
+        """Return the loss and the local part of its gradient; raise on all ranks if the gradient is not finite."""
+        with unwarned():  # a gradient that is not finite raises NonFiniteError below
             value, gradient = value_and_grad(self._loss)(self.unknowns.tree(self._packing.unpack(vector)))
         start = self.unknowns.start
         for name, g, x in zip(labels(start, "start"), leaves(gradient), leaves(start)):
@@ -101,7 +101,7 @@ class DistributedObjective(Objective):
         return float(value), self._packing.pack_gradient(self.unknowns.blocks(gradient))
 
     def projected_gradient(self, evaluation: Evaluation) -> list[Any]:
-        """Return the gradient as a list of fields and arrays, 0 in entries that bounds hold."""
+        """Return the projected gradient (see `Objective`) as a list of distributed fields and arrays."""
         blocks = self._packing.unpack(super().projected_gradient(evaluation))
         return [leaf for leaf in leaves(self.unknowns.tree(blocks)) if is_variable(leaf)]
 
@@ -117,7 +117,7 @@ def minimize_on_ranks(
     bounds: Any,
     other_arguments: dict[str, Any],
 ) -> Minimum:
-    """Minimize a loss of fields on ranks. All ranks call it.
+    """Minimize a loss whose argument contains distributed fields. All ranks must call it together.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def minimize_on_ranks(
     loss, start, method, maxiter, tolerance, callback, bounds
         As for `minimize`.
     other_arguments : dict
-        The other arguments of `minimize`, and the options of the method: all must have their default, None or False.
+        The other arguments of `minimize` and the options of the method. All of them must be None or False.
 
     Returns
     -------
@@ -155,7 +155,7 @@ def minimize_on_ranks(
 
 
 def _check_arguments(method, tolerance, bounds, other_arguments):
-    """Refuse arguments that TAO does not take."""
+    """Raise TypeError for arguments that are not supported with TAO."""
     unsupported = [name for name, value in other_arguments.items() if value not in (None, False)]
     if hasattr(tolerance, "inside"):
         unsupported.append("certified")
@@ -171,9 +171,9 @@ def _check_arguments(method, tolerance, bounds, other_arguments):
 def _run(
     comm: MPI.Comm, objective: DistributedObjective, monitor: Monitor, x: NDArray[np.float64], maxiter: int
 ) -> None:
-    """Run TAO's quasi-Newton method with limited memory and bounds from x until the monitor stops it."""
+    """Run TAO's limited-memory quasi-Newton method with bounds, from x, until the monitor stops it."""
     first = objective.evaluate_start(x)
-    unused_evaluations = [first]  # TAO evaluates its start again
+    unused_evaluations = [first]  # TAO evaluates the start too: reuse this evaluation
     highest_value = max(first.value, 1.0)
 
     def value_and_gradient(tao, solution, gradient):
@@ -182,7 +182,7 @@ def _run(
             evaluation = unused_evaluations.pop()
         else:
             evaluation = objective(solution.array.copy())
-        if evaluation.refused:  # TAO shortens its step at a high value, but fails at an infinite one
+        if evaluation.refused:  # return a large finite value: TAO then shortens the step, but fails for infinity
             gradient.setArray(np.zeros(solution.local_size))
             return 2 * highest_value
         gradient.setArray(evaluation.gradient)
@@ -197,7 +197,7 @@ def _run(
     def vector(array):
         return PETSc.Vec().createWithArray(array, comm=comm)
 
-    PETSc.garbage_cleanup(comm)  # frees objects that Python has dropped, on all ranks together
+    PETSc.garbage_cleanup(comm)  # frees PETSc objects without references, a collective operation
     solution = vector(x)
     lower = vector(np.clip(np.broadcast_to(objective.box.lower, x.shape), *LARGEST_BOUNDS))
     upper = vector(np.clip(np.broadcast_to(objective.box.upper, x.shape), *LARGEST_BOUNDS))

@@ -1,9 +1,10 @@
-"""Which rank holds which block of a field, and the numbers that all ranks agree on.
+"""The partition of fields into one block for each rank, and reductions over all ranks.
 
-Along an axis, the ranks at place c hold the cells cuts[c] to cuts[c + 1] and their lower faces; those at the last place
-hold the upper wall too. So every number has one owner, and sums over blocks are sums. Blocks may be empty: any grid can
-be distributed over any number of ranks. A box is one (start, stop) for each axis of a component; on a periodic axis it
-may reach beyond 0 and n.
+The ranks form a Cartesian arrangement. Along an axis, the ranks at position c of the arrangement own the cells cuts[c]
+to cuts[c + 1] - 1 and their lower faces; the ranks at the last position also own the upper wall. So every entry has
+exactly one owner, and a sum over a field is the sum over its blocks. Blocks may be empty, so that any grid can be
+distributed over any number of ranks. A box is one pair (start, stop) for each axis of a component. On a periodic axis,
+start may be negative and stop may be greater than n.
 """
 
 from __future__ import annotations
@@ -26,11 +27,11 @@ __all__ = ["Box", "Partition", "Shapes", "lengths", "partition_of", "slices"]
 Box: TypeAlias = Sequence[tuple[int, int]]
 Shapes: TypeAlias = Sequence[tuple[int, ...]]
 
-MOST_COMPARED = 1000  # entries of an array that are compared between ranks, in 5 us
+MOST_COMPARED = 1000  # about this number of entries of an array is compared between ranks, which takes 5 us
 
 
 class Partition:
-    """The cuts of a grid for the ranks of a communicator. Equal by value.
+    """The partition of a grid over the ranks of a communicator. Partitions with the same values are equal.
 
     Parameters
     ----------
@@ -44,7 +45,7 @@ class Partition:
     ranks : tuple of int
         Number of ranks along each axis.
     cuts : list of int arrays
-        For each axis the first cell at each place, and the number of cells.
+        For each axis, the first cell at each position of the arrangement of ranks, followed by the number of cells.
     """
 
     def __init__(self, shape: Sequence[int], periodic: Sequence[bool], comm: MPI.Comm) -> None:
@@ -72,16 +73,16 @@ class Partition:
     # ------------------------------------------------------------ blocks
 
     def lines(self, axis: int, length: int) -> NDArray[np.integer]:
-        """Return the cuts along one axis of a component with `length` entries: cells, nodes, or any other number."""
+        """Return the cuts along one axis for a component that has `length` entries along it, such as cells or nodes."""
         return np.append(self.cuts[axis][:-1] * length // max(self.shape[axis], 1), length)
 
     @cached_property
     def places(self) -> list[tuple]:
-        """For each rank, its place along each axis."""
+        """For each rank, its position along each axis in the arrangement of ranks."""
         return [np.unravel_index(rank, self.ranks) for rank in range(self.comm.size)]
 
     def box(self, part: Sequence[int], rank: int | None = None) -> Box:
-        """Return the box of one component that a rank (default: this one) holds."""
+        """Return the box of one component that a rank owns. Default: this rank."""
         if rank is None:
             rank = self.comm.rank
         lines = [self.lines(axis, length) for axis, length in enumerate(part)]
@@ -96,12 +97,12 @@ class Partition:
         return sum(map(prod, self.shapes(parts, rank)))
 
     def blocks(self, whole: NDArray, parts: Shapes, rank: int | None = None) -> list[NDArray]:
-        """Return the blocks of a rank in a whole flat field, as views, one for each component."""
+        """Return the blocks of a rank as views of a whole flat field, one for each component."""
         fields = components(whole, parts)
         return [field[slices(self.box(part, rank))] for field, part in zip(fields, parts, strict=True)]
 
     def take(self, values: NDArray, parts: Shapes) -> NDArray:
-        """Return the flat block of this rank of a whole flat field, a copy."""
+        """Return a copy of the flat block of this rank, given the whole flat field."""
         return np.concatenate([values[:0], *(block.reshape(-1) for block in self.blocks(values, parts))])
 
     def gather(self, flat: NDArray, parts: Shapes) -> NDArray:
@@ -114,11 +115,11 @@ class Partition:
         return whole
 
     def owners(self, parts: Shapes, entries: NDArray[np.integer]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the rank that holds each of some entries of a whole flat field, and the places in its flat block."""
+        """Return, for entries given by their indices in the whole flat field, the owner and the index in its block."""
         ranks = np.zeros(entries.size, np.int64)
         places = np.zeros(entries.size, np.int64)
-        first = 0  # entry of the component
-        starts = np.zeros(self.comm.size, np.int64)  # of the component in the flat block of each rank
+        first = 0  # index of the first entry of the component in the whole flat field
+        starts = np.zeros(self.comm.size, np.int64)  # index of the component's first entry in the block of each rank
         for part in parts:
             inside = np.flatnonzero((entries >= first) & (entries < first + prod(part)))
             rank = np.zeros(inside.size, np.int64)
@@ -134,10 +135,10 @@ class Partition:
             starts = starts + [self.size([part], r) for r in range(self.comm.size)]
         return ranks, places
 
-    # ------------------------------------------------------------ numbers that all ranks agree on
+    # ------------------------------------------------------------ comparisons and reductions
 
     def compare(self, value: ArrayLike) -> None:
-        """Record a number or array, or some of its entries, that must be the same on all ranks."""
+        """Record a number or array that must be the same on all ranks; of large arrays only a sample is recorded."""
         value = np.asarray(value)
         description = "a number"
         if value.ndim:
@@ -147,15 +148,15 @@ class Partition:
         self.agreement.record(f"{description} combined with a field on ranks", value.tobytes())
 
     def sum(self, number: ArrayLike) -> Any:
-        """Return the sum over the ranks, in their order."""
+        """Return the sum over all ranks, added in the order of the ranks."""
         return self.agreement.reduce(number, np.add)
 
     def max(self, number: ArrayLike) -> Any:
-        """Return the largest number of all ranks; NaN if one is NaN."""
+        """Return the maximum over all ranks; NaN if one value is NaN."""
         return self.agreement.reduce(number, np.maximum)
 
     def min(self, number: ArrayLike) -> Any:
-        """Return the least number of all ranks; NaN if one is NaN."""
+        """Return the minimum over all ranks; NaN if one value is NaN."""
         return self.agreement.reduce(number, np.minimum)
 
 
@@ -170,7 +171,7 @@ def lengths(box: Box) -> tuple[int, ...]:
 
 
 def slices(box: Box, origin: Box | None = None) -> tuple[slice, ...]:
-    """Return one slice for each axis of a box, relative to the start of another box."""
+    """Return one slice for each axis of a box; the indices are relative to the start of the box `origin`."""
     starts = [0] * len(box)
     if origin is not None:
         starts = [start for start, _ in origin]
@@ -178,7 +179,7 @@ def slices(box: Box, origin: Box | None = None) -> tuple[slice, ...]:
 
 
 def _arrangement(shape, count):
-    """Return the number of ranks along each axis for which the fewest cells are cut; ties prefer the first axes."""
+    """Return the number of ranks along each axis that minimizes the area of the cuts; ties prefer the first axes."""
     divisors = [p for p in range(count, 0, -1) if count % p == 0]
     arrangements = [ranks for ranks in product(divisors, repeat=len(shape)) if prod(ranks) == count]
 
