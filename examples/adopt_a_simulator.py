@@ -4,9 +4,9 @@ Gradients through code that has none
 
 A simulator in plain NumPy, its sparse Jacobian from a dozen runs, and a gradient that is checked.
 
-Somebody has written a step of a simulation, and it works. Nobody wants to write it again for the sake of a gradient.
-`dp.from_blackbox` takes it as it is, finds out which results depend on which values, and makes a function with
-derivatives of it.
+Suppose that a working simulation code exists, and that rewriting it only to get a gradient is too much work.
+`dp.from_blackbox` takes one time step of it unchanged, determines which results depend on which values, and returns a
+function with derivatives.
 
 Run it: ``python examples/adopt_a_simulator.py [cells] [--out FOLDER]``
 """
@@ -37,7 +37,7 @@ options = parser.parse_args()
 
 
 def foreign(x):
-    """Both substances now -> both after one step; x of shape (2, n, n)."""
+    """Return both substances after one step; x has the shape (2, n, n)."""
     u, v = x
     reaction = u * v * v
     new_u = u + 0.16 * spread(u) - reaction + 0.04 * (1 - u)
@@ -46,14 +46,14 @@ def foreign(x):
 
 
 def spread(a):
-    """The four neighbours of each cell, less four times the cell itself; the plane is periodic."""
+    """Return the sum of the four neighbours of each cell minus four times the cell; the plane is periodic."""
     along_x = numpy.roll(a, 1, axis=0) + numpy.roll(a, -1, axis=0)
     along_y = numpy.roll(a, 1, axis=1) + numpy.roll(a, -1, axis=1)
     return along_x + along_y - 4 * a
 
 
 def start(n):
-    """A spot of v, where some u is already eaten, and a little noise."""
+    """Return the initial state: a spot of v with less u in it, and a little noise."""
     x, y = dp.Grid((n, n), size=1.0).centres()
     spot = np.exp(-((x - 0.5) ** 2 + (y - 0.4) ** 2) / 0.01)
     noise = np.random.default_rng(0).random((2, n, n))
@@ -108,12 +108,12 @@ x = start(options.cells)
 
 
 def run(x):
-    """Both substances after five steps."""
+    """Return both substances after five steps."""
     return dp.rollout(lambda x, _: step(x), x, None, 5)
 
 
 def loss(x):
-    """How much v is left."""
+    """Return the sum of squares of the remaining v."""
     _, v = run(x)
     return np.sum(v**2)
 

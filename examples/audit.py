@@ -4,9 +4,9 @@ Is a gradient right?
 
 A right gradient, a wrong one and who is at fault, a kink, noise, a ripple: three verdicts.
 
-A wrong gradient raises no error. The search that uses it goes down a little slower, or stops a little early, and nobody
-knows why. `dp.check.gradient` compares a gradient with differences of the loss itself, and says one of three things: it
-agrees, it disagrees, or the loss is such that differences cannot tell.
+A wrong gradient raises no error. An optimization that uses it converges more slowly, or stops early, without a visible
+reason. `dp.check.gradient` compares a gradient with finite differences of the loss, and returns one of three verdicts:
+the gradient agrees, it disagrees, or the differences are inconclusive for this loss.
 
 Run it: ``python examples/audit.py [cells] [--out FOLDER]``
 """
@@ -48,7 +48,7 @@ solve = dp.inverse(dp.identity(grid.cells) - 0.01 * dp.laplacian(grid, dp.dirich
 
 
 def law(error):
-    """u -> u^4; its derivative is off by a share."""
+    """Return u^4; its hand-written derivative has a relative error."""
 
     def derivative(nums, answer, u):
         return lambda g: (4 * (1 + error) * u**3 * g,)
@@ -57,14 +57,14 @@ def law(error):
 
 
 def loss(error):
-    """A loss in which the law stands between two solves."""
+    """Return a loss that applies the law between two linear solves."""
     radiation = law(error)
     return lambda u: np.sum(solve(radiation(solve(u))) ** 2)
 
 
 # %%
-# Losses that differences cannot judge
-# ------------------------------------
+# Losses for which differences are inconclusive
+# ---------------------------------------------
 # A kink has two slopes. A solve that stops at 1e-3 makes noise of that size. A fast ripple of size 1e-7 changes the
 # slope by 1. In these cases the honest answer is that nothing can be said, and why.
 

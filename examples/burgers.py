@@ -4,9 +4,9 @@ Burgers: forward, and back
 
 A field that carries itself: published figures forward, and its start found from a later state.
 
-Burgers' equation is the smallest equation in which a flow steepens into a shock. We run it forward and meet known
-figures. Then we hide the start, look at one later state, and search. Gradient descent shows how such a search behaves;
-the last section shows that the question itself has to be asked more precisely.
+Burgers' equation is the simplest equation in which a flow steepens into a shock. We solve it forward in time and compare
+with published figures. Then we reconstruct the initial state from one later state. Gradient descent shows how such a
+search behaves; the last section shows that the inverse problem needs a regularization to have a unique answer.
 
 Run it: ``python examples/burgers.py [cells] [--out FOLDER]``. With ``--observation FILE`` (one number for each cell)
 the state that is seen is read from a file.
@@ -47,7 +47,7 @@ viscosity = 0.01 / (128 * np.pi)
 
 
 def step(u, nu):
-    """Diffusion, then the field carries itself."""
+    """One time step: diffusion, then advection of the velocity by itself."""
     u = u + nu * dt * L(u)
     return carry(u, u, dt)
 
@@ -71,13 +71,13 @@ print("published :  0.0057228 0.0171672 0.0286103 0.0400520 0.0514921   (128 cel
 # .. math:: J(u_0) = \frac{1}{n} \, | \Phi_{16}(u_0) - u_{\text{seen}} |^2 ,
 #
 # where :math:`\Phi_{16}` stands for 16 steps. Its gradient comes from one run backwards through the steps, each of
-# which hands the cotangent of its result to its argument.
+# which maps the cotangent of its result to the cotangent of its argument.
 
 seen = np.loadtxt(options.observation) if options.observation else truth[16]
 
 
 def loss(u):
-    """Mean squared miss of the state after 16 steps."""
+    """Mean squared error of the state after 16 steps."""
     return np.mean((dp.rollout(step, u, viscosity, 16) - seen) ** 2)
 
 
@@ -112,7 +112,7 @@ G = dp.gradient(ring)
 
 
 def smooth_loss(u):
-    """The miss, and a small price on slopes."""
+    """The mean squared error plus a small penalty on slopes."""
     return loss(u) + 1e-5 * np.mean(G(u) ** 2)
 
 

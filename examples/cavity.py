@@ -41,7 +41,7 @@ GHIA = [0.84123, 0.68717, 0.23151, 0.00332, -0.13641, -0.20581, -0.2109, -0.1566
 
 
 def cavity(n):
-    """The unit square, whose upper wall moves: grid, one step of the velocity, and its length."""
+    """Return the grid of the unit square, one time step with a moving upper wall, and the step size."""
     grid = dp.Grid((n, n), size=1.0)
     slow = dp.face_laplacian(grid)
     lid = dp.face_lift(grid)
@@ -65,7 +65,7 @@ def cavity(n):
 
 
 def steady(grid, step, dt, viscosity=0.01):
-    """The steady velocity, and how many steps it took."""
+    """Return the steady velocity and the number of time steps."""
     v = np.zeros(grid.faces.size)
     rate, steps = 1.0, 0
     while rate > 1e-5:
@@ -84,7 +84,7 @@ def steady(grid, step, dt, viscosity=0.01):
 
 
 def peak(line):
-    """The largest value of a smooth line."""
+    """Return the maximum of the parabola through the largest value and its neighbours."""
     low, top, high = line[np.argmax(line) - 1 :][:3]
     return top + (high - low) ** 2 / (8 * (2 * top - low - high))
 

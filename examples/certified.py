@@ -42,7 +42,7 @@ start = np.sin(3 * x) * y
 
 
 def control(method, rtol=1e-10):
-    """A solver and its tolerance -> the loss."""
+    """Return the loss that uses a solver with a tolerance."""
     solve = dp.inverse(A, method, rtol=rtol)
 
     def loss(u):

@@ -56,15 +56,15 @@ f = 1.0  # the heat made in a unit of length or area
 
 
 def design(label, grid, G, volumes, heat):
-    """Search for the best k on the faces of a grid; returns k."""
+    """Return the optimal conductivity k on the faces of a grid."""
     solve = dp.elliptic_solver(dp.divergence(grid), G)
 
     def conductivity(share):
-        """Any numbers -> a conductivity that is allowed."""
+        """Map any real numbers to an admissible conductivity."""
         return V * share**2 / np.sum(volumes * share**2)
 
     def content(share):
-        """How much heat there is: the loss."""
+        """Return the heat content, which is the loss."""
         temperature = solve(conductivity(share), heat)
         return np.sum(grid.volumes * heat * temperature)
 

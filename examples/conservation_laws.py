@@ -204,7 +204,7 @@ print(f"dam break: mean error of the depth {error:.5f}, water lost {lost:.0e}")
 
 
 def heard(left):
-    """The mean density at the sensor."""
+    """Return the mean density at the sensor for a pressure on the left."""
     sensor = int(0.75 * n)
     signal = dp.rollout(burst, tube(left), None, steps, keep=lambda index, u: u[0][sensor])
     return sum(signal) / steps
@@ -214,7 +214,7 @@ true_signal = heard(1.0)
 
 
 def loss(left):
-    """How far is what is heard from the true signal?"""
+    """Return the squared relative difference from the true signal."""
     return (heard(left) / true_signal - 1) ** 2
 
 

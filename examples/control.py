@@ -47,7 +47,7 @@ along_x = np.array([1.0, 0.0])[:, None, None]  # a velocity has two components; 
 
 
 def step(u, _, push):
-    """The field carries itself, diffusion, then the force."""
+    """One time step: advection of the velocity by itself, diffusion, then the force."""
     return spread(carry(u, u * along_x, dt)) + push
 
 
@@ -60,7 +60,7 @@ rng = np.random.default_rng(0)
 
 
 def bell(heights, places, widths):
-    """A bell curve in x for each scene; height, place and width are drawn from ranges."""
+    """Return a bell curve in x for each scene, with random height, position and width."""
     height = rng.uniform(*heights, scenes)
     place = rng.uniform(*places, scenes)
     width = rng.uniform(*widths, scenes)
@@ -73,7 +73,7 @@ truth = steady + np.zeros((STEPS, 1, 1))  # the same force in every step: shape 
 
 
 def run(force, keep="last"):
-    """The flow under a force."""
+    """Return the velocity at the end, under a force."""
     return dp.rollout(step, start, None, STEPS, inputs=dt * force, keep=keep)
 
 
@@ -97,12 +97,12 @@ wanted = run(truth)
 
 
 def size(force, eps=0.0):
-    """Total force of each scene; smooth with eps."""
+    """Return the total force of each scene; eps > 0 smooths the absolute value."""
     return dt * np.sum(np.sqrt(force**2 + eps**2), (0, 1))
 
 
 def tell(label, number, force, seconds):
-    """One row of the table: what was spent, and how good the force is."""
+    """Print one row of the table: the cost, and how good the force is."""
     share = np.sum(size(force)) / np.sum(size(truth))
     worst = np.max(size(force) / size(truth))
     miss = np.max(abs(run(force) - wanted))
@@ -125,7 +125,7 @@ print(f"{scenes:3} scenes           number  seconds  ms each |f|/truth     worst
 for eps, weight in rounds:
 
     def lagrangian(force):
-        """Total force, price and penalty."""
+        """Return the augmented Lagrangian: total force, multiplier term and penalty."""
         miss = run(force) - wanted
         return np.sum(size(force, eps)) + np.sum(price * miss + 0.5 * weight * miss**2)
 
@@ -144,7 +144,7 @@ for eps, weight in rounds:
 
 
 def blocks(coarse):
-    """A force on 8 x 8 blocks -> a force in each step and cell."""
+    """Expand a force on 8 x 8 blocks to a force in each step and cell."""
     return coarse.repeat(4, axis=0).repeat(4, axis=1)
 
 

@@ -49,7 +49,7 @@ PLACES = 0.823, 0.119  # y of the first maximum, x of the second
 
 
 class Box:
-    """The box on a grid of n cells along an axis: one step of flow and heat, and the heat that passes."""
+    """The box on a grid of n cells along each axis: one step of flow and heat, and the heat flux."""
 
     def __init__(self, n):
         self.grid = dp.Grid((n, n), size=1.0)
@@ -67,16 +67,16 @@ class Box:
         self.step = dp.flow_step(self.grid, dt, PRANDTL, self.buoyancy, implicit=True, scalars={"heat": heat})
 
     def buoyancy(self, v, scalars, rayleigh):
-        """The push on each face that looks up."""
+        """Return the buoyancy force on the faces across y."""
         return rayleigh * self.up * self.to_faces(scalars["heat"])
 
     def start(self):
-        """Air at rest that conducts heat: T falls evenly from wall to wall."""
+        """Return the initial state: air at rest, with T linear between the walls."""
         x, _ = self.grid.centres()
         return self.step.start(np.zeros(self.grid.faces.size), RAYLEIGH, {"heat": 1 - x})
 
     def nusselt(self, state):
-        """How much heat passes, in units of what passes at rest."""
+        """Return the heat flux, relative to that of air at rest."""
         T, v = state["s"]["heat"], state["v"]
         flux = v * self.to_faces(T) - self.gradient(T) - self.from_walls
         across, _ = self.grid.split(flux)
@@ -98,7 +98,7 @@ class Box:
 
 
 def steady(box):
-    """The steady state, its Nusselt number, and how many steps it took."""
+    """Return the steady state, its Nusselt number and the number of time steps."""
     state, steps = box.start(), 0
     now, before = box.nusselt(state), 0.0
     while abs(now - before) > 1e-2 * 20 * box.step.dt:

@@ -42,7 +42,7 @@ SIDES = {"x": (dp.inflow, dp.outflow), "y": dp.no_slip}
 
 
 def channel(cells):
-    """A grid with so many cells along a diameter."""
+    """Return a grid with `cells` cells along a diameter."""
     h = D / cells
     rows = round(HEIGHT / h)
     near = np.full(4 * cells, h)
@@ -71,7 +71,7 @@ def channel(cells):
 
 
 class Flow:
-    """The channel on one grid: what solves for the flow around an ellipse, and its forces."""
+    """The channel on one grid: solves for the flow around an ellipse and computes the forces on it."""
 
     def __init__(self, cells):
         self.grid = grid = channel(cells)
@@ -94,7 +94,7 @@ class Flow:
         self.near_ends = dp.sample(grid, outside)
 
     def residual(self, state, friction):
-        """What is 0 when the flow is steady."""
+        """Return the residual of the steady equations."""
         v, p = state["v"], state["p"]
         momentum = NU * (self.viscous(v) - friction * v) - self.convect(v, v) - self.slope(p)
         return {
@@ -103,7 +103,7 @@ class Flow:
         }
 
     def around(self, shape):
-        """The steady flow around an ellipse."""
+        """Return the steady flow around an ellipse."""
         along = (self.x - CENTRE) / np.exp(shape["s"])
         across = (self.y - shape["y"]) * np.exp(shape["s"])
         distance = np.sqrt(along**2 + across**2 + 1e-20) - shape["r"]

@@ -71,7 +71,7 @@ hidden = blocks(grid)
 
 
 def search(regularizer, weight):
-    """The ground that fits the readings, at the price of the regularizer."""
+    """Return the ground that fits the readings, for a weight of the regularizer."""
 
     def loss(m):
         misfit = (ground.readings(m) - data.readings) / data.noise
@@ -96,7 +96,7 @@ jumps = dp.gradient(grid)
 
 
 def error(field, truth):
-    """How far from the truth, relative."""
+    """Return the relative error."""
     return np.linalg.norm(field - truth) / np.linalg.norm(truth)
 
 

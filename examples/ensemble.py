@@ -46,7 +46,7 @@ solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid), rtol=1e-9)
 
 
 def end(conductivity, u):
-    """The field after all steps, with a law k(u)."""
+    """Return the field after all steps, for a law k(u)."""
     for _ in range(steps):
         k = conductivity(to_faces(u))
         u = solve(k, u / dt, 1 / dt)
@@ -67,7 +67,7 @@ def law(u):
 
 
 def network(weights, u):
-    """The conductivity by the network, at each value of u."""
+    """Return the conductivity that the network predicts for each value of u."""
     hidden, last = weights
     layer = tanh(dense(hidden, u[:, None]))
     return softplus(dense(last, layer))[:, 0]
@@ -83,7 +83,7 @@ def network(weights, u):
 
 
 def experiment(seed):
-    """How a field begins, and how it ends."""
+    """Return the initial and the final field of a random experiment."""
     places = np.random.default_rng(seed).uniform(0.1, 0.9, (3, 2))
     x, y = grid.centres()
     spots = [np.exp(-((x - a) ** 2 + (y - b) ** 2) / 0.02) for a, b in places]
@@ -92,7 +92,7 @@ def experiment(seed):
 
 
 def misfit(weights, scene):
-    """Mean squared miss of one experiment."""
+    """Return the mean squared error of one experiment."""
     start, wanted = scene
     return np.mean((end(lambda u: network(weights, u), start) - wanted) ** 2)
 

@@ -75,7 +75,7 @@ def exact(p):
 
 
 def burgers(scheme, cells):
-    """A scheme and a grid -> loss, where to take it, facts for the table."""
+    """Return, for a scheme and a grid, the loss, the point of evaluation, and entries for the table."""
     line = dp.Grid(cells, size=2.0, origin=-1.0, periodic=True)  # at p_1 = 0, u is odd: 0 at both ends
     (x,) = line.centres()
     h = 2 / cells
@@ -83,15 +83,15 @@ def burgers(scheme, cells):
     at_places = dp.sample(line, PLACES[:, None])
 
     def convect(u, p):
-        """The rate of change by what is carried."""
+        """Return the rate of change by convection."""
         return -D(A(u) ** 2 / 2)
 
     def rate(u, p):
-        """The rate of change, central."""
+        """Return the rate of change, with central fluxes."""
         return convect(u, p) + D(NU * G(u))
 
     def upwind_rate(u, p):
-        """The rate of change, upwind."""
+        """Return the rate of change, with upwind fluxes."""
         return convect(u, p) + D((NU + np.abs(A(u)) * h / 2) * G(u))
 
     longest = {
@@ -129,7 +129,7 @@ MIDDLE = 0.07367135328151
 
 
 def poisson(cells, method, rtol=1e-10):
-    """A solver, its tolerance and a grid -> loss, where to take it, facts for the table."""
+    """Return, for a solver and a grid, the loss, the point of evaluation, and entries for the table."""
     grid = dp.Grid((cells, cells), size=1.0)
     solve = dp.inverse(-dp.laplacian(grid, dp.dirichlet), method, rtol=rtol)
     middle = dp.sample(grid, [[0.5, 0.5]])

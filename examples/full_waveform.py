@@ -77,7 +77,7 @@ sources = np.stack([dp.sample(grid, [[place, 1.0]]).T(np.ones(1)) for place in s
 
 
 def pressure_rate(v, given):
-    """p_t; given are the speed, and the wavelet at this time."""
+    """Return p_t for the speed and the value of the wavelet at this time."""
     c, strength = given
     return -(c**2) * D(v) + strength * sources
 
@@ -93,7 +93,7 @@ quiet = np.zeros((len(shots), *grid.shape)), np.zeros((len(shots), grid.faces.si
 
 
 def heard(c):
-    """Speed -> what the receivers hear after each step, for all shots."""
+    """Return the pressure at the receivers after each step, for all shots."""
     traces = dp.rollout(step, quiet, c, steps, inputs=wavelet, keep=lambda index, state: receivers(state[0]))
     return np.stack(traces)
 

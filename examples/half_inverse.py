@@ -84,7 +84,7 @@ start = [layer(*size) for size in sizes]
 
 
 def misses(weights, states):
-    """End minus wanted end, under the pushes that the network chooses. Shape (samples, 4)."""
+    """Final state minus wanted final state, for the pushes of the network. Shape (samples, 4)."""
     *hidden, last = weights
     signal = states
     for one in hidden:
@@ -94,7 +94,7 @@ def misses(weights, states):
 
 
 def loss(weights, states=seen):
-    """Mean squared miss of a sample."""
+    """Return the mean squared error of a sample."""
     return np.mean(np.sum(misses(weights, states) ** 2, axis=1))
 
 

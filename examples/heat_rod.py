@@ -46,8 +46,8 @@ print(L)
 #
 # .. math:: dJ = g^T L \, du = (L^T g)^T du \quad \text{with} \quad g = \partial J / \partial v .
 #
-# So what flows forward through :math:`L` flows backward through its transpose. A program that takes derivatives needs
-# to be told just that: apply, transpose, and which belongs to which.
+# So a derivative that passes backward through :math:`L` is multiplied by the transpose of :math:`L`. A program that
+# computes derivatives needs only these two functions: the product with :math:`L` and the product with its transpose.
 
 apply = primitive(lambda u: L.matrix @ u)
 transpose = lambda g: L.matrix.T @ g
@@ -78,7 +78,7 @@ steps = 3 * options.cells
 
 
 def cool(u):
-    """Temperature now -> temperature after all steps."""
+    """Return the temperature after all time steps."""
     for _ in range(steps):
         u = u + dt * L(u)
     return u
@@ -94,7 +94,7 @@ wanted = cool(truth)
 
 
 def loss(u):
-    """How far is the cooled rod from the wanted one?"""
+    """Return the squared difference between the cooled rod and the wanted temperature."""
     return np.sum(rod.volumes * (cool(u) - wanted) ** 2)
 
 

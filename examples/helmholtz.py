@@ -55,7 +55,7 @@ omega = 2 * np.pi / (cells * h)  # for a speed of 1
 
 
 def layer(x, size=1.0):
-    """0 inside, growing to 1 over the last two wavelengths at both ends."""
+    """Return a profile that is 0 inside and grows to 1 over the last two wavelengths at both ends."""
     depth = 1 - np.minimum(x, size - x) / (2 * cells * h)
     return np.maximum(depth, 0) ** 3
 
@@ -71,7 +71,7 @@ kappa = np.arccos(1 - (omega * h) ** 2 / 2)
 
 
 def reflection(k, shift):
-    """What comes back from the end of a line, relative to what goes."""
+    """Return the amplitude of the reflected wave relative to the outgoing wave."""
     source = np.eye(200)[40]
     u = solve_line(k, source, shift)[50:170]  # between the source and the layer
     phase = kappa * np.arange(120)
@@ -105,7 +105,7 @@ damping = 3 * (layer(x) + layer(y))
 
 
 def shift(c):
-    """Speed in each cell -> what stands beside the second derivatives."""
+    """Return the zeroth-order coefficient of the equation for the speed in each cell."""
     return -((omega / c) ** 2) * (1 + 1j * damping)
 
 
@@ -162,7 +162,7 @@ heard = listen(u)
 
 
 def misfit(c):
-    """How far is what would be heard from what is heard?"""
+    """Return the squared difference between predicted and measured waves."""
     return np.sum(np.abs(listen(solve(1 / density, source, shift(c))) - heard) ** 2)
 
 

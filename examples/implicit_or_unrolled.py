@@ -46,7 +46,7 @@ class Problem:
         self.source = np.exp(-((x - 0.3) ** 2 + (y - 0.4) ** 2) / 0.02) + 0.3 * x
 
     def value_and_gradient(self, solve):
-        """A solver -> a function without arguments: the loss and its gradient at the source."""
+        """Return a function without arguments that computes the loss and its gradient by a solver."""
         both = dp.value_and_grad(lambda b: np.mean((solve(b) - self.wanted) ** 2))
         return lambda: both(self.source)
 
@@ -70,7 +70,7 @@ class Problem:
 
 
 def solvers(A):
-    """Three ways through CG, and two faster solvers."""
+    """Return three ways to differentiate CG, and two faster solvers."""
     return {
         "CG, 200 iterations unrolled": dp.inverse(A, "krylov", diff="unrolled", iterations=200),
         "CG, 20 iterations unrolled": dp.inverse(A, "krylov", diff="unrolled", iterations=20),
@@ -88,7 +88,7 @@ def solvers(A):
 
 
 def seconds(action):
-    """How long an action takes."""
+    """Return the run time of an action in seconds."""
     start = perf_counter()
     action()
     return perf_counter() - start

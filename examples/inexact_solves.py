@@ -65,7 +65,7 @@ damping = h**2 / 2
 
 
 class Search:
-    """Gradient descent in theta with inexact solves: what it has now, and what it has spent."""
+    """Gradient descent in theta with inexact solves: its current state and its cost so far."""
 
     def __init__(self):
         self.theta = START
@@ -75,11 +75,11 @@ class Search:
         self.path = []  # pairs (sweeps, theta)
 
     def residual(self):
-        """What is left of the equation of u."""
+        """Return the residual of the equation of u."""
         return self.theta * source - A.apply(self.u)
 
     def adjoint_residual(self):
-        """What is left of the equation of the adjoint."""
+        """Return the residual of the adjoint equation."""
         return (self.u - seen) / n - A.T.apply(self.adjoint)
 
     def descend(self, gradient):

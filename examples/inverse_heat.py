@@ -61,7 +61,7 @@ places = np.arange(SIDE)
 
 
 def rectangles():
-    """A hidden start."""
+    """Return a random initial temperature, to generate synthetic data."""
     x = np.zeros(grid.shape)
     for _ in range(rng.integers(4, 11)):
         temperature = rng.random()
@@ -88,7 +88,7 @@ print(f"{options.samples} samples with heat {warmth:.0f}, noise of the data (sin
 
 
 def descent(y):
-    """What 1000 steps of gradient descent find."""
+    """Return the result of 1000 steps of gradient descent."""
     return waves((1 - (1 - fade**2) ** 1000) / fade, y)
 
 
@@ -101,7 +101,7 @@ def descent(y):
 
 
 def inverse_simulator(end, x):
-    """The start near x that ends nearer to `end`, in the waves that can be told."""
+    """Return the start near x whose final state is nearer to `end`, in the waves that the data determine."""
     return x + waves((fade > 1e-6) / fade, end - heat(x))
 
 
@@ -135,7 +135,7 @@ def jumps_and_values(x):
 
 
 def shrink(v, t):
-    """Jumps go towards 0 by t; values go up to 0."""
+    """Shrink jumps towards 0 by t (soft thresholding), and replace negative values by 0."""
     jumps = np.sign(v[:2]) * np.maximum(abs(v[:2]) - t, 0)
     values = np.maximum(v[2:], 0)
     return np.concatenate([jumps, values])

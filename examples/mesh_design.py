@@ -53,14 +53,14 @@ print(f"{mesh.nelements} triangles, {inner.size} inner nodes, {np.sum(kept)} ent
 # The solver
 # ----------
 # It is made of the places alone. Then `solve(values, b)` is the temperature, differentiable in each value and in b. The
-# values on one place are summed, and the way back hands its cotangent to each of them.
+# values at the same place are summed, and in the backward pass each of them gets the cotangent of the sum.
 
 solve = dp.matrix_solver.from_coo(rows[kept], columns[kept])
 unit = entries.data[kept]
 
 
 def temperature(k):
-    """Conductivity of each triangle -> temperature of each inner node."""
+    """Return the temperature of each inner node for the conductivity of each triangle."""
     return solve(unit * k[element[kept]], load)
 
 
@@ -75,7 +75,7 @@ area = 0.5 * np.abs(np.cross((corners[:, 1] - corners[:, 0]).T, (corners[:, 2] -
 
 
 def conductivity(shares):
-    """Logarithms of shares -> conductivity of each triangle, 1 on average."""
+    """Return the conductivity of each triangle, 1 on average, from logarithms of shares."""
     weight = np.exp(shares)
     return weight * np.sum(area) / np.sum(area * weight)
 

@@ -47,12 +47,12 @@ print(dp.check.operator(scanner))
 
 
 def smear(u):
-    """The map."""
+    """Apply the operator."""
     return 0.5 * u + 0.5 * np.roll(u, 1, axis=0)
 
 
 def smear_back(g):
-    """Its transpose."""
+    """Apply the transpose of the operator."""
     return 0.5 * g + 0.5 * np.roll(g, -1, axis=0)
 
 

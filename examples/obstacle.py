@@ -68,7 +68,7 @@ columns = [int(place * n) for place in (1.3, 2.0, 2.7)]
 
 
 def readings(profile):
-    """What the sensors say at the end of each quarter of the time."""
+    """Return the readings of the sensors at the end of each quarter of the time."""
     state = start(profile)
     values = []
     for _ in range(4):
@@ -97,7 +97,7 @@ measured = exact + 0.01 * np.random.default_rng(0).standard_normal(exact.size)
 
 
 def loss(profile):
-    """How far are the readings from the measured ones?"""
+    """Return half the squared misfit of the readings plus a penalty on roughness of the profile."""
     miss = readings(profile) - measured
     rough = profile[1:] - profile[:-1]
     return 0.5 * np.sum(miss**2) + 1e-3 * np.sum(rough**2)

@@ -42,7 +42,7 @@ noise = np.random.default_rng(0).uniform(-1, 1, (n, n))
 # * `etdrk4`: :math:`A` is exact, by transforms, as :math:`e^{A \Delta t}`; :math:`N` by a Runge-Kutta scheme of fourth
 #   order.
 #
-# This runs one of them, and judges the gradient of the sum of squares after 5 steps in every parameter:
+# This runs one of them, and checks the gradient of the sum of squares after 5 steps in every parameter:
 
 
 def report(name, step, state, params, steps, keep="last"):
@@ -160,7 +160,7 @@ print(f"wavelength {length:.2f} ({2 * np.pi:.2f}), size {size:.3f} (one wave: {n
 # %%
 # Kuramoto-Sivashinsky: a flame front
 # -----------------------------------
-# Long waves grow, short ones are damped, and the last term hands energy from the ones to the others, for ever:
+# Long waves grow, short ones are damped, and the last term transfers energy from long to short waves, for ever:
 #
 # .. math:: u_t = -\Delta u - \Delta^2 u - \tfrac{1}{2} \, c \, |\nabla u|^2 .
 #
@@ -188,7 +188,7 @@ seen = dp.rollout(eat, soup, rates, 25)["v"]
 
 
 def miss(feed):
-    """Mean squared difference from what is seen."""
+    """Return the mean squared difference from the observation."""
     return np.mean((dp.rollout(eat, soup, rates | {"feed": feed}, 25)["v"] - seen) ** 2)
 
 

@@ -73,7 +73,7 @@ def diffuse(wind):
 
 
 def step(state, source):
-    """What happens to smoke and wind in one step."""
+    """One time step of smoke and wind."""
     smoke, wind = state
     smoke = carry_smoke(smoke, wind, dt) + source
     wind = carry_wind(wind, wind, dt)

@@ -55,7 +55,7 @@ up = grid.join(0.0, 1.0)
 
 
 def step(state, source):
-    """What happens to smoke and wind in one step."""
+    """One time step of smoke and wind."""
     smoke, wind = state
     smoke = carry_smoke(smoke, wind, 1.0) + source
     wind = carry_wind(wind, wind, 1.0) + up * to_faces(smoke)
@@ -81,7 +81,7 @@ goal = run(calm, wanted)
 
 
 def loss(winds):
-    """Half the squared misses of the three plumes."""
+    """Return half the sum of squared errors of the three plumes."""
     return sum(0.5 * np.sum((run(wind, source) - goal) ** 2) for wind, source in zip(winds, sources))
 
 

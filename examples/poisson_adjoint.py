@@ -46,7 +46,7 @@ MIDDLE = 0.07367135328151
 
 
 def measure(method, cells):
-    """What one solver needs and reaches on one grid: a row of the table."""
+    """Return a row of the table: cost and accuracy of one solver on one grid."""
     grid = dp.Grid((cells, cells), size=1.0)
     solve = dp.inverse(-dp.laplacian(grid, dp.dirichlet), method)
     load = np.ones(grid.shape)

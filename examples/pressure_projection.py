@@ -71,7 +71,7 @@ reach = right @ project @ left
 
 
 def loss(v):
-    """Half the squared miss on the right."""
+    """Return half the sum of squared errors on the right."""
     return 0.5 * np.sum((reach(v) - target) ** 2)
 
 

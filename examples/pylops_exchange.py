@@ -71,7 +71,7 @@ plain = pylops.optimization.leastsquares.regularized_inversion(
 
 
 def miss(u):
-    """How far from the truth, relative."""
+    """Return the relative error."""
     return np.linalg.norm(u - blocks) / np.linalg.norm(blocks)
 
 

@@ -48,13 +48,13 @@ carry = dp.transport(ring, "semi_lagrangian", velocity="cells")
 
 
 def step(u, nu):
-    """Diffusion, then the field carries itself."""
+    """One time step: diffusion, then advection of the velocity by itself."""
     u = u + nu * dt * L(u)
     return carry(u, u, dt)
 
 
 def run(u):
-    """The start -> 32 frames, the start first."""
+    """Return 32 frames, of which the first is the start."""
     return dp.rollout(step, u, nu, 31, keep="all")
 
 
@@ -62,7 +62,7 @@ truth = run(-np.sin(np.pi * x))
 
 
 def misfit(u):
-    """Mean squared difference from what is seen: all that is known."""
+    """Return the mean squared difference from the observation, the only data."""
     return np.mean((u - truth[16]) ** 2)
 
 
@@ -82,7 +82,7 @@ points = np.stack([np.sin(angles), np.cos(angles), times], axis=1)
 
 
 def field(w, points=points):
-    """Weights -> frames of u."""
+    """Return the frames of u that the weights describe."""
     for layer in w[:-1]:
         points = network.tanh(network.dense(layer, points))
     return network.dense(w[-1], points).reshape(-1, n)
@@ -99,11 +99,11 @@ def field(w, points=points):
 #
 # It is small where :math:`u` is smooth, and no scheme says what to do at a shock. The second asks for what the solver
 # would do, :math:`r = (u^{m+1} - \Phi(u^m)) / \Delta t`, with a step :math:`\Phi`: if it were zero, the network would
-# be a run of the solver. Its size also serves to judge all the answers.
+# be a run of the solver. Its size is also the measure by which all answers are compared.
 
 
 def by_equation(w):
-    """Misfit, and what is left of the equation."""
+    """Return the misfit plus the residual of the equation."""
     u = field(w)
     right = np.roll(u, -1, axis=1)
     left = np.roll(u, 1, axis=1)
@@ -113,13 +113,13 @@ def by_equation(w):
 
 
 def broken(frames):
-    """Mean square of what is left of the scheme."""
+    """Return the mean square of the residual of the scheme."""
     left = [after - step(before, nu) for before, after in zip(frames, frames[1:])]
     return np.mean(np.stack(left) ** 2) / dt**2
 
 
 def by_scheme(w):
-    """Misfit, and what is left of the scheme."""
+    """Return the misfit plus the residual of the scheme."""
     u = field(w)
     return misfit(u[16]) + broken(u)
 

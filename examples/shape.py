@@ -74,7 +74,7 @@ def flow(shape):
 
 
 def drag(shape):
-    """The push of the wind on the obstacle along x."""
+    """Return the force of the wind on the obstacle along x."""
     velocity = flow(shape)["v"]
     return np.sum(volumes * along * inside(shape) * velocity) * brake
 

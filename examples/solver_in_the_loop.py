@@ -127,7 +127,7 @@ def window(number, begin, steps):
 
 
 def miss(weights, seen, **how):
-    """Coarse states, with the network in every step, minus the true ones."""
+    """Return the errors of the coarse states that the solver with the network computes."""
     states, forces = seen
     run = dp.rollout(coarse, states[0], weights, len(forces), inputs=forces, keep="all", **how)
     return run - states
@@ -144,7 +144,7 @@ RATES = 3e-3, 1e-3, 3e-4
 
 
 def train(unrolled, truncate=None, fresh=True):
-    """Weights after all gradients."""
+    """Return the weights after training."""
     rng = np.random.default_rng(0)
     weights = [convolution_weights(rng, inputs, outputs, 5, gain) for inputs, outputs, gain in LAYERS]
     each = options.gradients // 3

@@ -62,7 +62,7 @@ pin[0, 0] = 1.0
 
 
 def flow(v, p, force):
-    """What is left of momentum and of conservation of mass."""
+    """Return the residuals of the momentum equation and of conservation of mass."""
     momentum = force - convect(v, v) - G(p)
     on_walls = v - inside(v)
     return {"v": inside(momentum) + on_walls, "p": D(v) + pin * p}

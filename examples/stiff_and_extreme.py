@@ -72,7 +72,7 @@ swirl = dp.curl(square)(np.outer(np.hanning(n + 1), np.hanning(n + 1)))
 
 
 def ink(p):
-    """How far is the ink after ten steps from a ramp?"""
+    """Return the mean squared difference between the ink after ten steps and a ramp."""
     step = lambda u, p: carry(u, p["wind"], p["dt"])
     return np.mean((dp.rollout(step, hot, p, 10) - x) ** 2)
 

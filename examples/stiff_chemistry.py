@@ -117,7 +117,7 @@ reach = dp.stepper("radau", lambda u, p: robertson(u, p[0]), lambda p: p[1], tol
 
 
 def run(logs):
-    """Logarithms of factors on the rates -> the state at all times, the start first."""
+    """Return the state at all times, for the logarithms of factors on the rates."""
     return dp.rollout(reach, start, RATES * np.exp(logs), 10, inputs=lengths, keep="all")
 
 

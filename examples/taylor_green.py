@@ -6,7 +6,7 @@ An exact solution of the Navier-Stokes equations, a scheme of first and one of s
 
 A flow with an exact solution tells what a scheme is worth, to the last digit. There are a few, and Taylor and Green's
 vortices are the friendliest: they keep their shape and only get weaker. The derivatives of the end in the start and in
-the viscosity are known too, so that gradients through hundreds of steps can be judged by more than finite differences.
+the viscosity are known too, so that gradients through hundreds of steps can be compared with exact ones.
 
 Run it: ``python examples/taylor_green.py [cells] [--out FOLDER]``
 """

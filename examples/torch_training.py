@@ -46,7 +46,7 @@ heating = np.ones(grid.shape)
 
 
 def law(material):
-    """The conductivity that nobody knows."""
+    """Return the true conductivity, which the network does not know."""
     return 0.5 + 2.0 / (1.0 + np.exp(-4.0 * material))
 
 
@@ -90,7 +90,7 @@ untrained = learned(scale)
 # .. math:: (-D \, \text{diag}(k) \, G)^T \lambda = g, \qquad
 #           \frac{\partial J}{\partial k_f} = (D^T \lambda)_f \, (G u)_f ,
 #
-# for each face :math:`f`. Torch hands this on to the weights.
+# for each face :math:`f`. Torch propagates it to the weights.
 
 temperature = dp.interop.to_torch(lambda k: solve(k, heating))
 inputs = [torch.from_numpy(material)[:, None] for material in materials]

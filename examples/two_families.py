@@ -57,7 +57,7 @@ def spread(L, u):
 
 
 def unevenness(L):
-    """Operator -> the loss of the scene. The physics does not care about the form."""
+    """Return the loss of the scene for an operator, whatever the form of the operator is."""
     return lambda u: np.mean(spread(L, u) ** 2)
 
 

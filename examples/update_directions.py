@@ -82,7 +82,7 @@ def physical(rate):
 
 
 def update(x, direction, rate):
-    """What all methods share."""
+    """Apply an update to the variables, as all methods do."""
     return x - rate * direction(x)
 
 

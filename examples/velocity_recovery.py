@@ -62,7 +62,7 @@ seen = carried(hidden)
 
 
 def loss(v):
-    """Squared miss at the end."""
+    """Return the squared error at the end."""
     return np.sum((carried(v) - seen) ** 2)
 
 

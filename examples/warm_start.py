@@ -80,7 +80,7 @@ errors = [smooth_error() for _ in states]
 
 
 def guesses(size):
-    """Guesses whose error is this share of the solution; None for a start from zero."""
+    """Return guesses with the given relative error; None for a start from zero."""
     if size is None:
         return [None] * len(states)
     return [p + size * np.linalg.norm(p) * error for p, error in zip(solutions, errors)]
@@ -95,7 +95,7 @@ def guesses(size):
 
 
 def iterations(method, size, rtol):
-    """Iterations to a relative residual, one count for each state."""
+    """Return the number of iterations to a relative residual, for each state."""
     inv = dp.inverse(box, method, rtol=rtol, nullspace="project")
     counts = []
     for b, guess in zip(states, guesses(size)):

@@ -103,7 +103,7 @@ def guess(w, b):
 
 
 def energy(x, b):
-    """What CG makes small."""
+    """Return the energy, which CG minimizes."""
     return np.sum(x * (0.5 * box(x) - b))
 
 
@@ -127,7 +127,7 @@ batches = [training[i : i + 2] for i in range(0, 64, 2)]
 
 
 def train(loss, w, rate, steps=10 * n):
-    """The weights after so many steps of Adam, and the seconds."""
+    """Return the weights after the given number of steps of Adam, and the run time in seconds."""
     best = dp.minimize(loss, w, "adam", steps, 0, rate=rate, batches=batches)
     return best.x, best.history[-1].seconds
 
