@@ -4,8 +4,8 @@ Burgers: forward, and back
 
 A field that carries itself: published figures forward, and its start found from a later state.
 
-Burgers' equation is the simplest equation in which a flow steepens into a shock. We solve it forward in time and compare
-with published figures. Then we reconstruct the initial state from one later state. Gradient descent shows how such a
+Burgers' equation is the simplest equation in which a flow steepens into a shock. We solve it forward in time and
+compare with published figures. Then we reconstruct the initial state from one later state. Gradient descent shows how a
 search behaves; the last section shows that the inverse problem needs a regularization to have a unique answer.
 
 Run it: ``python examples/burgers.py [cells] [--out FOLDER]``. With ``--observation FILE`` (one number for each cell)

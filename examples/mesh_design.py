@@ -32,9 +32,9 @@ options = parser.parse_args()
 #
 # .. math:: A(k) = \sum_e k_e \, A_e ,
 #
-# and assembly hands out all entries of all :math:`A_e`: a row, a column and a number each, many of them on one place of
-# the matrix. We keep those between inner nodes, since the rim is held at 0. The elements are of second order: those of
-# first order take a pattern of chess for a better conductor than it is.
+# and assembly returns all entries of all :math:`A_e`, each with its row and its column. Many of them have the same row
+# and column. We keep the entries between inner nodes, because the rim is held at 0. The elements are of second order:
+# first-order elements overestimate the conductivity of a checkerboard pattern.
 
 mesh = skfem.MeshTri.init_circle(options.refinements)
 basis = skfem.Basis(mesh, skfem.ElementTriP2())
