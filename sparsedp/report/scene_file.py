@@ -1,8 +1,8 @@
-"""A scene in a file that is named on the command line, and the folder that its results are written to.
+"""Load a scene (a loss and a point) from a Python file named on the command line, and create the folder of results.
 
-The code of a user may end or disturb the process that runs it. What is changed in the process while that code runs
-(standard output, ``sys.argv``, ``sys.path``, ``os._exit``) is restored at the end of each block, also after an error.
-The functions here are called by ``python -m sparsedp`` alone.
+The user's code may end the process or change its state. While it runs, standard output, ``sys.argv``, ``sys.path`` and
+``os._exit`` are replaced. They are restored afterwards, also after an error. Only ``python -m sparsedp`` calls the
+functions of this module.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from sparsedp._utils.calls import warn_deprecated
 
 __all__ = ["SceneFile", "claim_folder", "free_folder", "guarded", "load_scene"]
 
-POINT_NAMES = ("start", "x")  # the first that the file defines is the point
-OPTIONS = ("work_precision", "stress")  # instruments whose arguments the file may hold, as dicts NAME_options
+POINT_NAMES = ("start", "x")  # names of the point; the first one that the file defines is used
+OPTIONS = ("work_precision", "stress")  # the file may define their arguments as a dict NAME_options
 
 
 class SceneFile(NamedTuple):
-    """A loss and a point from a file, and arguments for the instruments.
+    """A loss and a point from a file, and arguments for `work_precision` and `stress`.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class SceneFile(NamedTuple):
         ``loss(x)``.
     x : tree of arrays
     options : dict
-        Name of an instrument: dict of its arguments.
+        Dict of arguments for "work_precision" and "stress".
     """
 
     name: str
@@ -46,19 +46,19 @@ class SceneFile(NamedTuple):
 
 
 def load_scene(target: str) -> SceneFile:
-    """Run a file once, as a module, and return the scene that it defines; what it prints goes to stderr.
+    """Run a file once, as a module, and return the scene that it defines. Its output is redirected to stderr.
 
     Parameters
     ----------
     target : str
-        ``FILE.py[:loss[:start]]``. Without a name the loss is called `loss`, and the point `start` or `x`; a point
-        that is a tuple fills a loss of several arguments. The file may define two dicts of arguments:
+        ``FILE.py[:loss[:start]]``. The default name of the loss is `loss`, that of the point `start` or `x`. If the
+        loss takes several arguments, the point is the tuple of arguments. The file may also define the dicts
         `work_precision_options` (problem, methods, ...) and `stress_options` (ranges, step, ...).
 
     Raises
     ------
     ValueError
-        If there is no such file, it does not run, or a name is missing.
+        If the file does not exist or raises an error, or if a name is missing.
     """
     parts = re.fullmatch(r"(.+\.py)(?::([^:]+))?(?::([^:]+))?", target)
     if parts is None:
@@ -92,7 +92,7 @@ def load_scene(target: str) -> SceneFile:
 
 
 def _with_one_argument(loss: Callable[..., Any], point: Any) -> Callable[[Any], Any]:
-    """Return a loss as a function of one point: a tuple fills a loss of several arguments."""
+    """Return a loss as a function of one argument. A point that is a tuple is unpacked if the loss takes several."""
     if not isinstance(point, tuple):
         return loss
     try:
@@ -103,7 +103,7 @@ def _with_one_argument(loss: Callable[..., Any], point: Any) -> Callable[[Any], 
 
 
 def _run(file: Path) -> dict[str, Any]:
-    """Run a file as the command ``python FILE`` would, and return its names."""
+    """Run a file with the ``sys.argv`` and ``sys.path`` of ``python FILE``; return its global names."""
     if not os.path.isfile(file):  # Path.is_file raises for a name that is too long
         raise ValueError(f"there is no file {file}; name one that is there")
     arguments = sys.argv
@@ -118,19 +118,19 @@ def _run(file: Path) -> dict[str, Any]:
         sys.path = path
 
 
-# ---------------------------------------------------------------- code of the user
+# ---------------------------------------------------------------- run code of the user
 
 
 @contextlib.contextmanager
 def guarded(name: str = "", file: str = "") -> Iterator[None]:
-    """Run code of the user: it prints to stderr, and what it raises becomes a ValueError, also an exit.
+    """Run user code in a `with` block: its output goes to stderr, and all exceptions and exits become ValueError.
 
     Parameters
     ----------
     name : str
-        Of its loss, for the message.
+        Name of the loss, for the message.
     file : str
-        The file, if it is the file itself that runs.
+        Name of the file, if the file itself is run.
     """
     try:
         with contextlib.redirect_stdout(sys.stderr), _exit_as_an_error():
@@ -150,8 +150,8 @@ def guarded(name: str = "", file: str = "") -> Iterator[None]:
 def _exit_as_an_error() -> Iterator[None]:
     """Let ``os._exit`` raise SystemExit within the block, so that the user's code cannot choose the exit code.
 
-    The function is replaced in the whole process until the block ends; nothing less sees an exit that runs no
-    handlers. Child processes, which end this way, are not affected.
+    The function is replaced in the whole process until the block ends, because there is no other way to intercept it.
+    Child processes, which normally end by ``os._exit``, are not affected.
     """
     original = os._exit
     process = os.getpid()
@@ -169,7 +169,7 @@ def _exit_as_an_error() -> Iterator[None]:
 
 
 def _line_of(error: BaseException, file: str) -> str:
-    """Return in words the last line of a file that took part in an error; empty if none did."""
+    """Return "line N: " for the last line of a file in the traceback of an error; "" if there is none."""
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
     if isinstance(error, SyntaxError) and error.filename == file:
         lines.append(error.lineno)
@@ -182,7 +182,7 @@ def _line_of(error: BaseException, file: str) -> str:
 
 
 def free_folder(folder: Path, names: Sequence[str], force: bool) -> Path:
-    """Return a folder, or if it holds one of these files and `force` is not set the first of folder-2, folder-3, ..."""
+    """Return `folder`, or the first of folder-2, folder-3, ... that has none of these files (unless `force`)."""
     free = folder
     number = 1
     while not force and any(os.path.lexists(free / name) for name in names):
@@ -192,7 +192,7 @@ def free_folder(folder: Path, names: Sequence[str], force: bool) -> Path:
 
 
 def claim_folder(folder: Path, names: Sequence[str], force: bool) -> None:
-    """Create a folder, and refuse if it holds one of these files and `force` is not set."""
+    """Create a folder. Raise ValueError if it has one of these files and `force` is not set."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

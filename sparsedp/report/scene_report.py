@@ -1,7 +1,7 @@
-"""The report on a scene: all instruments in one folder.
+"""Write a report on a scene: gradient check, run times, error estimates, work and stress test, in one folder.
 
-The folder gets Markdown, CSV and pictures of each instrument, and a page that says what they say, in two formats:
-report.md, and report.html, which holds all of it.
+The folder gets files in Markdown, CSV and PNG format for each of them, and a summary in two formats: report.md, which
+links to these files, and report.html, which contains all results.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ __all__ = ["PAGES", "write_report"]
 
 PAGES = ("report.md", "report.html")
 NO_PROBLEM = "the file gives no work_precision_options (problem, methods, over)"
-MEANINGS = {  # the worst first: one that is wrong decides before one that is open
+MEANINGS = {  # from worst to best; the worst verdict of all parts is that of the report
     "disagrees": "Something is wrong: the gradient is not what differences of the loss say, or a case below FAILED.",
     "inconclusive": "Nothing is proved: the reason stands below. This is no pass.",
     "agrees": "The gradient is what differences of the loss say, and no stiff or extreme case failed.",
@@ -47,12 +47,12 @@ def write_report(scene: SceneFile, folder: Path, force: bool = False) -> tuple[s
     -------
     verdict : "agrees", "disagrees" or "inconclusive"
     sentences : list of str
-        What stands on the page.
+        The sentences of the report.
 
     Raises
     ------
     ValueError
-        If there is a report already, the folder cannot be written, or the loss ends the program.
+        If a report exists already and `force` is not set, the folder cannot be written, or the loss ends the program.
     OSError
         If a file cannot be written.
     """
@@ -87,7 +87,7 @@ def write_report(scene: SceneFile, folder: Path, force: bool = False) -> tuple[s
 
 
 def _verdict_of(results: list[Any]) -> str:
-    """Return the verdict of the report: the worse one of the audit, which is first, and the stress cases, last."""
+    """Return the worse verdict of the audit (the first result) and of the stress cases (the last result)."""
     verdicts = [getattr(result, "verdict", "inconclusive") for result in (results[0], results[-1])]
     return next(verdict for verdict in MEANINGS if verdict in verdicts)
 
@@ -108,57 +108,57 @@ def _chapter_in_markdown(chapter: Chapter, sentences: list[str], files: list[Pat
 
 
 def _attempt(chapter: Chapter, scene: SceneFile) -> Any:
-    """Return the result of an instrument, or in words why there is none: one that fails does not stop the others."""
+    """Return the result of a chapter, or the error as text, so that a failed chapter does not stop the others."""
     try:
         return chapter.run(scene.loss, scene.x, **scene.options.get(chapter.stem, {}))
-    except Exception as error:  # the loss is the user's: it may raise anything
+    except Exception as error:  # the user's loss may raise any exception
         return error_text(error)
 
 
 def _measure_work_precision(loss: Any, x: Any, **options: Any) -> Any:
-    """Measure error against run time, if the file has options for it."""
+    """Return the result of `work_precision`, or a sentence if the file defines no options for it."""
     if not options:
         return NO_PROBLEM
     return work_precision(**options)
 
 
 def _draw_nothing(result: Any) -> None:
-    """Draw no picture."""
+    """Return None: the chapter has no plot."""
 
 
 def _draw_v_curve(audit: Any) -> Callable[[Any], Any]:
-    """Return what draws the V-curve of an audit on axes."""
+    """Return the function that plots the V-curve of an audit on axes."""
     return partial(plots.v_curve, audit)
 
 
 def _draw_stability_map(stress_result: Any) -> Callable[[Any], Any] | None:
-    """Return what draws the stability map, None without one."""
+    """Return the function that plots the stability map; None if there is no map."""
     if stress_result.map:
         return stress_result.plot
     return None
 
 
 def _draw_rows(rows: Any) -> Callable[[Any], Any]:
-    """Return what draws error against run time on axes."""
+    """Return the function that plots error against run time on axes."""
     return rows.plot
 
 
 class Chapter(NamedTuple):
-    """An instrument of the report.
+    """A chapter of the report.
 
     Attributes
     ----------
     stem : str
-        Of its files.
+        Name of its files, without suffix.
     title : str
     failed : str
-        Beginning of the sentence where it has no result.
+        Beginning of the sentence that is written if there is no result.
     run : callable
-        ``run(loss, x, **options)`` returns a Result, or in words why there is none.
+        ``run(loss, x, **options)`` returns a Result, or a sentence that says why there is none.
     draw : callable
-        ``draw(result)`` returns what draws it on axes, or None.
+        ``draw(result)`` returns a function that plots the result on axes, or None.
     caption : str
-        How to read the picture.
+        How to read the plot.
     """
 
     stem: str

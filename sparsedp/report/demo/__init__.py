@@ -1,6 +1,6 @@
-"""The demo: find the hidden ground from well readings. Read in this order.
+"""The demo: estimate the conductivity of the ground from pressures measured at sensors. Read the files in this order.
 
-scene.py     the physics: wells, readings, the loss. The part to copy for a problem of your own
-story.py     the same scene on three grids: check the gradient, recover, count, time; what is printed and written
-terrain.py   the field that serves as the hidden ground: a plain 2-D array from any file, on any grid
+scene.py     the physical model, the synthetic measurements and the loss; copy it for a problem of your own
+story.py     run the problem on three grids: check the gradient, minimize, measure, print and write the results
+terrain.py   load the field that serves as the true conductivity, and average it to any grid
 """

@@ -1,12 +1,12 @@
-"""The physics of the demo: pump at some wells, read the pressure at many sensors, find the ground.
+"""The model of the demo: pump at some wells, measure the pressure at many sensors, estimate the conductivity.
 
-The ground is a box. Its sides across x are rivers (pressure 0), the other sides are tight. With the
-conductivity k and a pump of rate 1 at a well, the pressure p that sets in solves
+The domain is a box. The two boundaries at the ends of x are rivers (pressure 0), and there is no flow through the other
+boundaries. For the conductivity k and a pump of rate 1 at a well, the steady pressure p solves
 
-    -div(k grad p) = b,        p = 0 at the rivers,   dp/dn = 0 at the tight sides.
+    -div(k grad p) = b,        p = 0 at the rivers,   dp/dn = 0 at the other boundaries.
 
-Every well is pumped in turn, and each time all sensors are read. Unknown is log k, one number for
-each cell. Lengths are in units of the longest side, pressures in rate / conductivity.
+In each experiment one well is pumped, and the pressure is measured at all sensors. The unknown is log k in each cell.
+Lengths are in units of the longest side, pressures in units of rate / conductivity.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ import sparsedp as dp
 __all__ = ["NOISE", "Ground", "Survey", "centres_of", "objective", "regulariser", "survey"]
 
 RIVERS = {"x": dp.dirichlet, "y": dp.neumann}
-RADIUS = 0.05  # of the gravel pack around a well [longest side]
-RTOL = 1e-10  # of every solve, on its true residual
-NOISE = 0.005  # of a reading, relative to the mean square over the sensors
-SMOOTHNESS = 6e-4  # weight of the regulariser, against misfit / noise
+RADIUS = 0.05  # radius of the source around a well, in units of the longest side
+RTOL = 1e-10  # relative tolerance of each solve
+NOISE = 0.005  # standard deviation of a measurement, relative to the root mean square over the sensors
+SMOOTHNESS = 6e-4  # weight of the regularization relative to the misfit
 SEED = 0  # of the noise
-WELLS = (4, 3)  # along the axes
+WELLS = (4, 3)  # number along each axis
 SENSORS = (24, 20)
 
 
 class Ground:
-    """The forward model on one grid: the readings of all experiments as a function of log-conductivity."""
+    """The forward model on one grid: the measurements of all experiments as a function of the log-conductivity."""
 
     def __init__(self, grid: dp.Grid, wells: np.ndarray, sensors: np.ndarray) -> None:
         self.grid = grid
@@ -42,20 +42,20 @@ class Ground:
         self.pumps = [pump(grid, well) for well in wells]
 
     def readings(self, logk: Any) -> Any:
-        """Return the pressure at the sensors, shape (wells, sensors), for a log-conductivity on cells."""
+        """Return the pressures at the sensors, an array of shape (wells, sensors), for a log-conductivity on cells."""
         k = self.to_faces(np.exp(logk))
         return np.stack([self.read(self.solve(k, b)) for b in self.pumps])
 
 
 def pump(grid: dp.Grid, well: np.ndarray) -> np.ndarray:
-    """Return the source of a well on cells: a bell of width `RADIUS` whose integral is 1, on every grid."""
+    """Return the source of a well on cells: a Gaussian of standard deviation `RADIUS`, normalized to integral 1."""
     x, y = grid.centres()
     bell = np.exp(-((x - well[0]) ** 2 + (y - well[1]) ** 2) / (2 * RADIUS**2))
     return bell / np.sum(bell * grid.volumes)
 
 
 def objective(ground: Ground, data: Survey) -> Callable[[Any], Any]:
-    """Return the loss: half the mean square misfit to the readings, plus the roughness of log k."""
+    """Return the loss: half the mean square misfit to the measurements, plus the regularization of log k."""
     roughness = regulariser(ground.grid)
 
     def loss(logk: Any) -> Any:
@@ -66,15 +66,15 @@ def objective(ground: Ground, data: Survey) -> Callable[[Any], Any]:
 
 
 def regulariser(grid: dp.Grid) -> Callable[[Any], Any]:
-    """Return the roughness of log k: SMOOTHNESS times half the integral of its squared slope."""
+    """Return the regularization as a function of log k: SMOOTHNESS / 2 times the integral of |grad log k|^2."""
     roughness = dp.smoothness(grid)
     return lambda logk: SMOOTHNESS * roughness(logk)
 
 
 class Survey(NamedTuple):
-    """What is known about the ground: where the wells and sensors are, and what was read.
+    """The data of the inverse problem: positions of wells and sensors, and the measured pressures.
 
-    `readings` has the shape (wells, sensors); `noise` is the standard deviation in each experiment.
+    `readings` has shape (wells, sensors). `noise` is the standard deviation of the noise in each experiment.
     """
 
     wells: np.ndarray
@@ -84,16 +84,19 @@ class Survey(NamedTuple):
 
 
 def survey(grid: dp.Grid, logk: np.ndarray) -> Survey:
-    """Return the survey of a hidden ground, on a grid of its own, finer than those that invert it."""
+    """Generate synthetic measurements, with noise, from a known log-conductivity.
+
+    The grid is finer than the grids on which the inverse problem is solved, so that data and model differ.
+    """
     wells = centres_of(dp.Grid(WELLS, size=grid.size))
     sensors = centres_of(dp.Grid(SENSORS, size=grid.size))
     exact = Ground(grid, wells, sensors).readings(logk)
     noise = NOISE * np.sqrt(np.mean(exact**2, axis=1, keepdims=True))
-    # Uniform numbers of standard deviation 1: their stream is the same with every version of NumPy.
+    # Uniform random numbers with standard deviation 1. `random` gives the same numbers in all versions of NumPy.
     errors = np.sqrt(12) * (default_rng(SEED).random(exact.shape) - 0.5)
     return Survey(wells, sensors, exact + noise * errors, noise)
 
 
 def centres_of(grid: dp.Grid) -> np.ndarray:
-    """Return the centres of the cells of a grid as points, shape (m, 2)."""
+    """Return the cell centres of a grid as an array of points, shape (m, 2)."""
     return np.stack([centres.ravel() for centres in grid.centres()], axis=1)

@@ -1,6 +1,6 @@
-"""The demo from the first line to the last: hide a ground, survey it, check the gradient, recover it on three grids.
+"""Run the demo: generate synthetic data from a known field, check the gradient, and estimate the field on three grids.
 
-Progress is printed; pictures, the table and the recovered field are written to files.
+Progress is printed. The plots, the table and the estimated field are written to files.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from sparsedp.report.scene_file import claim_folder
 
 __all__ = ["FILES", "Study", "grids_for", "prepare", "tell"]
 
-SMALLEST = 12  # cells along the longest side
+SMALLEST = 12  # smallest and largest number of cells along the longest side
 LARGEST = 512
-THINNEST = 0.25  # shortest side of the box
+THINNEST = 0.25  # smallest length of the shorter side of the box
 ITERATIONS = 80
-WARM_UP = 2  # iterations whose time is not measured
+WARM_UP = 2  # number of iterations before the measured run
 ARRAYS = ("table.csv", "convergence.csv", "recovered.npy")
 PICTURES = ("truth.png", "recovery.png", "convergence.png")
 FILES = (*ARRAYS, *PICTURES)
@@ -38,7 +38,7 @@ SHOWN = ("grid", "unknowns", "gradient", "iterations", *COUNTED, "seconds", "mis
 
 
 class Study(NamedTuple):
-    """What all grids share: the survey, and the hidden ground they try to find, on the finest of them."""
+    """The data that all grids share: the measurements, and the true log-conductivity on the finest grid."""
 
     terrain: Terrain
     grids: list
@@ -47,9 +47,9 @@ class Study(NamedTuple):
 
 
 def grids_for(terrain: Terrain, size: int) -> list[dp.Grid]:
-    """Return three grids in the proportions of a terrain, the longest side of length 1.
+    """Return three grids with the aspect ratio of a terrain. The longest side has length 1.
 
-    They have half, three quarters and all of `size` cells along the longest side.
+    Along the longest side the grids have size / 2, 3 size / 4 and `size` cells.
 
     Raises
     ------
@@ -64,12 +64,12 @@ def grids_for(terrain: Terrain, size: int) -> list[dp.Grid]:
 
 
 def prepare(terrain: Terrain, grids: list[dp.Grid]) -> Study:
-    """Hide the ground, and compute the survey on a grid twice as fine as the finest.
+    """Generate the true field and the synthetic measurements on a grid twice as fine as the finest grid.
 
     Raises
     ------
     ValueError
-        If the terrain is constant at this size.
+        If the terrain is constant after it is averaged to the cells.
     """
     fine = dp.Grid(tuple(2 * n for n in grids[-1].shape), size=grids[-1].size)
     hidden = hidden_ground(fine, terrain)
@@ -77,17 +77,18 @@ def prepare(terrain: Terrain, grids: list[dp.Grid]) -> Study:
 
 
 def recover(study: Study, grid: dp.Grid) -> tuple[np.ndarray, dict[str, Any], list[dict[str, Any]]]:
-    """Check the gradient, then find the ground by L-BFGS, with a progress bar on a terminal.
+    """Check the gradient, and estimate the log-conductivity by L-BFGS, with a progress bar on a terminal.
 
-    Two iterations run beforehand, on a ground of their own: the seconds do not contain compilation.
+    A separate run of two iterations comes first, so that the measured time does not include compilation.
 
     Returns
     -------
     logk : ndarray
-        Log-conductivity.
+        The estimated log-conductivity.
     row : dict
-        Of the table. Misfit: root mean square of (computed - read) / noise, 1 is a fit within the noise. Error:
-        distance from the truth, relative, 1 for the flat start.
+        The row of the table for this grid. The misfit is the root mean square of (computed - measured) / noise; a value
+        of 1 means that the data are fitted up to noise. The error is the relative distance from the true field; it is 1
+        at the start, where log k = 0.
     iterations : list of dict
         The grid, number, seconds, misfit and error of each iteration.
     """
@@ -97,10 +98,10 @@ def recover(study: Study, grid: dp.Grid) -> tuple[np.ndarray, dict[str, Any], li
     progress = _Progress(study, grid)
     with recording() as calls, progress:
         best = dp.minimize(loss, np.zeros(grid.shape), maxiter=ITERATIONS, callback=progress.note, memory=20)
-    if best.message.startswith("interrupted"):  # minimize keeps its best point; the demo ends
+    if best.message.startswith("interrupted"):  # minimize returns its best point after Ctrl-C; end the demo
         raise KeyboardInterrupt
     rows = progress.rows
-    if best.history[-1].iteration > len(rows):  # the iteration that meets the tolerance is not reported
+    if best.history[-1].iteration > len(rows):  # minimize does not call the callback for the iteration that converges
         progress.note(best.history[-1], best.x)
     last = rows[-1]
     misfit_and_error = f"misfit/noise {last['misfit']:.3f}, error {last['error']:.3f}"
@@ -113,27 +114,27 @@ def recover(study: Study, grid: dp.Grid) -> tuple[np.ndarray, dict[str, Any], li
 
 
 def _check_gradient(study: Study, grid: dp.Grid, loss: Any) -> Any:
-    """Check the gradient at a ground without special values, and print the result."""
+    """Check the gradient at a field with generic values, and print the result."""
     x, y = grid.centres()
     check = dp.check.gradient(loss, 0.5 * np.sin(5 * x + 1) * np.cos(4 * y), directions=1)
-    # one table is enough
+    # Print the whole table only once.
     if grid is study.grids[-1]:
         shown = str(check)
     else:
         shown = f"  {check.verdict}"
-    print(f"On {grid}. Is the gradient right?", shown, sep="\n", flush=True)  # a log is read while it is written
+    print(f"On {grid}. Is the gradient right?", shown, sep="\n", flush=True)  # at once, also in a log file
     return check
 
 
 def _warm_up(study: Study, grid: dp.Grid) -> None:
-    """Run some iterations whose time is not measured."""
+    """Run a few iterations, so that code is compiled before the measured run."""
     loss = objective(Ground(grid, study.data.wells, study.data.sensors), study.data)
     with recording():
         dp.minimize(loss, np.zeros(grid.shape), maxiter=WARM_UP, memory=20)
 
 
 class _Progress:
-    """The iterations of one run, noted, and counted by a bar on a terminal that has tqdm."""
+    """Record the iterations of one run, and show a progress bar on a terminal if tqdm is installed."""
 
     def __init__(self, study: Study, grid: dp.Grid) -> None:
         self.name = " x ".join(map(str, grid.shape))
@@ -152,7 +153,7 @@ class _Progress:
             self.bar.close()
 
     def note(self, record: Any, logk: np.ndarray) -> None:
-        """Note an iteration."""
+        """Record an iteration. This is the callback of `minimize`."""
         misfit = float(np.sqrt(max(0.0, 2 * (record.value - self.roughness(logk)))))
         error = distance(self.to_finest(logk), self.truth)
         numbers = {"iterations": len(self.rows) + 1, "seconds": record.seconds, "misfit": misfit, "error": error}
@@ -165,7 +166,7 @@ class _Progress:
 
 
 def tell(study: Study, folder: Path, force: bool) -> bool:
-    """Run the demo, print what happens, write the files.
+    """Run the demo, print the progress, and write the files.
 
     Parameters
     ----------
@@ -184,7 +185,7 @@ def tell(study: Study, folder: Path, force: bool) -> bool:
     OSError
         If a file cannot be written.
     ValueError
-        If one has appeared there during the run, and `force` is not set.
+        If one of the files has been created by another process during the run, and `force` is not set.
     """
     print(INTRODUCTION.format(s=study, d=study.data, noise=100 * NOISE), flush=True)
     rows = []
@@ -195,7 +196,7 @@ def tell(study: Study, folder: Path, force: bool) -> bool:
         runs.append(run)
     print("Error against run time. Misfit/noise 1: the readings are met to the noise. Error 1: the flat start.")
     print(table_of(rows, SHOWN), end="\n\n")
-    claim_folder(folder, FILES, force)  # again: files may have appeared during the run
+    claim_folder(folder, FILES, force)  # check again: files may have been created during the run
     write_file(folder / "table.csv", table_of(rows).csv())
     write_file(folder / "convergence.csv", table_of([iteration for run in runs for iteration in run]).csv())
     write_file(folder / "recovered.npy", lambda stream: np.save(stream, logk, allow_pickle=False))
@@ -224,7 +225,7 @@ To try next:
 
 
 def _map(study: Study, title: str, field: np.ndarray, ax: Any) -> Any:
-    """Draw a field with the wells and the sensors; truth and recovery with the same colours."""
+    """Plot a field with wells and sensors. True and estimated field have the same colour scale."""
     limits = float(study.truth.min()), float(study.truth.max())
     plots.plot(study.grids[-1], field, ax, title, "log of conductivity / mean conductivity", limits)
     ax.plot(*study.data.sensors.T, ".", color="black", markersize=1, alpha=0.6)
@@ -233,6 +234,6 @@ def _map(study: Study, title: str, field: np.ndarray, ax: Any) -> Any:
 
 
 def _convergence(runs: list[list[dict[str, Any]]], ax: Any) -> Any:
-    """Draw error against run time, one curve for each grid."""
+    """Plot error against run time, with one curve for each grid."""
     lines = {f"{run[0]['grid']} cells": [(row["seconds"], row["error"]) for row in run] for run in runs}
     return plots.curves(lines, ax, "run time [s]", "relative error of log conductivity (flat start: 1)")

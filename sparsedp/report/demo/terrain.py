@@ -1,6 +1,6 @@
-"""The field that serves as the hidden ground: real terrain, the reader's own file, or a generated one.
+"""The field that serves as the true log-conductivity: real terrain, a file of the user, or a generated field.
 
-Files are read by NumPy, which unpickles nothing.
+Files are read by NumPy without pickle.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from sparsedp.report.demo.scene import centres_of
 __all__ = ["Terrain", "hidden_ground", "load", "read_field", "remap"]
 
 SAMPLE = "jacksboro_fault_dem.npz"
-FINEST = 8  # points along an axis that are averaged into one cell
-STEEPEST = 3.5  # bound on |log k|: conductivities then span a factor of at most 1000
-MOST = 10**8  # values of a file; a field of the demo is a map, not an archive
-LEAST = 4  # values along an axis
+FINEST = 8  # largest number of points along an axis that are averaged to one cell
+STEEPEST = 3.5  # bound on |log k|, so that conductivities differ by a factor of at most 1000
+MOST = 10**8  # largest number of values in a file
+LEAST = 4  # smallest number of values along an axis
 
 
 class Terrain(NamedTuple):
-    """A 2-D array, axis 0 is x, and where it came from."""
+    """A 2-D array, whose axis 0 is x, and a description of its source."""
 
     field: np.ndarray
     source: str
@@ -39,7 +39,7 @@ def load(path: Path | None = None) -> Terrain:
     Parameters
     ----------
     path : pathlib.Path or None
-        None: the sample data of matplotlib, or a generated terrain.
+        Default: the sample data of matplotlib, or a generated terrain if matplotlib is not installed.
 
     Returns
     -------
@@ -48,7 +48,7 @@ def load(path: Path | None = None) -> Terrain:
     Raises
     ------
     ValueError, ImportError
-        From `read_field`, when `path` does not hold a usable field.
+        Raised by `read_field` if the file has no usable field.
     """
     if path is not None:
         return Terrain(read_field(path), f"your file {path}")
@@ -62,16 +62,16 @@ def load(path: Path | None = None) -> Terrain:
 
 
 def generated(shape: tuple[int, int]) -> np.ndarray:
-    """Return winding ridges, the same in every run."""
+    """Return a smooth field with winding ridges. It is the same in every run."""
     x, y = np.indices(shape) / max(shape)
     return np.sin(9 * x + 2 * np.sin(7 * y)) + 0.5 * np.cos(17 * y - 5 * x)
 
 
 def remap(source: dp.Grid, grid: dp.Grid) -> dp.Operator:
-    """Return the operator from cells of a grid to cells of another one over the same box: the mean over each cell.
+    """Return the operator that averages a cell field to the cells of another grid on the same box.
 
-    Each cell is cut into `FINEST` parts or fewer along each axis, the field is interpolated there
-    (`sample`), and the parts are averaged (`restrict`). Linear fields are exact.
+    Each target cell is divided into at most `FINEST` parts along each axis. The field is interpolated to these parts
+    (`sample`), which are then averaged (`restrict`). Linear fields are mapped exactly.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def remap(source: dp.Grid, grid: dp.Grid) -> dp.Operator:
 
 
 def hidden_ground(grid: dp.Grid, terrain: Terrain) -> np.ndarray:
-    """Return a terrain as log-conductivity on a grid: mean 0, standard deviation 1 (or a little less).
+    """Return a terrain as log-conductivity on a grid, with mean 0 and standard deviation 1 (or a little less).
 
     Parameters
     ----------
@@ -103,12 +103,13 @@ def hidden_ground(grid: dp.Grid, terrain: Terrain) -> np.ndarray:
 
     Returns
     -------
-    array, shape `grid.shape`: log of the conductivity, relative to its geometric mean
+    array, shape `grid.shape`
+        Logarithm of the conductivity divided by its geometric mean.
 
     Raises
     ------
     ValueError
-        If the field is constant once it is averaged over the cells.
+        If the field is constant after it is averaged to the cells.
     """
     heights = remap(dp.Grid(terrain.field.shape, size=grid.size), grid)(terrain.field)
     heights = heights - heights.mean()
@@ -125,7 +126,7 @@ def hidden_ground(grid: dp.Grid, terrain: Terrain) -> np.ndarray:
 def read_field(path: Path) -> np.ndarray:
     """Read a finite field of shape (nx, ny) from a .npy, .npz or .png file.
 
-    An array is taken as a field: axis 0 is x. A picture has its rows from the top, and is rotated.
+    Axis 0 of an array is x. The rows of a .png image run from top to bottom; they are converted to this convention.
 
     Parameters
     ----------
@@ -138,9 +139,9 @@ def read_field(path: Path) -> np.ndarray:
     Raises
     ------
     ValueError
-        If there is no such file, or it is not a real, finite 2-D array.
+        If the file does not exist, or does not have a real, finite 2-D array.
     ImportError
-        If a picture is given and matplotlib is not installed.
+        If the file is an image and matplotlib is not installed.
 
     Examples
     --------
@@ -151,7 +152,7 @@ def read_field(path: Path) -> np.ndarray:
     array([0.03125, 0.03125, 0.03125, 0.125  ])
     """
     readers: dict[str, Any] = {
-        ".npy": partial(np.load, mmap_mode="r"),  # mapped into memory: its header may promise more than it holds
+        ".npy": partial(np.load, mmap_mode="r"),  # memory-mapped: a wrong header must not allocate memory
         ".npz": _only_map,
         ".png": _grey,
     }
@@ -164,7 +165,7 @@ def read_field(path: Path) -> np.ndarray:
         field = reader(path)
     except ImportError:
         raise
-    except Exception as error:  # foreign bytes fail in many ways, all with the same meaning
+    except Exception as error:  # readers raise errors of many classes for damaged files
         reason = getattr(error, "strerror", None) or error
         raise ValueError(f"{path} cannot be read ({reason}); save the field with numpy.save") from error
     if field.ndim != 2 or min(field.shape) < LEAST:
@@ -176,12 +177,12 @@ def read_field(path: Path) -> np.ndarray:
     with np.errstate(over="ignore"):
         field = field.astype(float)
     check_finite(path, field, "needs finite values")
-    # By a power of two: nothing is rounded, nothing overflows.
+    # Scale by a power of two, which causes no rounding errors.
     return np.ldexp(field, -np.frexp(np.abs(field).max())[1])
 
 
 def _grey(path: Path) -> np.ndarray:
-    """Return the grey values of a picture, whose rows run from the top."""
+    """Return the grey values of an image. Its rows run from top to bottom; axis 0 of the result is x."""
     with plots.opened(path) as picture:
         return np.asarray(picture.convert("F"))[::-1].T
 
