@@ -1,4 +1,4 @@
-"""Examine a gradient along all directions of an audit: sweep, weigh, and take more steps where these are undecided."""
+"""Examine a gradient along all directions of an audit, with more steps along directions without a decision."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from sparsedp.check.thresholds import THRESHOLDS
 __all__ = ["RANDOM_DIRECTIONS", "examine_directions", "excuse_kinks"]
 
 RANDOM_DIRECTIONS = 3
-# The step to the point where a loss with kinks is examined again: its length in units of x, and its seed.
+# A loss with kinks is examined again at a point at this distance from x (in units of x), in a random direction.
 SHIFT = 2.0**-6
 SHIFT_SEED = 7
 
@@ -39,18 +39,19 @@ def examine_directions(
     ----------
     evaluations : Evaluations
     count, rng, is_wanted
-        As in `Point.directions`.
+        See `Point.directions`.
 
     Returns
     -------
     directions : list of DirectionEvidence
-        Empty where loss or gradient is not finite.
+        Empty if loss or gradient is not finite.
     findings : list of (str, str)
-        Word and reason of what was found before.
+        (word, reason) of each problem with the values of loss and gradient at the point.
 
     Notes
     -----
-    The noise belongs to the loss, not to a direction: the larger one along the first and the last counts for all.
+    The noise is a property of the loss. It is measured along the first and the last direction, and the larger value is
+    used for all directions.
     """
     point = evaluations.point
     evaluations.start()
@@ -77,7 +78,7 @@ def examine_directions(
 
 
 def _find_unsound_values(evaluations: Evaluations, slopes: NDArray[Any], again: NDArray[Any]) -> list[tuple[str, str]]:
-    """Return what is wrong with the values of loss and gradient at the point."""
+    """Return findings about values at the point that are not finite, not deterministic or too small."""
     point = evaluations.point
     base = evaluations.base
     findings = []
@@ -100,7 +101,7 @@ def _find_unsound_values(evaluations: Evaluations, slopes: NDArray[Any], again: 
 
 
 def _first_non_finite(values: NDArray[Any]) -> str:
-    """Return in words where the first NaN or infinity of an array is; empty for a single number."""
+    """Return a phrase with the position of the first NaN or infinity in an array; "" for a scalar."""
     is_finite = np.isfinite(values)
     if not is_finite.ndim:
         return ""
@@ -108,13 +109,13 @@ def _first_non_finite(values: NDArray[Any]) -> str:
 
 
 def _examine_line(line: Line, seek_ripples: bool) -> DirectionEvidence:
-    """Sweep and weigh a line, and go on with other steps where the derivative stays undecided.
+    """Evaluate the loss along a line and return the evidence. Add more steps if there is no decision.
 
     Parameters
     ----------
     line : Line
     seek_ripples : bool
-        Whether steps far below the plateau are tried where there is noise, though all agrees.
+        If True, and the loss has noise, also try steps far below the plateau when gradient and differences agree.
     """
     line.sweep(line.evaluations.steps)
     evidence = weigh(line)
@@ -138,9 +139,10 @@ def _examine_line(line: Line, seek_ripples: bool) -> DirectionEvidence:
 
 
 def _note_ripple(evidence: DirectionEvidence, finer: DirectionEvidence) -> None:
-    """Change the word to "ripple" where fine steps, which rounding does not hide, agree on another derivative.
+    """Change the word to "ripple" if several fine steps agree on another derivative than the coarse steps.
 
-    The plateau of coarse steps is no proof then: the derivative at x differs from the slope of the whole.
+    Only steps at which rounding cannot explain the difference are used. The plateau at coarse steps then does not show
+    the derivative at x.
     """
     run = THRESHOLDS.ripple_run
     agreement = THRESHOLDS.ripple_agreement
@@ -162,10 +164,10 @@ def _note_ripple(evidence: DirectionEvidence, finer: DirectionEvidence) -> None:
 
 @np.errstate(all="ignore")
 def _excuse_hidden_ripple(evidence: DirectionEvidence) -> None:
-    """Change the word to "ripple" where a ripple below the noise of the loss may explain a gap.
+    """Change the word to "ripple" if a ripple below the noise of the loss may explain a gap.
 
-    A gradient that bends by as much as the gap, within steps over which the gap does not change the loss beyond its
-    noise, belongs to a loss whose ripple no difference can see.
+    This is the case if the gradient itself varies by about as much as the gap over a step that is so short that the gap
+    changes the loss by less than its noise. Finite differences cannot detect such a ripple.
     """
     line = evidence.line
     noise = max(2.0, evidence.jitter) * line.evaluations.eps * abs(line.base)
@@ -178,7 +180,7 @@ def _excuse_hidden_ripple(evidence: DirectionEvidence) -> None:
             bend = _bend_of_gradient(line, step)
             if not bend > visible:
                 continue
-            # At a kink the gradient jumps, however near.
+            # At a kink the gradient also varies over a much shorter step.
             if bend > 2 * _bend_of_gradient(line, THRESHOLDS.ripple_smoothness * step):
                 evidence.word = "ripple"
                 evidence.note = (
@@ -189,7 +191,7 @@ def _excuse_hidden_ripple(evidence: DirectionEvidence) -> None:
 
 
 def _bend_of_gradient(line: Line, step: float) -> float:
-    """Return how far the slopes on both sides of x are from twice the slope at x."""
+    """Return |g(x + t d) . d + g(x - t d) . d - 2 g(x) . d| for the step t."""
     total = 0.0
     for side in (step, -step):
         end = line.point.unpack(line.point.vector + side * line.direction)
@@ -201,10 +203,11 @@ def _bend_of_gradient(line: Line, step: float) -> float:
 
 
 def excuse_kinks(evaluations: Evaluations, directions: Sequence[DirectionEvidence]) -> None:
-    """Change the word of directions that seem wrong to "kink" where all agrees at a point beside the kinks.
+    """Change the word of directions that disagree to "kink" if the gradient does not disagree at a nearby point.
 
-    Where several kinks meet, a derivative may lie outside the one-sided ones and still follow a convention. It is
-    wrong if it is wrong beside the kinks as well. Nothing is done without kinks or without a function for the gradient.
+    Where several kinks meet, a gradient may be outside the one-sided derivatives and still be acceptable. It is wrong
+    only if it also disagrees at a nearby point without kinks. This needs evidence of kinks, and the gradient as a
+    function; otherwise nothing is changed.
     """
     if not callable(evaluations.gradient) or not _may_be_kinks(directions):
         return
@@ -223,7 +226,7 @@ def excuse_kinks(evaluations: Evaluations, directions: Sequence[DirectionEvidenc
 
 
 def _may_be_kinks(directions: Sequence[DirectionEvidence]) -> bool:
-    """Return whether kinks may explain what speaks against a gradient."""
+    """Return whether kinks may be the reason why a gradient disagrees."""
     words = {direction.word for direction in directions}
     if "outside" in words or {"disagrees", "kink"} <= words:
         return True
@@ -231,10 +234,10 @@ def _may_be_kinks(directions: Sequence[DirectionEvidence]) -> bool:
 
 
 def _is_not_additive(evidence: DirectionEvidence) -> bool:
-    """Return whether differences along two parts of a direction do not add up to those along the whole.
+    """Return True if the derivatives along two parts of a direction do not add up to that along the direction.
 
-    There is no derivative then, though every line through x is straight: x^3 / (x^2 + y^2) at 0, or a limited slope
-    where neighbours are equal.
+    Then the loss is not differentiable at x, even if it has a derivative along every line. Examples are
+    x^3 / (x^2 + y^2) at 0, and a limited slope where neighbouring values are equal.
     """
     line = evidence.line
     entries = np.flatnonzero(line.direction)

@@ -1,4 +1,4 @@
-"""Every node of a reverse-mode tape, seen while it is recorded: what was called, with which values, inside what."""
+"""Observe the nodes of a reverse-mode tape while they are recorded: the functions, their arguments and nesting."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ from sparsedp.autodiff.tape import called, isbox, through
 __all__ = ["Node", "bytes_held", "calls_seen", "in_order"]
 
 HOLDERS = (tuple, list, set, dict, MethodType, CellType, partial)
-DEEPEST = 36  # holders inside each other; deeper ones do not belong to the tape. A function with its closure is three
+DEEPEST = 36  # largest nesting of containers that is searched; a function with its closure has three levels
 
 
 class Node:
-    """One call that the tape holds.
+    """One call that is recorded on the tape.
 
     Attributes
     ----------
     subject : Rule, Operator, or a function of autograd
     name : str
-        The name that the user knows.
+        Name of the call for messages.
     value
-        Its result.
+        The result.
     values : list
-        The arguments that are differentiated.
+        The differentiated arguments.
     places : list of int
         Their positions among the arguments that the user passes.
     plain : bool
-        Whether no argument belongs to an outer trace.
+        True if no argument is a traced value of an outer derivative.
     inner : list of Node
-        The calls that its derivative recorded, as a time loop does that runs its steps again; the steps of a loop that
-        keeps its tape stand before the loop.
+        The calls that were recorded while its VJP was running, for example the time steps that a loop recomputes. If a
+        loop stores the tape of its steps, these calls come before the loop in the list of all calls.
     again : callable
-        ``again(values)`` is the same call with other values of these arguments.
+        ``again(values)`` repeats the call with other values of the differentiated arguments.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class Node:
 
 
 def _as_new(argument: Any) -> Any:
-    """Return an argument for another run of a call; one that keeps the results of its run has `as_new`."""
+    """Return an argument for a repeated call. Objects that store results have `as_new`, an unused copy."""
     if hasattr(argument, "as_new"):
         return argument.as_new()
     return argument
@@ -76,9 +76,9 @@ def _as_new(argument: Any) -> Any:
 
 @contextmanager
 def calls_seen() -> Iterator[list[Node]]:
-    """Yield the list of the calls that the `with` block records, each with those inside of it."""
+    """Yield a list to which the calls recorded in the `with` block are appended, each with its inner calls."""
     calls: list[Node] = []
-    running: list[Node] = []  # calls whose derivative is running, the innermost last
+    running: list[Node] = []  # calls whose VJP is running, from outer to inner
 
     def see(tape_node: Any, *call: Any) -> None:
         node = Node(*call)
@@ -103,16 +103,16 @@ def calls_seen() -> Iterator[list[Node]]:
 
 
 def in_order(nodes: Iterable[Node]) -> Iterator[Node]:
-    """Yield all calls, those inside of a call before it."""
+    """Yield all calls. The inner calls of a call come before it."""
     for node in nodes:
         yield from in_order(node.inner)
         yield node
 
 
 def bytes_held(nodes: Iterable[Any]) -> int:
-    """Return the bytes of all arrays that nodes of a tape keep alive, each buffer once.
+    """Return the number of bytes of all arrays that are referenced by nodes of a tape. Each buffer counts once.
 
-    The arrays are below functions (their closures and defaults) and containers.
+    The search follows the closures and defaults of functions, and containers.
     """
     buffers: dict[int, int] = {}
     seen: set[int] = set()
@@ -131,7 +131,7 @@ def bytes_held(nodes: Iterable[Any]) -> int:
 
 
 def _owner(array: Any) -> Any:
-    """Return the array that owns the memory of a view; a distributed field has no views."""
+    """Return the array that owns the memory of a view. For other objects (distributed fields), return the object."""
     base = getattr(array, "base", None)
     while isinstance(base, np.ndarray):
         array = base
@@ -140,10 +140,10 @@ def _owner(array: Any) -> Any:
 
 
 def _parts(thing: Any) -> Any:
-    """Return what a box, a function or a container refers to."""
+    """Return the objects to which a box, a function or a container refers."""
     if isbox(thing):
         return (thing._value,)
-    if isinstance(thing, FunctionType):  # not the names of its module
+    if isinstance(thing, FunctionType):  # without the globals of its module
         return (thing.__closure__, thing.__defaults__)
     if isinstance(thing, HOLDERS):
         return gc.get_referents(thing)

@@ -1,4 +1,4 @@
-"""Derivatives by other ways, beside the gradient under test: forward mode, complex steps, Hessian products."""
+"""Compare the gradient under test with forward mode, with complex steps, and with Hessian products."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from sparsedp.check.thresholds import THRESHOLDS
 
 __all__ = ["ModeComparison", "check_complex_step", "check_hessian_product", "compare_modes"]
 
-COMPLEX_STEP = 2.0**-100  # in units of x: its square is lost beside x
-SINGLE_PRECISION_EPS = 300.0  # roundings of x that the modes may differ by
+COMPLEX_STEP = 2.0**-100  # in units of x; its square is negligible
+SINGLE_PRECISION_EPS = 300.0  # the modes may differ by this multiple of the eps of x; matters in single precision
 
 
 class ModeComparison(NamedTuple):
-    """How far forward mode is from reverse mode.
+    """The difference between forward and reverse mode.
 
     Attributes
     ----------
     gap : float
-        Largest difference of the two, as a share of the derivative.
+        Largest difference of the two modes, relative to the derivative.
     allowed : float
-        What rounding explains; more behind a solve or in noise.
+        Largest difference due to rounding; it is larger for a loss with solves or with noise.
     is_hidden : bool
-        Whether all larger gaps lie along directions where differences prove nothing, and below their error bars: the
-        derivative may be rounding itself, as for a loss whose terms cancel.
+        True if all larger differences are along undecided directions and below the error bars of these directions. Then
+        the derivative itself may be a rounding error, as in a loss whose terms cancel.
     """
 
     gap: float
@@ -40,7 +40,7 @@ class ModeComparison(NamedTuple):
 
     @property
     def is_allowed(self) -> bool:
-        """Whether the modes agree."""
+        """Whether the modes agree up to rounding."""
         return self.gap <= self.allowed
 
     def finding(self, tolerance: float) -> tuple[str, str]:
@@ -49,7 +49,7 @@ class ModeComparison(NamedTuple):
         Parameters
         ----------
         tolerance : float
-            Of the solves in the loss.
+            Largest tolerance of the solves in the loss.
         """
         if self.is_allowed:
             return "note", f"forward mode: agrees with reverse mode to {self.gap:.0e}"
@@ -63,7 +63,7 @@ class ModeComparison(NamedTuple):
 
 
 def compare_modes(loss: Callable[[Any], Any], directions: Sequence[DirectionEvidence]) -> ModeComparison | None:
-    """Compare forward mode with reverse mode along some directions; return None where a rule has no JVP."""
+    """Compare forward mode with reverse mode along some directions. Return None if a rule has no JVP."""
     largest_gap = 0.0
     allowed = THRESHOLDS.mode_gap
     gaps_are_hidden = []
@@ -95,12 +95,12 @@ def compare_modes(loss: Callable[[Any], Any], directions: Sequence[DirectionEvid
 def check_complex_step(
     loss: Callable[[Any], Any], point: Point, direction: DirectionEvidence, base: float
 ) -> str | None:
-    """Compare Im f(x + i t d) / t with g . d, exact to rounding where the code is analytic.
+    """Compare Im f(x + i t d) / t with g . d. The quotient is exact up to rounding if the loss is analytic.
 
     Returns
     -------
     str or None
-        How far they agree; None where the code is not analytic.
+        A note on the agreement; None if the two differ, since the loss is then probably not analytic.
 
     References
     ----------
@@ -110,9 +110,9 @@ def check_complex_step(
     complex_values = [x + 1j * COMPLEX_STEP * d for x, d in zip(point.values, displacements)]
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a discarded imaginary part shows in the gap
+            warnings.simplefilter("ignore")  # a discarded imaginary part is noticed by the gap
             value = complex(loss(point.tree(complex_values)))
-    except Exception:  # a loss of real numbers may refuse complex ones in any way
+    except Exception:  # the loss may raise any exception for complex numbers
         return None
     gap = abs(value.imag / COMPLEX_STEP - direction.slope) / direction.scale
     same_value = abs(value.real - base) <= 1e-9 * abs(base)
@@ -129,13 +129,13 @@ def check_hessian_product(
 ) -> tuple[str | None, str]:
     """Examine d . H d by the third Taylor remainder.
 
-    The verdict on the gradient does not depend on it: a pullback that uses a value it captured has a right gradient
-    and a wrong Hessian.
+    The verdict on the gradient does not depend on the result. For example, a pullback that uses a captured value in
+    place of a traced one gives a correct gradient and a wrong Hessian.
 
     Returns
     -------
     word : "agrees", "disagrees", "inconclusive" or None
-        None without a product.
+        None if the Hessian product is not available.
     note : str
     """
     if point.complex:
@@ -144,7 +144,7 @@ def check_hessian_product(
     try:
         with np.errstate(all="ignore"):
             product = point.gradient(hvp(loss, point.fresh(), point.unpack(displacement))) @ displacement
-    except Exception as error:  # a rule, ours or not, may lack a second derivative and say so in any way
+    except Exception as error:  # any exception: a rule may have no second derivative
         return None, f"Hessian product: not available ({type(error).__name__})"
     bend = float(product)
     _measure_third_order(direction, bend)
@@ -155,8 +155,8 @@ def check_hessian_product(
 
 @np.errstate(all="ignore")
 def _measure_third_order(direction: DirectionEvidence, bend: float) -> None:
-    """Measure the order of the third Taylor remainder on the finest levels clear of noise, gap and rounding of x."""
-    latest = weigh(direction.line)  # with all levels that were added since
+    """Measure the order of the third Taylor remainder on the finest levels with negligible noise and rounding."""
+    latest = weigh(direction.line)  # with all levels that were added later
     steps = latest.steps
     remainders = latest.remainders - steps**2 / 2 * bend
     size = rms_of_both_sides(remainders)
@@ -173,7 +173,7 @@ def _measure_third_order(direction: DirectionEvidence, bend: float) -> None:
 
 
 def _word_of_third_order(direction: DirectionEvidence) -> tuple[str, str]:
-    """Return the word for a Hessian product, and the order of its remainder in words."""
+    """Return the word for a Hessian product, and a phrase about the order of its remainder."""
     order = direction.third_order
     fewest = THRESHOLDS.fewest_orders
     if not isfinite(direction.bend):

@@ -1,4 +1,4 @@
-"""The thresholds of the audit of a gradient, each with its derivation."""
+"""The thresholds of `check.gradient`, each with its derivation."""
 
 from __future__ import annotations
 
@@ -11,96 +11,104 @@ __all__ = ["THRESHOLDS", "AuditThresholds"]
 class AuditThresholds:
     """Thresholds of `check.gradient`.
 
-    Shares are relative to the derivative along a direction unless another quantity is named. With central differences
-    of a loss of size F, rounding eps and third derivative of order F, the best step is about eps^(1/3) and the error
-    bar there about eps^(2/3) = 4e-11 of the derivative. Shares are multiples of that, or of what a solve to the
-    default tolerance of 1e-10 leaves.
+    A share is a ratio to the derivative along a direction, unless another quantity is named. For central differences of
+    a loss of size F with relative rounding error eps and a third derivative of order F, the best step is about
+    eps^(1/3), and the relative error bar there is about eps^(2/3) = 4e-11. The shares are multiples of this error bar,
+    or of the error of a solve with the default tolerance of 1e-10.
 
     Attributes
     ----------
     bars_disagree : float
-        A gap of more than this many error bars is wrong. A bar is the largest of three distances, so the chance of ten
-        bars by noise alone is negligible in a hundred lines.
+        A gap of more than this many error bars is significant. A gap of ten error bars by noise alone is very unlikely,
+        even among a hundred directions, because an error bar is the largest of several distances.
     bars_agree : float
-        A gap of at most this many error bars is compatible with 0. Between the two nothing is decided.
+        A gap of at most this many error bars is compatible with 0. Gaps between `bars_agree` and `bars_disagree` are
+        undecided.
     resolved_share : float
-        An error bar above this share proves nothing: three digits are the least for a statement about a derivative.
+        With an error bar above this share there is no decision: a verdict needs at least three digits.
     agreement_share : float
-        A gap below this share is agreement, whatever the bar: about 270 eps^(2/3).
+        A gap below this share counts as agreement for every error bar: about 270 eps^(2/3).
     noisy_agreement_share : float
-        The same behind a solve, or in noise: the remainder of a solve to 1e-10 is amplified by the condition of the
-        system and by 1 / step, and may be smooth in x.
+        The same share for a loss with solves or with noise. The error of a solve with tolerance 1e-10 is amplified by
+        the condition number of the system and by 1 / step, and may be smooth in x.
     agreement_per_noise : float
-        Between these two limits a gap may have this multiple of the measured noise of the loss: eps^(-1/4), the
-        factor by which the best step of a second-order difference enlarges noise.
+        Between these two shares, the allowed gap is this multiple of the measured noise of the loss. It is eps^(-1/4),
+        the factor by which the best step of a second-order difference amplifies noise.
     solve_remainder_share : float
-        Behind a solve, a gap below this share of the loss may be a remainder of the solve: ten times its tolerance.
+        For a loss with solves, a gap below this share of the loss may be the error of a solve: ten times its tolerance.
     solve_remainder_tolerances : float
-        The same in units of the tolerance of the solves, where that is looser.
+        The same limit as a multiple of the tolerance of the solves; the larger limit applies.
     step_remainder_tolerances : float
-        A gap below this many tolerances of time steps may be a remainder of their error control.
+        A gap below this multiple of the tolerance of time steps may be due to their error control.
     loose_tolerance : float
-        A tolerance of solves above this may explain any gap for which no call is at fault.
+        If the tolerance of the solves is above this value, and no call is at fault, the gap may be due to the solves.
     mode_tolerances : float
-        Forward and reverse mode may differ by this many tolerances of the solves: each mode ends at another residual.
+        Forward and reverse mode may differ by this multiple of the tolerance of the solves, because the solves of the
+        two modes end with different residuals.
     mode_gap : float
-        Share by which forward and reverse mode may differ by rounding: about 5e5 eps, for sums of 1e5 terms and more.
+        Share by which forward and reverse mode may differ due to rounding: about 5e5 eps, enough for sums of 1e5 terms.
     noisy_mode_gap : float
-        The same behind a solve or in noise.
+        The same for a loss with solves or with noise.
     complex_step_gap : float
-        Share by which a complex step may differ by rounding.
+        Share by which a complex step may differ due to rounding.
     smallest_loss_change : float
-        Losses that change by less than this underflow: their differences are not normal numbers.
+        If the loss changes by less than this value, its differences are subnormal numbers and lose digits.
     vanishing_share : float
-        A derivative and its bar below this share of the curvature are 0.
+        A derivative counts as 0 if it and its error bar are below this share of the curvature.
     negligible_share : float
-        An undecided direction whose derivative is below this share of the largest one does not matter.
+        An undecided direction is ignored if its derivative is below this share of the largest derivative.
     small_share : float
-        The same for a direction whose derivative is resolved to one digit.
+        An undecided direction whose derivative is known to one digit is ignored if its error bar is below this share of
+        the largest derivative.
     rounding_noise : float
-        Noise above this many roundings of the loss has another cause: a solve, chaos, a staircase.
+        Noise above this number of roundings of the loss is not due to rounding, but to solves, chaos or steps.
     smooth_noise : float
         A smooth function varies by at most this many roundings between neighbouring steps.
     noise_levels : int
-        Number of finest levels that the noise is read from.
+        Number of finest levels from which the noise is measured.
     fewest_levels : int
-        Usable levels without which nothing is decided: two Richardson extrapolations need four.
+        Smallest number of usable levels for a decision. The error bars of Richardson extrapolation need four.
     fewest_orders : int
-        Usable levels without which a Taylor order is not decided.
+        Smallest number of usable levels for a Taylor order.
     most_orders : int
-        Usable levels that an order is read from, the finest ones.
+        An order is measured from at most this number of usable levels, the finest ones.
     first_order_margin : float
-        The order of f(x + t d) - f is 1 to within this.
+        Largest allowed deviation of the order of f(x + t d) - f(x) from 1.
     second_order : float
-        Least order of the remainder with the gradient.
+        Smallest allowed order of the second Taylor remainder (with the gradient).
     third_order : float
-        Least order of the remainder with gradient and Hessian product.
+        Smallest allowed order of the third Taylor remainder (with gradient and Hessian product).
     wrong_hessian_order : float
-        Up to here the order is 2, which a wrong Hessian gives; above, the loss has no third derivatives.
+        An order of the third remainder up to this value counts as 2, which shows a wrong Hessian. For orders between
+        this value and `third_order` the loss is not three times differentiable.
     odd_share : float
-        Share of a third remainder that may change its sign with the step; more, and the Hessian jumps at x.
+        Allowed share of the odd part in a third remainder of order 2. If it is larger, the Hessian jumps at x.
     clear_of_noise : float
-        A usable remainder is this many times the noise, which then moves an order by at most
+        A remainder is usable if it is at least this multiple of the noise. Noise then changes an order by at most
         log(1.01 / 0.99) / log(pair_ratio) = 0.015.
     linear_share : float
-        A level serves for order 1 where t |g . d| is this many times the even part, which then moves the order by at
-        most log(sqrt(1 + 1 / 25)) / log(pair_ratio) = 0.015.
+        A level is used for order 1 if t |g . d| is at least this multiple of the even part. The even part then changes
+        the order by at most log(sqrt(1 + 1 / 25)) / log(pair_ratio) = 0.015.
     nearby_steps : float
-        Orders are read at steps up to this multiple of the step of the plateau; coarser ones are no limit t -> 0.
+        Orders are measured at steps up to this multiple of the step of the plateau. Coarser steps do not show the
+        limit t -> 0.
     pair_ratio : float
-        Least ratio of the two steps of a pair that gives an order.
+        Smallest ratio of two steps from which an order is computed.
     extension_bar : float
-        A sweep is extended where its error bar is above this share.
+        More steps are added to a sweep if its error bar is above this share.
     ripple_run : int
-        Neighbouring fine levels that agree with each other on another derivative show a ripple.
+        Number of neighbouring fine levels that must show the same other derivative to detect a ripple.
     ripple_agreement : float
-        Share to which they agree; also the share of a gap above which the rounding of the loss hides a ripple.
+        Relative difference that is allowed between these levels. Rounding must also be below this share of their gap.
     ripple_reaches : tuple of float
-        The gradient is evaluated within these multiples of the step over which a gap changes the loss by its noise.
+        Multiples of a step at which the gradient is evaluated to detect a ripple below the noise. The step is that over
+        which the gap changes the loss by as much as its noise.
     ripple_smoothness : float
-        Within this share of such a step a ripple is smooth, and a kink is not.
+        The gradient is also evaluated at this share of such a step, to distinguish a ripple, which is smooth, from a
+        kink.
     ripple_range : float
-        Within this share of the step of the plateau a smooth gradient does not bend.
+        A ripple is only searched within this share of the step of the plateau, where a smooth gradient is nearly
+        constant.
     """
 
     bars_disagree: float = 10.0
