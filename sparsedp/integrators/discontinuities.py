@@ -30,25 +30,26 @@ if TYPE_CHECKING:
 
 __all__ = ["RateInspector"]
 
-UNEVEN = 3.0  # ratio of the changes of a rate in both halves of a step, from which on the larger one is searched
-CONCENTRATED = 0.5  # share of the change in one of eight parts, from which on the search continues
-NEGLIGIBLE = 1e-6  # share of the rate below which changes do not count
-PERSISTS = 0.5  # share of a deviation after a division, from which on it may be a jump
-PARTS = 8
-DIVISIONS = 9  # after which a change counts as a jump: at 8^-9 of a step
-STEADY = 4  # successive divisions that do not reduce the deviation, in a search for small jumps
-RESOLVED = 4.0  # lengths of a layer that a step across it may have
-GAP = 1 / 200  # largest share of the interval between two evaluations of a rate that depends on the time
-EFFORT = 2.0  # evaluations for that, at most, as a multiple of those that the steps take
-EVALUATIONS = 12  # of the rate in a step, about
-MISSED = 0.3  # share of its length to which a step that missed a smooth pulse is shortened
-UNSEEN = 10.0  # error, in units of the tolerance, of a step that missed a smooth pulse, from which on it is refused
-NEARBY = 1e-4  # share of a step for differences of the rate
-WINDOW = 7  # successive steps over which errors are compared with the change of the rate
-COARSE = 0.005  # error of the change of the rate by the quadrature of a scheme, from which on it is not resolved
-ROUNDING = 1e-15  # relative change of the state
-NOISE = 30.0  # times its effect on the rate: changes up to there may be rounding
-ROUGH = 0.02  # fourth difference of the rate over eighths of a step, as a share of its change, of a closer search
+# Fractions of a step, of the interval, or of a change of the rate are plain numbers between 0 and 1.
+UNEVEN = 3.0  # search the half of a step in which the rate changes more by this factor than in the other half
+CONCENTRATED = 0.5  # continue the search if one of eight parts has at least this fraction of the change
+NEGLIGIBLE = 1e-6  # changes below this fraction of the rate are ignored
+PERSISTS = 0.5  # there may be a jump if a division leaves at least this fraction of the deviation
+PARTS = 8  # number of parts in each division
+DIVISIONS = 9  # a change that persists after this number of divisions (8^-9 of a step) is regarded as a jump
+STEADY = 4  # number of successive divisions that do not reduce the deviation, in a search for small jumps
+RESOLVED = 4.0  # largest ratio of the length of a step to that of a layer in it
+GAP = 1 / 200  # largest fraction of the interval between two evaluations of a rate that depends on the time
+EFFORT = 2.0  # largest ratio of these evaluations to the evaluations that the steps need
+EVALUATIONS = 12  # approximate number of evaluations of the rate in a step
+MISSED = 0.3  # a step that missed a smooth pulse is shortened to this fraction of its length
+UNSEEN = 10.0  # reject a step that missed a smooth pulse if its error, in units of the tolerance, is larger
+NEARBY = 1e-4  # fraction of a step for finite differences of the rate
+WINDOW = 7  # number of successive steps over which errors are compared with changes of the rate
+COARSE = 0.005  # the rate is not resolved if the relative error of its change by quadrature is larger
+ROUNDING = 1e-15  # relative perturbation of the state to estimate the effect of rounding on the rate
+NOISE = 30.0  # changes of the rate below this multiple of that effect may be rounding
+ROUGH = 0.02  # search more closely if fourth differences of the rate exceed this fraction of its change
 REFUSALS = UnstableStepError, NonFiniteError, ConvergenceError
 
 

@@ -1,19 +1,20 @@
-"""Exponential steps: functions of z L for a separable operator L, differentiable in z, and the step built from them.
+"""Functions of z L for a separable operator L, differentiable in z, and the exponential step etdrk4.
 
-Such a function f has a derivative f' of the same kind, and with y = f(z L) b
+The derivative f' of such a function f is of the same kind, and with y = f(z L) b
 
     dy = f(z L) db + L f'(z L) b dz,     b_bar = f(z L)^T g,     z_bar = g . L f'(z L) b.
 
-So one rule serves all of them. They are sums of phi_k, by one transform and its inverse:
+So one rule is enough for all functions. They are linear combinations of the functions phi_k, and are applied by one
+transform and its inverse:
 
     phi_0(x) = exp(x),    phi_{k+1}(x) = (phi_k(x) - 1/k!) / x,    phi_k'(x) = phi_k(x) - k phi_{k+1}(x)
 
-Near 0 the formula in the middle loses all digits: from x = -3 on they are computed as Kummer's functions,
-phi_k(x) = 1F1(1; k + 1; x) / k!, which SciPy has for all k.
+Near 0 the recurrence loses all digits. For x >= -3 the phi_k are therefore computed as Kummer's functions,
+phi_k(x) = 1F1(1; k + 1; x) / k!, which SciPy provides for all k.
 
-etdrk4, exponential time differencing, is built from functions of z L. Order 4, and exact where N is constant and s a
-polynomial of degree 3. A source enters in every stage by the integral of exp((h - x) c L) s(t + x), with s
-interpolated at four points.
+etdrk4 (exponential time differencing) is built from functions of z L. It has order 4 and is exact if the rate N is
+constant and the source s a polynomial in time of degree 3. The source contributes to every stage the integral of
+exp((h - x) c L) s(t + x), with s interpolated at four points.
 
 References
 ----------
@@ -52,12 +53,12 @@ if TYPE_CHECKING:
 __all__ = ["Exponential", "Function", "PhiFunctions", "phi"]
 
 NEAR = 3.0  # largest -x for which Kummer's function is used
-LARGEST = 1e3  # of x, beyond which even the exponential is infinite
-KEPT = 64  # operators f(z L), for a few z
+LARGEST = 1e3  # x is limited to this value, above which the exponential overflows
+KEPT = 64  # number of cached operators f(z L)
 
 
 def phi(k: int, x: Any) -> list[np.ndarray]:
-    """Return phi_0(x), ..., phi_k(x) for real x, to a few units of the last digit.
+    """Return phi_0(x), ..., phi_k(x) for real x, with errors of a few units in the last digit.
 
     Examples
     --------
@@ -82,7 +83,7 @@ class Function(NamedTuple):
     power: int = 0
 
     def derivative(self) -> Function:
-        """Return the derivative in z, of the same form."""
+        """Return the derivative with respect to z, as a Function."""
         weights = [*self.weights, 0.0]
         for k, weight in enumerate(self.weights):
             weights[k + 1] -= k * weight
@@ -94,7 +95,7 @@ class Function(NamedTuple):
         return sum(a / factorial(k) for k, a in enumerate(self.weights))
 
     def values(self, z: float, eigenvalues: np.ndarray) -> np.ndarray:
-        """Return the values on the eigenvalues of L."""
+        """Return the values of the function at the eigenvalues of L."""
         with np.errstate(over="ignore", invalid="ignore"):
             phis = phi(len(self.weights) - 1, self.scale * z * eigenvalues)
             pairs = zip(self.weights, phis, strict=True)
@@ -107,9 +108,9 @@ class PhiFunctions:
     Parameters
     ----------
     op : Operator
-        L, separable, or made of such ones.
+        L, a separable operator or composed of separable operators.
     name : str
-        For messages and counts.
+        Name in error messages and counts.
 
     Raises
     ------
@@ -130,7 +131,7 @@ class PhiFunctions:
         return self._rule(function, False)(z, b)
 
     def _make_rule(self, function: Function, is_transposed: bool) -> Rule:
-        """Return the rule of f(z L) b, or of f(z L^T) b, in (z, b)."""
+        """Return the rule of (z, b) for f(z L) b or, if `is_transposed`, for f(z L)^T b."""
 
         def forward(z: Any, b: Any) -> Any:
             require_arrays(self.name, [b])
@@ -150,7 +151,7 @@ class PhiFunctions:
         return family(name, forward, slope, transposed)
 
     def _set_up(self, function: Function, z: float) -> Operator:
-        """Return the Operator f(z L) of plain z; for z = 0 without transforms: then exp(z L) keeps every bit."""
+        """Return the Operator f(z L) for a plain z. For z = 0 no transforms are used, so that exp(z L) b equals b."""
         if z == 0:
             product = reduce(matmul, [self.op] * function.power, identity(self.op.domain))
             return self._named((function.start * product).structure)
@@ -178,7 +179,8 @@ NODES = (0.0, 0.5 - 0.1 * 5**0.5, 0.5 + 0.1 * 5**0.5, 1.0)  # of Lobatto, as sha
 def quadrature(nodes: Sequence[float], start: float, stop: float) -> tuple[Function, ...]:
     """Return the weights of s(t + node h) in h times the integral of exp((stop - x) z L) s(t + x h), start < x < stop.
 
-    They come from the Lagrange polynomials of the nodes; the integral of x^k over 0 < x < 1 is k! phi_{k+1}(z L).
+    They are computed from the Lagrange polynomials of the nodes; for s(t + x h) = x^k the integral from 0 to 1 is
+    k! phi_{k+1}(z L).
     """
     functions = []
     for values in np.eye(len(nodes)):
@@ -211,7 +213,7 @@ class Exponential(Scheme):
         """Return the state after a step."""
 
         def f(functions: Sequence[Function], *trees: Any) -> Any:
-            """Return the sum of function(h c L) tree."""
+            """Return the sum of function(h c L) applied to the corresponding tree."""
 
             def of_field(op: Operator | None, z: Any, *row: Any) -> Any:
                 pairs = zip(functions, row, strict=True)

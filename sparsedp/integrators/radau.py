@@ -1,30 +1,34 @@
-"""Radau IIA of order 5 with error control, for small stiff systems: dense, and one rule on the tape for an interval.
+"""Radau IIA of order 5 with error control for small stiff systems, with dense matrices.
 
-A step of length h from u has three stages, with f_i = f(u + z_i, t + c_i h) and c_3 = 1,
+An interval with all its steps is one rule on the tape. A step of length h from u has three stages, with
+f_i = f(u + z_i, t + c_i h) and c_3 = 1,
 
     z_i = h sum_j a_ij f_j,          and the new state is u + z_3.
 
-It is L-stable: stiff components decay for any h. Of smooth problems the order is 5, of stiff ones with moving data at
-least 3, where Rosenbrock methods (Rodas) fall to less; and the discrete adjoint needs first derivatives of f alone,
-where theirs needs derivatives of the Jacobian. Newton's method uses one Jacobian J of f for all stages, and for as many
-steps as it converges with: in the basis of the eigenvectors of A^-1 its system of 3 n unknowns is a real and a complex
-one of n. The error of a step is estimated by an embedded formula of order 3, filtered by the real matrix,
+The method is L-stable: stiff components decay for any h. The order is 5 for smooth problems and at least 3 for stiff
+problems with time-dependent data, where Rosenbrock methods such as Rodas have a lower order. The discrete adjoint needs
+only first derivatives of f, while that of Rosenbrock methods needs derivatives of the Jacobian. Newton's method uses
+one Jacobian J of f for all stages, and for further steps as long as it converges with this J. In the basis of the
+eigenvectors of A^-1 its linear system of 3 n unknowns splits into a real and a complex system of n unknowns each. The
+error of a step is estimated by an embedded formula of order 3, multiplied by the inverse of the real matrix,
 
     e = (g/h - J)^-1 (f(u, t) + sum_i e_i z_i / h),          g the real eigenvalue of A^-1.
 
-In a second trial from a state, if it is too large, f(u + e, t) replaces f(u, t) once: an error in u that decays at any
-length would stay in e until h is as short as that takes, 72 trials in a row in u' = -1e6 (u - cos t). The lengths of
-steps are chosen as in adaptive.py.
+If e is too large in a second trial from the same state, e is computed again with f(u + e, t) in place of f(u, t).
+Otherwise an error in u, which decays in a step of any length, would make e too large until h is very small: for
+u' = -1e6 (u - cos t) 72 successive trials were rejected. Step lengths are chosen as in adaptive.py.
 
-Derivatives are those of the steps taken, by the implicit function theorem for each, never through the iterations. With
-J_i, P_i, q_i the derivatives of f_i in the state, the params and the time,
+Derivatives are those of the accepted steps. They are computed by the implicit function theorem for each step, not by
+differentiation of Newton's iterations. Let J_i, P_i, q_i be the derivatives of f_i with respect to the state, the
+params and the time. Then
 
     K dz = h A (J_i du + P_i dp + q_i (dt + c_i dh)) + z/h dh,          K = 1 - h A J_i   (3 n unknowns),
 
-and the backward pass is the transpose of this map. Lengths follow the state, dh = d, and the error of the derivative is
-estimated by two perturbed solutions, as adaptive.py says and for its reasons. Two things differ: the first perturbed
-solution has the derivative of u + z_3 + EPSILON e, and the last step gives the sum of all d back: the rate at its end
-would not do, since errors of stiff parts are large in it.
+and the backward pass is the transpose of this map. As in adaptive.py, step lengths have a derivative dh = d with
+respect to the state, and two perturbed solutions estimate the error of the derivative. There are two differences. The
+first perturbed solution has the derivative of u + z_3 + EPSILON e. The sum of all d is subtracted in the last step
+only, by means of the derivative of this step; the rate at its end is not used, as it contains large errors of stiff
+components.
 
 References
 ----------
@@ -77,28 +81,28 @@ BASIS = np.array([_vectors[:, _real].real, _vectors[:, _upper].real, _vectors[:,
 BASIS_INVERSE = np.linalg.inv(BASIS)
 CUBIC = np.linalg.inv(np.vander([0.0, *C], increasing=True))  # values at 0, c_1, c_2, c_3 -> coefficients
 
-UNKNOWNS = 500  # largest number; beyond it sparse solves are faster
+UNKNOWNS = 500  # largest number of unknowns; for larger systems sparse solves are faster
 EMBEDDED = 3  # order of the embedded formula
-NEWTON = 1e-3  # error of Newton's method in units of the tolerance: at 0.03 HIRES is 10 to 100 times less accurate
-ROUNDING = 1e-15  # relative correction below which no iteration is asked to go
-STALLED = 1e-11  # relative correction that counts as rounding where it does not shrink
-ITERATIONS = 10  # of Newton's method in a step with error control
-REFUSALS = UnstableStepError, NonFiniteError, ConvergenceError  # of a rate at a state too far away
-TOGETHER = 32  # steps whose derivatives are computed at once
-ENTRIES = 2**20  # of an array of them
-FAST = 0.03  # ratio of two corrections up to which the Jacobian is used for the next step
+NEWTON = 1e-3  # error of Newton's method in units of the tolerance; 0.03 made HIRES 10 to 100 times less accurate
+ROUNDING = 1e-15  # smallest tolerance of the relative correction in Newton's method
+STALLED = 1e-11  # a relative correction below this that does not decrease any more is regarded as rounding
+ITERATIONS = 10  # largest number of iterations of Newton's method in a step with error control
+REFUSALS = UnstableStepError, NonFiniteError, ConvergenceError  # exceptions of a rate outside its domain
+TOGETHER = 32  # largest number of steps whose derivatives are computed in one batch
+ENTRIES = 2**20  # largest number of entries of an array in such a batch
+FAST = 0.03  # keep the Jacobian for the next step if the ratio of successive corrections is below this
 
 
 class FlatProblem:
-    """A problem on flat unknowns, and its derivatives.
+    """A problem whose state is one flat array, and its derivatives.
 
     Parameters
     ----------
     problem : Problem
     u : tree
-        The shapes of its leaves count.
+        A state; only the shapes and dtypes of its leaves are used.
     name : str
-        For messages.
+        Name in error messages.
     """
 
     def __init__(self, problem: Problem, u: Any, name: str) -> None:
@@ -114,60 +118,61 @@ class FlatProblem:
         self.is_vector = self.unknowns.shapes == [(self.size,)]
 
     def state(self, v: Any) -> Any:
-        """Return the tree of flat unknowns."""
+        """Convert a flat array to the tree of the user's state."""
         if self.is_vector:
             return v
         return self.unknowns.split(v)
 
     def __call__(self, v: Any, params: Any, t: Any) -> Any:
-        """Return the flat rate."""
+        """Return the rate as a flat array."""
         rate = self.problem(self.state(v), params, t)
         if self.is_vector:
             return rate
         return self.unknowns.flat(rate)
 
     def rows(self, points: Iterable[tuple], params: Any, moving: Sequence[bool]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rates at points (v, t), and their derivatives in the state, the moving params, and the time."""
+        """Return the rates at points (v, t), and their derivatives with respect to state, moving params and time."""
         trees = [(self.state(v), params, t) for v, t in points]
         is_differentiated = [*[True] * len(self.unknowns.shapes), *moving, True]
         return jacobians_of(lambda tree: self.problem(*tree), trees, is_differentiated)
 
 
 class Radau(Adaptive):
-    """Steps of a problem with few unknowns, any tree of real arrays, and the derivative of the steps taken.
+    """Steps of Radau IIA, for states that are trees of real arrays with few entries, and their derivatives.
 
     Parameters
     ----------
     problem : Problem
     jacobian : callable or None
-        For Newton's method alone; derivatives are computed from the rate.
+        Used in Newton's method only; derivatives are computed from the rate.
     tolerance : float or None
-        As `Adaptive`; None: one step.
+        See `Adaptive`; None: one step without error control.
     floor : None, number, or tree like the state
-        As `Adaptive`.
+        See `Adaptive`.
     settings : SolveSettings
-        rtol and maxiter, of Newton's method where there is no error control.
+        Its rtol and maxiter are those of Newton's method without error control.
 
     Attributes
     ----------
     params, moving : tree, list of bool
-        Of an interval, plain, and which leaves are traced. Each interval has a copy of the scheme.
+        Plain params of an interval, and for each leaf whether it is traced. Each interval uses a copy of this object.
     v : flat array or None
         The state at the start of the step.
     f : flat array
-        The rate there.
+        The rate at `v`.
     J : array or None
-        The Jacobian in use.
+        The current Jacobian.
     factored_length : float or None
-        The length of a step for which `real` and `complex` solve the systems of Newton's method.
+        The step length for which the matrices of Newton's method are factored.
     real, complex : callable
+        Solve with the factored real and complex matrix.
     guess : tuple or None
-        State, length and cubic of the last step.
+        State, length and interpolating cubic of the last step, to extrapolate a first guess of the stages.
     is_fresh, is_slow : bool
-        Whether the Jacobian belongs to this state, and whether the last step converged slowly with it.
+        Whether the Jacobian was computed at the current state, and whether Newton's method was slow in the last step.
     """
 
-    window = 10 * WINDOW  # a jump at a fine tolerance takes thousands of steps, of little cost
+    window = 10 * WINDOW  # a jump with a small tolerance takes thousands of steps, which are cheap
     follows_path = False
     quadrature = tuple(C), tuple(A[2])
     params: Any
@@ -213,7 +218,7 @@ class Radau(Adaptive):
         return run.rounded(new)
 
     def interval(self, u: Any, params: Any, t: Any, h: Any) -> tuple[Radau, tuple]:
-        """Return a copy for an interval, and its arguments: flat unknowns, moving params, time and length."""
+        """Return a copy of this object for an interval, and arguments: flat state, traced params, time and length."""
         run = copy(self)
         run.problem = FlatProblem(self.problem, u, self.name)
         run.params = constant(untraced(params))
@@ -245,15 +250,15 @@ class Radau(Adaptive):
         return ends
 
     def tree(self, v: Any) -> Any:
-        """Return the state of a step as the user knows it."""
+        """Convert the flat state of a step to the tree of the user's state."""
         return self.problem.state(v)
 
     def rounded(self, v: Any) -> Any:
-        """Return the state at the end of an interval."""
+        """Convert the flat state at the end of an interval to a tree with the dtypes of the user's state."""
         return self.problem.unknowns.rounded(v)
 
     def partial_step(self, step: AcceptedStep, arguments: tuple, length: float) -> AcceptedStep | None:
-        """Return the step from the same state with another length, to rounding; None if there is none."""
+        """Repeat a step with another length, with stages converged to rounding; return None if the trial fails."""
         newton_tolerance = self.newton_tolerance
         max_iterations = self.max_iterations
         self.newton_tolerance = ROUNDING
@@ -265,17 +270,17 @@ class Radau(Adaptive):
             self.max_iterations = max_iterations
 
     def check(self, *arguments: Any) -> None:
-        """Refuse a state, a rate, or derivatives that the method does not support."""
+        """Raise an error for a state, a rate, or derivatives that the method does not support."""
         u, _, t, h = untraced(arguments)
         rate = self.problem.problem(u, self.params, t)
         require_arrays(self.name, leaves(rate))
-        like(combine(u, (0.0, rate)), u)  # refuses other shapes, and complex
+        like(combine(u, (0.0, rate)), u)  # raise an error for a wrong shape or a complex rate
         if any(map(isbox, leaves(rate))):
             raise DerivativeError(
                 f"the rate of {self.name} uses a traced value that is not an argument; put it into params"
             )
         traced = [leaf for leaf in leaves(arguments) if isbox(leaf)]
-        if len(traces_of(traced)) > 1:  # the rule below is linear: its own derivative would lack that of these steps
+        if len(traces_of(traced)) > 1:  # the rule on the tape is linear, so that second derivatives would be wrong
             raise DerivativeError(
                 f"{self.name} has first derivatives only, got one inside another; take tr_bdf2 for second ones"
             )
@@ -285,14 +290,14 @@ class Radau(Adaptive):
             self.check_tolerance(u)
 
     def inspector(self, arguments: tuple) -> RateInspector | None:
-        """Return what looks for jumps of the rate, with the params of the interval; None where it has none."""
+        """Return an object that detects jumps of the rate; None without error control or if the rate cannot jump."""
         problem = self.problem.problem
         if self.tolerance is None or (problem.rate is None and not problem.source_takes_time):
             return None
         return RateInspector(self, self.params, *arguments[2:])
 
     def inner_state(self, step: AcceptedStep) -> tuple[Any, float]:
-        """Return the second stage, and the share of the step at which it is."""
+        """Return the state at the second stage, and its position as a fraction of the step."""
         return step.u + step.middle[1], C[1]
 
     def _steps(
@@ -300,7 +305,7 @@ class Radau(Adaptive):
     ) -> Iterable[AcceptedStep]:
         if self.tolerance is not None:
             return super()._steps(v, self.params, t, h, inspector)
-        self._first_length(v, self.params, t, h)  # refuses a rate that is not finite
+        self._first_length(v, self.params, t, h)  # raise an error for a rate that is not finite
         with np.errstate(all="ignore"):
             z = self.stages(v, t, h)
         if z is None:
@@ -316,7 +321,7 @@ class Radau(Adaptive):
         """Return the stages, the new state, and the error of the embedded formula in units of the tolerance."""
         h = length * h
         is_second_trial = v is self.v
-        with np.errstate(all="ignore"):  # a step that is too long is refused in any case
+        with np.errstate(all="ignore"):  # overflow in a step that is too long leads to its rejection
             z = self.stages(v, t, h)
             if z is None:
                 return None, None, np.inf
@@ -332,18 +337,18 @@ class Radau(Adaptive):
         return z, v + z[2], ratio if np.isfinite(ratio) else np.inf
 
     def sizes(self, *states: Any) -> list:
-        """Return |u| + floor, to which errors are compared, flat; the larger of several states."""
+        """Return |u| + floor, the unit of errors, as a flat array; |u| is the largest of several states."""
         return [np.concatenate([*map(np.ravel, super().sizes(*map(self.problem.state, states)))])]
 
     def units(self, v: Any, w: Any) -> np.ndarray:
-        """Return |v| + floor, to which errors are compared, the larger of two states; 1 in place of 0."""
+        """Return |v| + floor, the unit of errors, with the larger of two states; 1 in place of 0."""
         (size,) = self.sizes(v, w)
         return np.where(size > 0, size, 1.0)
 
     # ------------------------------------------------------------ Newton's method
 
     def stages(self, v: Any, t: Any, h: Any) -> np.ndarray | None:
-        """Return the stages z of a step, or None where Newton's method does not converge."""
+        """Return the stages z of a step, or None if Newton's method does not converge."""
         try:
             if v is not self.v:
                 self.f = self.problem(v, self.params, t)
@@ -380,14 +385,14 @@ class Radau(Adaptive):
         return J
 
     def _newton(self, v: Any, t: Any, h: Any) -> np.ndarray | None:
-        """Run Newton's method for the stages, by the Jacobian at hand; None where it does not converge."""
-        h = float(h)  # complex numbers of Python and of NumPy divide with other roundings
+        """Run Newton's method for the stages with the current Jacobian; return None if it does not converge."""
+        h = float(h)  # complex division is rounded differently in Python and in NumPy
         if self.factored_length != h:
             self.real = dense_lu(REAL / h * np.eye(v.size) - self.J)[0]
             self.complex = dense_lu(COMPLEX / h * np.eye(v.size) - self.J)[0]
             self.factored_length = h
         z = np.zeros((3, v.size))
-        if self.guess is not None:  # the cubic through the last stages; from there, or again from the same state
+        if self.guess is not None:  # extrapolate the cubic through the last stages, also in a second trial
             start, length, cubic = self.guess
             z = np.vander(C * h / length + (start is not v), 4, increasing=True) @ cubic - v
         w = BASIS_INVERSE @ z
@@ -424,10 +429,10 @@ class Radau(Adaptive):
         self.is_slow = ratio > FAST and iteration > 2
         return z
 
-    # ------------------------------------------------------------ the derivative of the steps taken
+    # ------------------------------------------------------------ the derivative of the accepted steps
 
     def perturbed_solutions(self, count: int) -> tuple[Callable, Callable]:
-        """Return the functions `perturb` and `evaluate`; without error control there is one solution alone."""
+        """Return the functions `perturb` and `evaluate`; without error control there are no perturbed solutions."""
         if self.tolerance:
             return super().perturbed_solutions(count)
         return (lambda x: x[None]), (lambda x: x[0])
@@ -441,10 +446,10 @@ class Radau(Adaptive):
         entered: Any,
         event: Event | None = None,
     ) -> Any:
-        """Return the deviations at the end: a linear map of those of (u, moving params, t, h).
+        """Return the deviations at the end, a linear map of the initial deviations of (u, moving params, t, h).
 
-        Inside, the sum of all d so far stands between the first two. Where an event ends the path, its time is the
-        time of the steps and all d.
+        The vectors inside this function also contain the sum of all d so far, between u and the params. If an event
+        ends the path, the deviation of its time is that of t plus the sum of all d.
         """
         *_, t, h = arguments
         n = self.problem.size
@@ -455,9 +460,9 @@ class Radau(Adaptive):
         groups = [path[first : first + n_together] for first in range(0, len(path), n_together)]
 
         def tangent(x: np.ndarray) -> np.ndarray:
-            """Return the tangents at the end, from those at the start, both in units of the sizes."""
+            """Return the tangents at the end for tangents at the start, both divided by the units of deviations."""
             y = np.insert(x * start_units, n, 0.0, axis=1).T
-            if x.any():  # else it is the value that the tape records
+            if x.any():  # the value that the tape records is 0 and needs no work
                 for group in groups:
                     for step, correction in self._linearised(group, path[-1], t, h, event):
                         y[: n + 1] = step @ y + less * (correction @ y)
@@ -486,20 +491,23 @@ class Radau(Adaptive):
     def _linearised(
         self, steps: list[AcceptedStep], end: AcceptedStep, t: float, h: float, event: Event | None
     ) -> np.ndarray:
-        """Return the derivatives of (u, all d) after each step, and what less extrapolation adds to them.
+        """Return the Jacobians of (u, sum of all d) after each step, and the corrections of the perturbed solution.
 
         Parameters
         ----------
         steps : list of AcceptedStep
         end : AcceptedStep
-            The last one of the interval.
+            The last step of the interval.
         t, h : float
-            Of the interval.
+            Start and length of the interval.
         event : Event or None
+            The event that ends the interval.
 
         Returns
         -------
-        array (steps, 2, n + 1, numbers at the start and all d)
+        array, shape (number of steps, 2, n + 1, k)
+            For each step the Jacobian (index 0) and, for the first perturbed solution, its change per unit of `LESS`
+            (index 1), with respect to the k entries of (u, sum of all d, moving params, t, h) before the step.
         """
         n = self.problem.size
         m = len(steps)
@@ -510,7 +518,7 @@ class Radau(Adaptive):
         states, shares = (np.concatenate(part) for part in zip(*places, strict=True))
         points = [*zip(states, t + shares * h, strict=True)]
         rates, rows = self.problem.rows(points, self.params, self.moving)
-        # Points: the starts of the steps, the end of the last one, the first and the second stages.
+        # The points are the starts of the steps, the end of the last step, the first stages, and the second stages.
         first = rows[:m]
         rows = np.stack([rows[m + 1 : -m], rows[-m:], rows[1 : m + 1]], 1)
         is_last = np.array([step is end for step in steps])
@@ -535,9 +543,9 @@ class Radau(Adaptive):
             + np.tensordot(E, dz, (0, 1)) / lengths
         )
         M = np.stack([dz[:, 2] + np.eye(n, b.shape[-1]), solved(REAL / lengths * one - first[..., :n], error)], 1)
-        stretch = M[..., -1].copy()  # derivative of the new state in the length
+        stretch = M[..., -1].copy()  # derivative of the new state with respect to the step length
         M[..., -1] = done * M[..., -2] + length * stretch
-        M = np.insert(M, n, M[..., -2] - last * stretch, axis=3)  # the last step gives all d back
+        M = np.insert(M, n, M[..., -2] - last * stretch, axis=3)  # the last step subtracts the sum of all d
         M[..., :n] += stretch[..., None] * section[:, None, None]
         shift = np.zeros((m, 2, 1, M.shape[3]))
         shift[:, 0, 0, : n + 1] = np.insert(section, n, ~gives_back, axis=1)
@@ -556,9 +564,9 @@ class Radau(Adaptive):
         shift: np.ndarray,
         stretch: np.ndarray,
     ) -> None:
-        """Choose d of the last step so that the event stays 0; write it into `M` and `shift`.
+        """Determine d of the last step from the condition that the event function stays 0; update `M` and `shift`.
 
-        With the new state M x + stretch d and the time S + t + d, S all d before,
+        With the new state M x + stretch d and the time S + t + d, where S is the sum of all earlier d,
 
             d = -(g_u M x + g_p p + g_t (S + t)) / (g_u stretch + g_t).
         """
@@ -583,10 +591,10 @@ class Radau(Adaptive):
 
 
 def solved(matrices: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the solution of each matrix for its right-hand sides."""
+    """Solve a linear system with several right-hand sides for each matrix."""
     return np.array([dense_lu(matrix)[0](part, False) for matrix, part in zip(matrices, b, strict=True)])
 
 
 def norm(x: np.ndarray) -> float:
-    """Return the root mean square; of three stages the root of the sum of their squares."""
+    """Return the root mean square of a vector; for an array of stages, the root of the sum of their mean squares."""
     return float(np.sqrt(np.vdot(x, x) / x.shape[-1]))
