@@ -1,4 +1,4 @@
-"""Checkpoints of a run of `minimize`: each state is one file, written whole or not at all."""
+"""Checkpoints of a run of `minimize`. Each state is stored in one file, which is written atomically."""
 
 from __future__ import annotations
 
@@ -24,25 +24,26 @@ if TYPE_CHECKING:
 __all__ = ["Checkpoint"]
 
 FORMAT = "sparsedp optimization 5"
-STATES = 2  # how many are kept
-ROUNDING = 1e-6  # share of loss and gradient at the start by which another number of processes or version may differ
-SHARE = 0.1  # a state is written when that takes at most this share of the time since the last one
+STATES = 2  # number of states that are kept
+ROUNDING = 1e-6  # tolerated relative difference of loss and gradient if the number of processes or the version changed
+SHARE = 0.1  # writing states may take at most this fraction of the run time
 
 
 class Checkpoint:
-    """A folder with the last two states of a run, each a .npz file without pickle. Does nothing without a folder.
+    """A folder with the last two states of a run, each stored in an .npz file without pickle.
 
     Parameters
     ----------
     folder : path or None
+        If it is None, nothing is read or written.
     settings : dict
-        What the run depends on beside the loss and the batches: name and any value. A folder of a run with other
-        settings is refused.
+        Names and values of the settings of the run, other than the loss and the batches. If the folder contains a run
+        with other settings, ValueError is raised.
 
     Attributes
     ----------
     resumed : str
-        Whether the run continued from the folder; empty without one.
+        A sentence that says whether the run continued from the folder; empty if there is no folder.
     """
 
     def __init__(self, folder: str | os.PathLike[str] | None, settings: dict[str, Any]):
@@ -56,19 +57,21 @@ class Checkpoint:
         self.resumed = ""
 
     def resume(self, template: Any, objective: Objective, monitor: Monitor) -> Any:
-        """Return the last state of the folder, None if there is none; objective and monitor continue from it.
+        """Return the last state stored in the folder, or None, and restore `objective` and `monitor`.
 
         Parameters
         ----------
         template : state
-            At the start. Its structure is that of every state; its loss is compared with the stored one.
+            The state at the start. It determines the structure of the stored state, and its loss is compared with the
+            stored loss at the start.
         objective : Objective
         monitor : Monitor
 
         Raises
         ------
         ValueError
-            If the folder holds a run with other settings, batches, or another loss at its last point.
+            If the folder contains a run with other settings or batches, or if the loss at its first or last point has
+            changed.
         """
         if self._folder is None:
             return None
@@ -103,7 +106,7 @@ class Checkpoint:
         return state
 
     def _check_start(self, start, record, objective, exact):
-        """Refuse a loss that differs from the first record."""
+        """Raise ValueError if the loss or gradient norm at the start differs from the stored record."""
         value = objective.in_units_of_loss(start.value)
         gradient_norm = objective.in_units_of_loss(norm(objective.projected_gradient(start)))
         same = _agree(value, record.value, record.value, exact)
@@ -111,14 +114,14 @@ class Checkpoint:
         self._check_same("loss at the start", same)
 
     def _check_last_point(self, last, start, objective, exact):
-        """Refuse another loss at the last point than the stored one."""
+        """Raise ValueError if the loss or gradient at the last point differs from the stored one."""
         again = objective(last.point)
         same = _agree(again.value, last.value, start.value, exact)
         same = same and _agree(again.gradient, last.gradient, norm(objective.projected_gradient(start)), exact)
         self._check_same("loss at the last point", same)
 
     def _check_same(self, name, same):
-        """Refuse a folder of a run in which something differs."""
+        """Raise ValueError unless `same` is true; `name` says what differs in the stored run."""
         if not same:
             raise ValueError(
                 f"{self._folder} holds a run with another {name}; call minimize as that run began, or write another "
@@ -126,7 +129,7 @@ class Checkpoint:
             )
 
     def _load(self):
-        """Return the content of the newest valid file, empty without one, and words on files that were skipped."""
+        """Return the content of the newest valid file ({} without one), and a text about skipped files."""
         skipped = [f"; skipped {path.name}: an unfinished write" for path in self._folder.glob(f"*{UNFINISHED}")]
         for path in self._files():
             for version in (FORMAT, FORMAT_0_2):
@@ -137,16 +140,16 @@ class Checkpoint:
         return {}, "".join(skipped)
 
     def _files(self):
-        """Return the files of states, newest first."""
+        """Return the paths of all stored states, newest first."""
         return sorted(self._folder.glob("state-*.npz"), reverse=True)
 
     def _add_batch(self, batch):
-        """Add the batch of an iteration to the fingerprint of all batches so far."""
+        """Update the fingerprint of all batches so far with the batch of one more iteration."""
         so_far = self._settings["list of batches"] + fingerprint(batch)
         self._settings = {**self._settings, "list of batches": _digest(so_far.encode())}
 
     def save(self, state: Any, objective: Objective, monitor: Monitor) -> None:
-        """Write the state, unless one was written a moment ago and the run continues."""
+        """Remember the state, and write it if enough time has passed since the last write or if the run stops."""
         if self._folder is None:
             return
         self._add_batch(objective.batches.at(monitor.iteration))
@@ -163,14 +166,14 @@ class Checkpoint:
             self.write(monitor.history)
 
     def write(self, history: list[Record]) -> None:
-        """Write the state of the last complete iteration, unless it is written."""
+        """Write the state of the last complete iteration if it has not been written yet."""
         if self._unwritten is None:
             return
         begin = time.perf_counter()
         number = self._unwritten["iteration"]
         path = self._folder / f"state-{number:09d}.npz"
         save_tree(path, {**self._unwritten, "history": history[: number + 1]}, FORMAT)
-        up_to_this = [file for file in self._files() if file <= path]  # newer ones are damaged
+        up_to_this = [file for file in self._files() if file <= path]  # files of later iterations are damaged
         for file in up_to_this[STATES:]:
             file.unlink(missing_ok=True)
         self._unwritten = None
@@ -179,7 +182,7 @@ class Checkpoint:
 
 
 def fingerprint(tree: Any) -> str:
-    """Return a hash of any value: of its structure, of the type and content of every leaf, of a function its name."""
+    """Return a hash of the structure of a tree, and of the type and content of its leaves; functions count by name."""
     entries, rebuild = flatten(tree)
     structure = repr(rebuild(range(len(entries))))
     return _digest("\n".join([structure, *map(_description, entries)]).encode())
@@ -191,20 +194,20 @@ def _digest(content):
 
 
 def _description(leaf):
-    """Return the type and content of a leaf in words that are the same in every process."""
+    """Return a text that describes the type and content of a leaf and is the same in every process."""
     leaf = gathered(leaf)
     kind = type(leaf).__qualname__
     if isinstance(leaf, (np.ndarray, np.generic)) and leaf.dtype != object:
         return f"{kind} {leaf.dtype} {leaf.shape} {_digest(leaf.tobytes())}"
     if callable(leaf):
         return f"{getattr(leaf, '__module__', '')} {getattr(leaf, '__qualname__', kind)}"
-    if " at 0x" in repr(leaf):  # an address differs in the next process
+    if " at 0x" in repr(leaf):  # a memory address, which differs between processes
         return kind
     return f"{kind} {leaf!r}"
 
 
 def _agree(value, stored, size, exact):
-    """Return whether two numbers or vectors agree: bit for bit, or if not `exact` up to rounding of a size."""
+    """Return whether two values agree: bitwise if `exact`, else up to a tolerance relative to `size`."""
     if np.array_equal(value, stored):
         return True
     return not exact and norm(value - stored) <= ROUNDING * abs(size)

@@ -1,4 +1,4 @@
-"""The Jacobian of a function of a tree at one point: products with it, and its entries where it is small."""
+"""The Jacobian of a function of a tree at one point: products with it, its matrix if it is small, and covariances."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Linearization", "left_singular"]
 
-MOST_ENTRIES = 3e7  # of a Jacobian that is formed by default (240 MB)
-LONGEST_SIDE = 4000  # longest shorter side of a Jacobian that is formed by default
-MOST_UNKNOWNS = 4000  # of which the covariance is computed (128 MB)
-FIRST_GROUP = 1e-4  # singular values above this share of the largest come from the first Gram matrix
-APART_ACCURACY = 1e-6  # relative difference of a row by row Jacobian from the recorded one
+MOST_ENTRIES = 3e7  # by default, a Jacobian with more entries (240 MB) is not formed
+LONGEST_SIDE = 4000  # by default, a Jacobian whose shorter side is longer than this is not formed
+MOST_UNKNOWNS = 4000  # the covariance of more unknowns (128 MB) is not computed
+FIRST_GROUP = 1e-4  # singular values above this multiple of the largest are taken from the first Gram matrix
+APART_ACCURACY = 1e-6  # tolerated relative difference of a product with the Jacobian of samples from the VJP
 
 NOT_FORMED = (
     "{}; the product of its inverse with v is dp.vjp(residuals, x)[1](dp.jvp(residuals, x, v)[1]), and "
@@ -42,7 +42,9 @@ NOT_APART = (
 
 
 class Linearization:
-    """Outputs y(x) of m numbers at a flat point of n numbers, and their Jacobian J, m x n.
+    """The outputs y of a function at a point x, and their Jacobian J of shape m x n.
+
+    Here m is the number of entries of y, and n the length of the flat vector x.
 
     Parameters
     ----------
@@ -51,21 +53,21 @@ class Linearization:
     packing : Packing
     vector : (n,) array
     batch : tuple
-        The arguments of `outputs` after x.
+        Further arguments of `outputs` after x.
     apart : bool
-        The outputs along axis 0 depend on their own copy of x alone. Then x is given with a leading axis of copies, one
-        for each of the s samples, and m / s products with J^T give all rows.
+        True if the outputs along axis 0 belong to s independent samples. `outputs` is then also called with a leading
+        axis of s copies of x, one for each sample, so that m / s products with J^T give the whole matrix J.
     dense : bool or None
-        Whether J is formed; None: if it is small.
+        Whether J is formed. None: only if it is small.
 
     Attributes
     ----------
     value : array
         The outputs.
     flat : (m,) array
-        The outputs divided by `scale`. J, and the products with it, are of these m numbers.
+        The outputs divided by `scale`, as a flat array. J is the Jacobian of this array.
     scale : float
-        A power of two, 1 at first: see `rescaled`.
+        A power of two, initially 1: see `rescaled`.
     shape : (m, n)
     dense : bool
         Whether J is formed.
@@ -73,7 +75,7 @@ class Linearization:
     Raises
     ------
     DerivativeError
-        If the outputs are complex or a scalar.
+        If the outputs are complex or a scalar, or if x is complex.
     NonFiniteError
         If an output is NaN or infinite.
     """
@@ -93,7 +95,7 @@ class Linearization:
         self._tree = packing.unpack(vector)
         self._free: Any = True  # which columns of J are kept
         self.scale = 1.0
-        if apart:  # products with J^T will be needed, so the outputs are recorded at once
+        if apart:  # products with J^T will be needed, so record the computation of the outputs now
             self.value = self._recorded[0]
         else:
             self.value = np.asarray(self._outputs(packing.unpack(vector)))
@@ -109,15 +111,15 @@ class Linearization:
         if dense is None:
             dense = rows * columns <= MOST_ENTRIES and min(rows, columns) <= LONGEST_SIDE
         self.dense = dense
-        self._by_columns = columns < rows and not apart  # they take fewer products than the rows
+        self._by_columns = columns < rows and not apart  # J v for each column takes fewer products than J^T w for rows
 
     @cached_property
     def _recorded(self):
-        """The outputs, and the function from a cotangent to that of x."""
+        """The outputs, and the VJP function from their cotangent to that of x."""
         return pullback(self._outputs, self._tree)
 
     def restricted(self, free: NDArray[np.bool_]) -> Linearization:
-        """Return the same linearization with the columns of J set to 0 where the unknowns are not free."""
+        """Return the same linearization with the columns of J set to 0 for unknowns that are not free."""
         if free.all():
             return self
         other = copy(self)
@@ -125,35 +127,35 @@ class Linearization:
         return other
 
     def rescaled(self, scale: float) -> Linearization:
-        """Return the same linearization with outputs and J divided by a power of two; call it before J is formed."""
+        """Return the linearization with outputs and J divided by a power of two. Must be called before J is formed."""
         other = copy(self)
         other.scale = scale
         other.flat = self.flat / scale
         return other
 
     def vjp(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return J^T w, (n,), of w, (m,)."""
-        if self.dense and self._by_columns:  # the columns are formed anyway, and nothing needs to be recorded
+        """Return J^T w, an array of shape (n,), for w of shape (m,)."""
+        if self.dense and self._by_columns:  # J is needed anyway, and it is computed without recording
             return w @ self.jacobian()
         cotangent = w.reshape(self.value.shape).astype(self.value.dtype)
         return self._free * (self._packing.pack_gradient(self._recorded[1](cotangent)) / self.scale)
 
     def jvp(self, v: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return J v, (m,), of v, (n,)."""
+        """Return J v, an array of shape (m,), for v of shape (n,)."""
         if "_all_columns" in vars(self):
             return self._all_columns @ (self._free * v)
         tangents = [leaf if is_variable(leaf) else None for leaf in leaves(self._packing.unpack(self._free * v))]
         return push(self._outputs, self._tree, tangents)[1].reshape(-1).astype(float) / self.scale
 
     def jacobian(self) -> NDArray[np.float64]:
-        """Return J, m x n."""
+        """Return the matrix J of shape m x n."""
         if self._free is True:
             return self._all_columns
         return self._all_columns * self._free
 
     @cached_property
     def _all_columns(self):
-        """J without restriction, by one product for each column or each row, whichever are fewer."""
+        """J for all unknowns, free or not, computed by one product for each column or for each row."""
         rows, columns = self.shape
         if self._apart:
             return self._jacobian_of_samples()
@@ -162,12 +164,12 @@ class Linearization:
         return np.array([self.vjp(unit) for unit in np.eye(rows)]).reshape(self.shape)
 
     def _jacobian_of_samples(self):
-        """Return J by one product for each output of a sample.
+        """Return J, computed by one product with J^T for each output of a sample.
 
         Raises
         ------
         ShapeError
-            If the outputs of a sample do not depend on their own copy of x alone.
+            If the outputs of a sample depend on the copy of x of another sample.
         """
         samples = len(self.value)
 
@@ -186,7 +188,7 @@ class Linearization:
             gradients = [np.reshape(leaf, (samples, -1)) for leaf in leaves(pull(cotangent)) if leaf is not None]
             np.concatenate(gradients, axis=1, out=jacobian[:, column])
         jacobian = jacobian.reshape(self.shape) / self.scale
-        # A function that uses one copy alone gives outputs of the right shape and wrong rows.
+        # If the function uses the copy of one sample for all samples, shapes are right but J is wrong: compare a VJP.
         probe = np.cos(np.arange(self.shape[0]))
         by_rows = self._free * (probe @ jacobian)
         recorded = self.vjp(probe)
@@ -195,7 +197,7 @@ class Linearization:
         return jacobian
 
     def covariance(self, absolute_sigma: bool) -> NDArray[np.float64] | str:
-        """Return the covariance of the unknowns, (n, n), or a sentence that says why it is not computed.
+        """Return the (n, n) covariance of the unknowns, or a sentence that says why it is not computed.
 
         Parameters
         ----------
@@ -204,7 +206,7 @@ class Linearization:
 
         Notes
         -----
-        Infinite where J has a rank below n.
+        All entries are infinite if the rank of J is less than n.
         """
         rows, columns = self.shape
         if columns > MOST_UNKNOWNS:
@@ -220,7 +222,7 @@ class Linearization:
         jacobian = self.jacobian()
         largest_entries = np.max(np.abs(jacobian), axis=0, initial=0.0)
         largest_entries[largest_entries == 0] = 1.0
-        # Columns of norm 1: then no unknown is small beside another.
+        # Scale the columns to norm 1, so that the rank test does not depend on the units of the unknowns.
         column_norms = largest_entries * np.linalg.norm(jacobian / largest_entries, axis=0)
         if rows < columns or not np.all(column_norms > 0):
             return np.full((columns, columns), np.inf)
@@ -232,24 +234,24 @@ class Linearization:
         else:
             sigma = np.linalg.norm(self.flat) / np.sqrt(rows - columns)
         root = vectors / s * sigma / column_norms[:, None]
-        with np.errstate(over="ignore"):  # the square of a large x may be infinite
+        with np.errstate(over="ignore"):  # variances of very large unknowns may overflow to infinity
             return root @ root.T
 
 
 def left_singular(matrix: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    r"""Return the left singular vectors and the singular values of a wide matrix, from Gram matrices.
+    r"""Return the left singular vectors and the singular values of a wide matrix, computed from Gram matrices.
 
     Parameters
     ----------
     matrix : (k, n) array
-        W, with k <= n.
+        The matrix W, with k <= n.
 
     Returns
     -------
     vectors : (k, k) array
-        As columns.
+        The left singular vectors, as columns.
     s : (k,) array
-        Falling.
+        The singular values in descending order.
 
     Raises
     ------
@@ -258,23 +260,25 @@ def left_singular(matrix: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDA
 
     Notes
     -----
-    The Gram matrix W W^T squares the singular values: those above 1e-4 of the largest keep at least eight digits, those
-    below 1e-8 are lost in rounding. So the first group, above 1e-4, is taken from it, and the others get a Gram matrix
-    of their own. With the eigenvectors E1 (squares q1) and E2 of the two groups, rounding leaves a part of E1 in E2;
-    after
+    The eigenvalues of the Gram matrix W W^T are the squared singular values. Singular values above 1e-4 times the
+    largest are obtained with at least eight digits; those below 1e-8 times the largest are lost in rounding. Therefore
+    only the first group, above 1e-4, is taken from this matrix, and the others are computed from a second Gram matrix.
+    Let E1 and E2 be the eigenvectors of the two groups, and q1 the diagonal matrix of the eigenvalues of the first.
+    Rounding errors leave a component of E1 in E2. It is removed by
 
         C = q1^-1 E1^T W (E2^T W)^T,    E2 <- E2 - E1 C,    E1 <- E1 + E2 C^T,
 
-    E2^T W has no more of the first group than after Householder's reflections. The same is repeated for W <- E2^T W
-    until the second group is empty: one to four times. An SVD of W costs five times as much.
+    so that E2^T W contains no more of the first group than after Householder reflections. The algorithm is then applied
+    to W <- E2^T W, and so on until the second group is empty, which takes one to four Gram matrices. An SVD of W is
+    five times as expensive.
     """
-    scale = power_of_two(largest(matrix))  # no square overflows
+    scale = power_of_two(largest(matrix))  # so that the squared entries do not overflow
     scaled = matrix / scale
     with np.errstate(invalid="ignore"):
         gram = scaled @ scaled.T
     check_finite("products of the Jacobian", gram, advice="; start where every output has a finite derivative")
     squares, vectors = scipy.linalg.eigh(gram.T, driver="evd", overwrite_a=True, check_finite=False)
-    # Eigenvalues rise, so the second group comes first.
+    # The eigenvalues are in ascending order, so the second group (small values) comes first.
     second_count = int(np.count_nonzero(squares <= FIRST_GROUP**2 * np.max(squares, initial=0.0)))
     if second_count == len(squares):
         second_count = 0
