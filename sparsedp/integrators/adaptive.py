@@ -657,8 +657,8 @@ class Adaptive(Scheme):
         else:
             limit = TIMES * self.tolerance
         unit = EPSILON * self.ratio
-        scale = 0.0  # of the last input
-        largest = 0.0  # of all inputs
+        scale = 0.0  # largest magnitude of an entry of the last input
+        largest = 0.0  # largest magnitude of an entry of all inputs so far
 
         def perturb(x: np.ndarray) -> np.ndarray:
             nonlocal scale, largest

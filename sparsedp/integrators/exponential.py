@@ -173,7 +173,7 @@ MEAN = Function((0.0, 0.5), 0.5)
 BEGIN = Function((0.0, 1.0, -3.0, 4.0))
 MIDDLE = Function((0.0, 0.0, 2.0, -4.0))
 END = Function((0.0, 0.0, -1.0, 4.0))
-NODES = (0.0, 0.5 - 0.1 * 5**0.5, 0.5 + 0.1 * 5**0.5, 1.0)  # of Lobatto, as shares of a step
+NODES = (0.0, 0.5 - 0.1 * 5**0.5, 0.5 + 0.1 * 5**0.5, 1.0)  # Lobatto nodes, as fractions of a step
 
 
 def quadrature(nodes: Sequence[float], start: float, stop: float) -> tuple[Function, ...]:

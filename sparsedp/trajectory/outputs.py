@@ -249,7 +249,7 @@ class FunctionOfStates(LastState):
     def __init__(self, form: ArgumentForm, function: Callable) -> None:
         super().__init__(form)
         self.function = function
-        self._fingerprints: list = []  # of the results, to detect a function that later returns other results
+        self._fingerprints: list = []  # fingerprints of the results, to detect other results in a later call
         self._trees: list = []  # the results, with a _StackedResult in place of each floating leaf
         self._first_trees: list = []  # the trees of the first run; later results get the same order of entries
 

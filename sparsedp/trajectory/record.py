@@ -68,7 +68,7 @@ def backward_record(n: int, kept: int, recomputed: int, norms: list[tuple[int, f
     Parameters
     ----------
     n, kept, recomputed : int
-        As the attributes of `Record`.
+        See the attributes of `Record`.
     norms : list of (int, float)
         Index of a state and the largest magnitude of an entry of its cotangent.
     last_cut : int
