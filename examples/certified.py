@@ -4,9 +4,9 @@ How exact is a gradient, and how exact need it be?
 
 The error that loose solves leave in a gradient, estimated and true; a search that chooses tolerances by itself.
 
-A gradient through a solve takes two solves, one forward and one adjoint. Both are iterations that stop at some
-tolerance. If they stop early the gradient is off: by how much? And far from the optimum, where any rough direction
-leads down, why should they go on to ten digits?
+A gradient through a linear solve needs two solves, one forward and one adjoint. Both are iterations that stop at some
+tolerance. How large is the error of the gradient if they stop early? And far from the optimum, where even a rough
+direction decreases the loss, which tolerance is sufficient?
 
 Run it: ``python examples/certified.py [cells] [--out FOLDER]``
 """

@@ -4,9 +4,9 @@ Where a given amount of conductor cools best
 
 A rod with its exact optimum, and a plate with a pipe.
 
-Heat is made everywhere in a body, and leaves it at one place that is kept cold. A given amount of conductor may be
-spread in it. Where should it go, so that the body stays as cool as possible? On a rod the answer fits on a line, and we
-can see how near a search comes to it. On a plate nobody knows it, but we know what to test.
+Heat is generated everywhere in a body, and leaves it at one place that is kept cold. A given amount of conductor can be
+distributed in it. Which distribution keeps the body as cool as possible? For a rod there is an exact solution, with
+which we compare the result of the optimization. For a plate there is none, but we can test an optimality condition.
 
 Run it: ``python examples/conductivity_design.py [cells] [--out FOLDER]``
 """

@@ -4,9 +4,9 @@ Shocks in gas and water
 
 Sod's tube and a dam break beside exact solutions, and a pressure found from the shock that a sensor heard.
 
-Where gas or water is suddenly let go, jumps run through it. A conservation law says how: what leaves one cell enters
-the next. Here one scheme serves both laws. A law is its flux and the speed of its waves; slopes, shocks, walls and
-gradients come with it.
+Where gas or water is suddenly released, shocks propagate through it. They follow from conservation laws: what leaves
+one cell enters the next. Here one scheme solves both laws. The user defines the flux and the wave speeds of a law; the
+scheme provides slopes, shocks, walls and gradients.
 
 Run it: ``python examples/conservation_laws.py [cells] [--out FOLDER]``
 """

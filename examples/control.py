@@ -4,9 +4,9 @@ The least force that ends a flow as wanted
 
 A hundred scenes at once, by gradients through the physics, beside a search without gradients.
 
-In each scene two humps of velocity run into each other. A steady force that we do not know brought the flow to some end
-state. We look for a force of our own, free in every cell and every step, that ends there too, and is as weak as
-possible. Published answers came from reinforcement learning and from a learned controller; here is the plain adjoint.
+In each scene two humps of velocity run into each other. An unknown steady force brought the flow to a known final
+state. We look for the weakest force that leads to the same final state; it may differ in every cell and every step.
+Published solutions used reinforcement learning and a learned controller; this example uses adjoint gradients.
 
 Run it: ``python examples/control.py [scenes] [--out FOLDER]``
 """

@@ -4,9 +4,9 @@ Edges in the ground
 
 Total variation beside a smooth regularizer: blocks in the ground, found from pressures.
 
-Water is pumped out at twelve wells in turn, and 480 sensors tell the pressure: how conductive is the ground? This is
-the scene of ``python -m sparsedp demo``, but here the ground is made of blocks. Readings alone do not tell all of it.
-What is added to them decides whether edges stay sharp.
+Water is pumped out at twelve wells in turn, and 480 sensors measure the pressure: how conductive is the ground? This is
+the scene of ``python -m sparsedp demo``, but here the ground consists of blocks. The readings alone do not determine
+it. The regularizer that is added to the misfit decides whether edges stay sharp.
 
 Run it: ``python examples/edges.py [cells] [--out FOLDER]``
 """

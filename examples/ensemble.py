@@ -2,12 +2,11 @@ r"""
 A law from twelve experiments
 =============================
 
-A network learns how conductivity depends on temperature; two processes share the work, with the bits of one.
+A network learns how conductivity depends on temperature; two processes give the same bits as one.
 
-Heat spreads through a material, and nobody knows how well it conducts, only that this depends on the temperature. We
-see twelve experiments: how the field began, and how it ended. A small network stands for the unknown law, inside every
-implicit step. All experiments count in each gradient, and they do not need each other: so two processes take them in
-turn.
+Heat spreads through a material whose conductivity is an unknown function of the temperature. The data are the initial
+and the final fields of twelve experiments. A small network represents the unknown law in every implicit step. Each
+gradient is a sum over all experiments, which are independent of each other, so that two processes can share them.
 
 Run it: ``python examples/ensemble.py [iterations] [--out FOLDER]``
 """

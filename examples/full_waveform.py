@@ -2,12 +2,12 @@ r"""
 A body in the Earth's crust, found from waves
 =============================================
 
-Leapfrog, a sponge, six shots and many receivers: what the waves tell of the speed under ground.
+Leapfrog, a sponge, six shots and many receivers: the wave speed under ground is found from recorded waves.
 
-Shots near the surface send waves down; where the speed of the rock changes, part of them comes back, and arrives sooner
-or later than expected. Receivers write down the pressure. From these traces we look for the speed in every cell: this
-is called full waveform inversion. The crust is that of the model ak135 (B. Kennett, E. Engdahl, R. Buland, Geophys. J.
-Int. 122, 1995), and a body in it is 10 % slower.
+Shots near the surface send waves down. Where the speed of the rock changes, a part of them is reflected. Receivers
+record the pressure. From these records we reconstruct the speed in every cell, which is called full waveform inversion.
+The crust is that of the model ak135 (B. Kennett, E. Engdahl, R. Buland, Geophys. J. Int. 122, 1995), and a body in it
+is 10 % slower.
 
 Run it: ``python examples/full_waveform.py [cells deep] [--out FOLDER]``
 """

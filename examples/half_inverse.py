@@ -4,9 +4,9 @@ A network that steers two oscillators
 
 Half-inverse gradients, Adam and Levenberg-Marquardt, beside each other.
 
-Two masses hang on springs. A network sees how they should end, and chooses 24 pushes on the second mass that bring them
-there. It is trained through the physics. The two masses answer to pushes with very different strength, so the gradient
-is badly scaled, and the way in which a step is made from it matters more than how many steps are made.
+Two masses hang on springs. The input of a network is their wanted final state; its output is 24 pushes on the second
+mass that should lead there. It is trained through the physics. The two masses respond to pushes with very different
+strength, so that the gradient is badly scaled. The update rule then matters more than the number of steps.
 
 The problem, the method and the figures: P. Schnell, P. Holl, N. Thuerey, "Half-inverse gradients for physical deep
 learning", ICLR 2022.

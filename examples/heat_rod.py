@@ -4,9 +4,9 @@ Heat in a rod
 
 One operator, one gradient, one table of finite differences.
 
-A rod is 1 m long, and both of its ends are held at 0 degrees. We see its temperature after it has cooled for a while,
-and ask: how warm was it, and where, at the start? On the way stands the idea that all of this library rests on. It
-takes three lines.
+A rod is 1 m long, and both of its ends are held at 0 degrees. We know its temperature after it has cooled for a while,
+and look for its temperature at the start. On the way we meet the idea on which this library is based: the derivative
+of a linear operator is its transpose. It takes three lines.
 
 Run it: ``python examples/heat_rod.py [cells] [--out FOLDER]``
 """

@@ -4,9 +4,8 @@ Waves of one frequency
 
 Helmholtz's equation with ends that absorb, two solvers, circular waves beside Hankel's function, and a gradient.
 
-A source hums at one frequency in a medium of varying speed and density. What is heard everywhere follows from one
-linear system, in complex numbers. It is a hard one: it is not definite, and whatever meets the end of the grid must not
-come back.
+A source emits one frequency in a medium of varying speed and density. The wave is the solution of one complex linear
+system. It is hard to solve, because the matrix is indefinite, and the boundaries must not reflect waves.
 
 Run it: ``python examples/helmholtz.py [cells] [--out FOLDER]``
 """

@@ -4,10 +4,9 @@ Through the iterations, or around them
 
 The gradient of a solve, taped through 200 iterations or by one adjoint solve: error, time, memory.
 
-A solver is a loop, and a loop can be taped: every iteration is kept, and the backward pass goes through all of them.
-This is called unrolling, and it is what happens when a solver is written in a language that takes derivatives by
-itself. But the solution does not depend on how it was found. Its derivative follows from the equation alone, and the
-iterations can be forgotten.
+A solver is a loop, and a tape can record it: every iteration is stored, and the backward pass goes through all of them.
+This is called unrolling, and it is what automatic differentiation of a solver does. But the solution does not depend on
+the method that computed it. Its derivative follows from the equation alone, and no iteration needs to be stored.
 
 Run it: ``python examples/implicit_or_unrolled.py [cells] [--out FOLDER]``
 """

@@ -2,10 +2,10 @@ r"""
 How exact must an inner solve be?
 =================================
 
-Let the error of the gradient say when to stop.
+The solves stop when the error of the gradient is small enough.
 
-A search needs a gradient at every step, and each gradient takes two solves. Solves that go to the last digit are a
-waste while the search is still far away; solves that stop too early send it astray. K. Bhatia, F. Koehler and
+An optimization needs a gradient in every step, and each gradient needs two solves. Exact solves waste time while the
+optimum is far away; solves that stop too early give a wrong search direction. K. Bhatia, F. Koehler and
 N. Thuerey (*Progressively refined differentiable physics*, ICLR 2025) save a third of the work by refining the solves
 as the search goes on. Here we ask for a bound on the error of the gradient instead, and save far more.
 

@@ -2,11 +2,11 @@ r"""
 Where the heat was
 ==================
 
-From a blurred picture back to a sharp one: gradients, one physical gradient, and what one knows beforehand.
+From a blurred picture back to a sharp one: gradients, one physical gradient, and prior knowledge.
 
-Heat was laid down in rectangles on a plate, and spread for a while. We see the end, in single precision, and want the
-start. The physics is linear and can be undone on paper; but it has damped fine waves by many powers of ten, and what is
-left of them drowns in rounding. This is what makes inverse problems hard, in its purest form.
+Rectangles of a plate are heated, and the heat spreads for a while. From the final temperature in single precision we
+reconstruct the initial one. The physics is linear and has an exact inverse, but it damps short waves by many powers of
+ten, so that they are smaller than rounding errors at the end. This is the basic difficulty of inverse problems.
 
 Case and published figures: inverse heat conduction in P. Holl, V. Koltun, N. Thuerey, "Scale-invariant learning by
 physics inversion", NeurIPS 2022. There a network is trained; here none is needed.

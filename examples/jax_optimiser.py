@@ -4,9 +4,9 @@ An optimizer of JAX around a rollout
 
 A rollout of this library as one more function of JAX, under `jit` and `grad`.
 
-A drop of ink falls into a wind, is carried along and spreads. We see a picture of the end, and ask: where did it fall,
-and how fast does it spread? JAX makes the drop, a rollout carries it, and Adam of optax finds both. No line of the
-physics is written in JAX.
+A drop of ink falls into a wind, is advected and spreads. From a picture of the final state we determine where it fell
+and how fast it spreads. JAX computes the initial drop, a rollout of this library advances it, and Adam of optax
+finds both unknowns. No line of the physics is written in JAX.
 
 Run it: ``python examples/jax_optimiser.py [cells] [--out FOLDER]``; it needs jax and optax
 """

@@ -4,8 +4,8 @@ An operator of your own
 
 Five lines, as a matrix or as two functions; and what the checks say when one of them is wrong.
 
-The catalogue does not hold your instrument, or your physics. Any linear map joins in when it can be applied and
-transposed. Gradients then run through it as through the others, since the VJP of a linear map *is* its transpose.
+Your instrument or your physics may need an operator that the library does not have. Every linear map can be used that
+can be applied and transposed. Gradients then work as for other operators: the VJP of a linear map *is* its transpose.
 
 Run it: ``python examples/new_operator.py [cells] [--out FOLDER]``
 """

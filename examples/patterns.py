@@ -5,8 +5,8 @@ Four patterns, one stepper each
 Gray-Scott, Cahn-Hilliard, Swift-Hohenberg and Kuramoto-Sivashinsky in a plane, and a rate found from a picture.
 
 Spots that divide, films that coarsen, rolls, and a flame that never comes to rest: four equations of textbooks, each a
-few lines here. All have a stiff part that is linear, and a small part that is not. `dp.stepper` is told which is which.
-For each there is something known to hold it against, and each is differentiable in its parameters.
+few lines here. All have a stiff linear part and a nonstiff nonlinear part, which `dp.stepper` takes separately.
+Each is compared with a known result, and each is differentiable in its parameters.
 
 Run it: ``python examples/patterns.py [cells] [--out FOLDER]``
 """

@@ -4,9 +4,9 @@ What does a gradient cost, and what does it not need?
 
 Two questions to one law: what each calls, sets up and keeps, and what is left out.
 
-Water is pumped out of the ground, and we measure the pressure in the middle. One may ask where to pump, when the rock
-is known; or what the rock is, when the wells are known. Both go through the same law, but their gradients do not need
-the same things. `dp.explain` says what a gradient will do.
+Water is pumped out of the ground, and we measure the pressure in the middle. If the rock is known, the unknown is where
+to pump; if the wells are known, the unknown is the rock. Both problems use the same law, but their gradients need
+different computations. `dp.explain` lists the computations of a gradient.
 
 Run it: ``python examples/plan.py [cells] [--out FOLDER]``
 """

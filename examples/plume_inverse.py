@@ -2,7 +2,7 @@ r"""
 Winds that make three plumes end like a fourth
 ==============================================
 
-A search in 7896 unknowns through a flow that carries itself, with 80 gradients.
+An optimization of 7896 unknowns through a nonlinear flow, with 80 gradients.
 
 Four plumes of smoke rise from four places. How should the air move at the start, so that the first three end as the
 fourth does? Each answer is a whole field of velocities. The physics in between is the one of the smoke plume:

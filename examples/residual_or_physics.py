@@ -4,10 +4,10 @@ Physics as a residual, or as it is
 
 The start of a flow, found by a network with a residual in its loss, and by the adjoint of a solver.
 
-One state of Burgers' equation is seen, and its start is wanted. There are two schools. One takes a network for the
-whole history and punishes it for what is left of the equation at many points (M. Raissi and others, J. Comput. Phys.
-378, 2019): no solver is needed. The other runs a solver and goes back through it: whatever it finds obeys the equation.
-Here both do the same task with the same optimizer, and we look at errors, seconds, and how far each breaks the physics.
+From one later state of Burgers' equation we reconstruct the initial state, with two methods. One represents the whole
+solution by a network and minimizes the residual of the equation at many points (M. Raissi and others, J. Comput. Phys.
+378, 2019), without a solver. The other differentiates a solver, so that its result always satisfies the equation. Both
+use the same optimizer, and we compare errors, run times and the residuals of the equation.
 
 Run it: ``python examples/residual_or_physics.py [iterations] [--out FOLDER]``
 """
