@@ -1,7 +1,7 @@
-"""The stress cases of a scene: extreme values of its parameters, and what has to come out of each.
+"""The stress cases of a scene: extreme values of its parameters, and functions that grade the results.
 
-GROUPS is the table: for each group a function that lists its cases, the values to try and the function that grades
-what comes out.
+GROUPS lists the groups of cases. Each group has a function that yields its cases. A case has the values to try and the
+function that grades the result.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ FAILED = "FAILED"
 WORDS = (PASSED, REFUSED, DEGRADED, FAILED)
 TIME_STEPS = ("dt", "time_step", "tau")
 VISCOSITIES = ("nu", "viscosity", "diffusivity", "kappa", "mu")
-DIFFERENCE_STEPS = (1e-4, 1e-5, 1e-3, 1e-6, 1e-2, 1e-7)  # in units of x; the one that mostly serves comes first
-GOOD_GAP = 1e-5  # between gradient and differences; it needs no further examination
-INVISIBLE_CHANGE = 100 * EPS  # of the value, relative: no difference sees it
-ROUNDING_OF_X = 8 * EPS  # change of x in its last digits
-GOOD_CHANGE = 1e-8  # of the result by a change in the last digits: allowed
-LARGEST_CHANGE = 1e-5  # beyond it the case has failed
-FINER_STEP = 8.0  # the time step is divided by it, to tell physics that grows from a step that does
-LARGEST_EXPONENT = 960  # power of 2 up to which a value is sure to be representable
+DIFFERENCE_STEPS = (1e-4, 1e-5, 1e-3, 1e-6, 1e-2, 1e-7)  # in units of x, tried in this order
+GOOD_GAP = 1e-5  # relative gap between gradient and differences up to which a case passes
+INVISIBLE_CHANGE = 100 * EPS  # relative change of the value that finite differences cannot detect
+ROUNDING_OF_X = 8 * EPS  # relative change of x by rounding
+GOOD_CHANGE = 1e-8  # relative change of the result up to which the case passes
+LARGEST_CHANGE = 1e-5  # relative change above which the case has FAILED
+FINER_STEP = 8.0  # divisor of the time step, to distinguish growing physics from an unstable step
+LARGEST_EXPONENT = 960  # a value up to this power of 2 can be represented
 
-Values = Mapping[str, Any]  # other values of some parameters, by name
+Values = Mapping[str, Any]  # changed values of some parameters, by name
 Grade = tuple[str, float, str]  # word, figure, note
 
 
@@ -56,14 +56,14 @@ Grade = tuple[str, float, str]  # word, figure, note
 
 
 class Scene:
-    """A loss at a point, its named parameters, their legal ranges, and which are time step and viscosity.
+    """A loss at a point, with names and legal ranges of its parameters, and the names of time step and viscosity.
 
     Attributes
     ----------
     leaves : dict
-        Name: array, of the floating leaves of x.
+        The floating leaves of x, by name.
     ranges : dict
-        Name: (low, high).
+        Legal range (low, high), by name.
     time_step, viscosity : str or None
         Names of these parameters.
     base : Outcome
@@ -104,27 +104,27 @@ class Scene:
         self.growth = self.growth_at({})
 
     def at(self, changed: Values) -> Any:
-        """Return the tree x with other values of some parameters, and fresh copies of the rest."""
+        """Return the tree x with changed values of some parameters, and copies of all others."""
         return self.point.tree(list((copied(self.leaves) | dict(changed)).values()))
 
     def value_or_nan(self, x: Any) -> Any:
-        """Return the loss at x, NaN whatever it raises."""
+        """Return the loss at x, or NaN if it raises an exception."""
         try:
             return self.loss(x)
         except Exception:  # a scene may raise anything
             return nan
 
     def growth_at(self, changed: Values) -> Growth | None:
-        """Return the growth of a step with other values of some parameters."""
+        """Return the growth of a step with changed values of some parameters."""
         return growth_of(self.loss, self.at(changed), self.step)
 
     def is_legal(self, name: str, value: Any) -> bool:
-        """Return whether a value lies in the range of a parameter; without a range everything does."""
+        """Return whether a value is in the range of a parameter. Without a range, all values are."""
         low, high = self.ranges.get(name, (-inf, inf))
         return bool(np.all((low <= value) & (value <= high)))
 
     def word_for_fault(self, changed: Values) -> str:
-        """Return the word for a wrong number: FAILED at x itself, in stated ranges, and without viscosity."""
+        """Return the grade of a wrong result: FAILED at x, within given ranges, and for viscosity 0, else DEGRADED."""
         is_stated = all(name in self.ranges and self.is_legal(name, value) for name, value in changed.items())
         is_inviscid = self.viscosity is not None and not np.any(changed.get(self.viscosity, 1.0))
         if is_stated or is_inviscid:
@@ -133,14 +133,15 @@ class Scene:
 
 
 class Outcome(NamedTuple):
-    """The outcome of a run.
+    """The result of one evaluation of value and gradient.
 
     Attributes
     ----------
     value : float
     gradient : tree or None
     refusal : tuple
-        Grade of the error, if there was one; the word is right for an error that the library raises on purpose.
+        Grade of the exception; empty if there was none. It is REFUSED for an exception of this library, ValueError or
+        TypeError, and DEGRADED for all others.
     has_grown : bool
         Whether the gradient grew without bound in the backward pass.
     """
@@ -152,22 +153,22 @@ class Outcome(NamedTuple):
 
 
 def run(loss: Callable[[Any], Any], x: Any) -> Outcome:
-    """Return value and gradient of a loss; an error is part of the outcome."""
+    """Return value and gradient of a loss. An exception is caught and becomes part of the outcome."""
     grown = thread.grown
     try:
         value, gradient = value_and_grad(loss)(x)
-    except Exception as error:  # a scene may raise anything: its row shows it
+    except Exception as error:  # a scene may raise any exception; its row shows it
         is_accidental = isinstance(error, (np.linalg.LinAlgError, UnicodeError))
         is_typed = isinstance(error, (SparsedpError, ValueError, TypeError)) and not is_accidental
         return Outcome(nan, None, (REFUSED if is_typed else DEGRADED, nan, error_text(error)))
     return Outcome(float(value), gradient, (), thread.grown > grown)
 
 
-# ---------------------------------------------------------------- grades of what comes out
+# ---------------------------------------------------------------- grades of results
 
 
 def graded_run(grade: Callable[..., Grade], scene: Scene, changed: Values) -> Grade:
-    """Run a scene with other values of some parameters, which it may not modify, and grade the outcome."""
+    """Run a scene with changed parameters and grade the outcome. It has FAILED if the run modified its input."""
     x = scene.at(changed)
     before = _bits(x)
     outcome = run(scene.loss, x)
@@ -182,9 +183,9 @@ def _bits(x: Any) -> list[bytes]:
 
 
 def grade_soundness(scene: Scene, changed: Values, outcome: Outcome) -> Grade:
-    """Grade whether numbers are finite, the gradient agrees with differences, and no step grows by fault of the scheme.
+    """Grade whether results are finite, the gradient agrees with differences, and the time step is stable.
 
-    At x itself the run may not be refused; the growth there is a case of its own.
+    At x itself an exception counts as FAILED. The growth at x is a separate case.
     """
     if outcome.refusal:
         word, figure, note = outcome.refusal
@@ -213,7 +214,7 @@ def grade_nearness(
     note: str = "differs from the plain case",
     unit: float = 1.0,
 ) -> Grade:
-    """Grade whether value and gradient are those at x, to `good` (0: to the last bit), or degraded, to `bad`."""
+    """Grade the difference of value and gradient to those at x: passed up to `good`, degraded up to `bad`."""
     base = scene.base
     refusal = outcome.refusal or base.refusal
     if refusal:
@@ -224,7 +225,7 @@ def grade_nearness(
 
 
 def _grade_gap(gap: float, good: float, bad: float, note: str, unit: float = 1.0) -> Grade:
-    """Grade a gap; the note may show it in a unit."""
+    """Grade a gap. The note may contain the gap, divided by `unit`."""
     if gap <= good:
         return PASSED, gap, ""
     return (DEGRADED if gap <= bad else FAILED), gap, note.format(gap / unit)
@@ -242,14 +243,13 @@ def grade_scaling(scene: Scene, changed: Values, outcome: Outcome, power: int) -
 
 
 def grade_refusal(scene: Scene, changed: Values, outcome: Outcome, located: bool = False) -> Grade:
-    """Grade whether the run ends with a typed error.
+    """Grade whether the run raises an exception of this library, ValueError or TypeError.
 
     Parameters
     ----------
     scene, changed, outcome
     located : bool
-        Whether the error has to say which number is wrong, where the first one stands (a loss may have moved it on
-        the way), or the name of the parameter.
+        If True, the message must also contain the wrong value, its position, or the name of the parameter.
     """
     if outcome.refusal:
         word, figure, note = outcome.refusal
@@ -264,7 +264,7 @@ def grade_refusal(scene: Scene, changed: Values, outcome: Outcome, located: bool
 
 
 def grade_growth(scene: Scene, changed: Values, outcome: Outcome) -> Grade:
-    """Grade the growth factor of a step: above 1 is right only if the physics grows."""
+    """Grade the growth factor of a step. A factor above 1 passes only if a smaller step shows similar growth."""
     growth: Any = scene.growth
     if growth.refusal:
         return REFUSED, nan, growth.refusal
@@ -282,10 +282,10 @@ def grade_growth(scene: Scene, changed: Values, outcome: Outcome) -> Grade:
 
 
 def _compare_with_differences(scene: Scene, changed: Values, outcome: Outcome) -> Grade:
-    """Compare the gradient with central differences along random directions in every leaf, and along itself.
+    """Compare the gradient with central differences along a random direction in each leaf, and along the gradient.
 
-    One difference that meets the gradient is enough along each direction. Where one does not, and at x itself, all
-    evidence is gathered and weighed as in `check.gradient`.
+    One difference that agrees is sufficient in each direction. If none agrees in some direction, and always at x
+    itself, the gradient is examined as in `check.gradient`.
     """
     point = Point(scene.at(changed))
     first_look = Evaluations(scene.value_or_nan, point, outcome.gradient)
@@ -301,7 +301,7 @@ def _compare_with_differences(scene: Scene, changed: Values, outcome: Outcome) -
     try:
         directions, findings = examine_directions(evaluations, 1, audit_generator(SEED), None)
         excuse_kinks(evaluations, directions)
-    except Exception as error:  # a scene may raise anything beside the point
+    except Exception as error:  # a scene may raise any exception near the point
         return DEGRADED, gap, f"the gradient cannot be compared with differences: {error_text(error)}"
     verdict, reason = overall_verdict(directions, findings)
     if verdict == "disagrees":
@@ -325,10 +325,10 @@ def _grade_disagreement(point: Point, outcome: Outcome, evaluations: Evaluations
 
 
 def _underflows(point: Point, value: float) -> bool:
-    """Return whether the smallest positive numbers, to which a gradient is rounded, are not small for some leaf.
+    """Return whether the gradient of some leaf may be so small that it is inaccurate due to underflow.
 
-    A leaf of size s has a derivative of about value / s. It is rounded to a multiple of the smallest positive number,
-    which changes the value by s times this number over a displacement of the size of the leaf.
+    The derivative with respect to a leaf of size s is about value / s, and is rounded to a multiple of the smallest
+    subnormal number. This is inaccurate if s times this number is not small relative to the value.
     """
     for leaf in point.values:
         largest = float(np.max(np.abs(leaf), initial=0.0))
@@ -338,7 +338,7 @@ def _underflows(point: Point, value: float) -> bool:
 
 
 def _directions(point: Point, gradient: NDArray[Any]) -> list[tuple[str, NDArray[Any]]]:
-    """Return names and displacements: random in each leaf, or in all of many leaves, and the gradient itself."""
+    """Return names and displacements: a random direction in each leaf (or one in all leaves), and the gradient."""
 
     def is_wanted(name: str) -> bool:
         return name.startswith("random in") or name == "gradient"
@@ -350,9 +350,10 @@ def _directions(point: Point, gradient: NDArray[Any]) -> list[tuple[str, NDArray
 
 
 def _smallest_gap(line: Line, largest: float) -> float:
-    """Return the smallest gap between gradient and differences as a share of the derivative; the first good one ends.
+    """Return the relative gap between gradient and differences: the first good one, or that at the last step.
 
-    A derivative far below the largest one is compared with that one: rounding of the loss hides the rest.
+    The gap is relative to the derivative, but at least to a small share of the largest derivative, because rounding of
+    the loss hides smaller ones.
     """
     scale = max(abs(line.slope), THRESHOLDS.negligible_share * largest)
     gap = inf
@@ -396,7 +397,7 @@ def as_given(scene: Scene, *_: Any) -> Iterator[Case]:
 
 
 def scalings(scene: Scene, name: str, x: NDArray[Any]) -> Iterator[Case]:
-    """List powers of two: a monomial in a parameter scales exactly, another loss is graded at the new point itself."""
+    """List scalings by powers of two. A loss that is a monomial in the parameter must scale exactly."""
     degree = _degree(scene, name, x)
     if not np.any(x):
         return
@@ -408,7 +409,7 @@ def scalings(scene: Scene, name: str, x: NDArray[Any]) -> Iterator[Case]:
 
 
 def _degree(scene: Scene, name: str, x: NDArray[Any]) -> int:
-    """Return d, where the loss is a monomial s^d in the scale s of a parameter, else 0."""
+    """Return d if the loss is proportional to s^d when a parameter is multiplied by s, else 0."""
     values = [scene.value_or_nan(scene.at({name: scale * x})) for scale in (0.5, 1.0, 2.0)]
     low, high = np.diff(np.log2(np.abs(values)))
     is_monomial = abs(low - high) + abs(low - np.rint(low)) < 1e-12
@@ -418,7 +419,7 @@ def _degree(scene: Scene, name: str, x: NDArray[Any]) -> int:
 
 
 def legal_range(scene: Scene, name: str, x: NDArray[Any]) -> Iterator[Case]:
-    """List values over the range of a parameter, and as far outside as it is wide."""
+    """List values within the range of a parameter, and one value outside on each side."""
     if name not in scene.ranges:
         return
     low, high = scene.ranges[name]
@@ -432,7 +433,7 @@ def legal_range(scene: Scene, name: str, x: NDArray[Any]) -> Iterator[Case]:
 
 
 def zeros_and_signs(scene: Scene, name: str, x: NDArray[Any]) -> Iterator[Case]:
-    """List 0 and the other sign: a time step has to be positive, a viscosity may be 0."""
+    """List 0 and the opposite sign. A time step must be positive; a viscosity may be 0."""
     yield "all 0", 0.0 * x, grade_refusal if name == scene.time_step else grade_soundness
     is_positive = name in (scene.time_step, scene.viscosity)
     yield "sign changed", -1.0 * x, grade_refusal if is_positive else grade_soundness
@@ -459,12 +460,12 @@ def jumps(scene: Scene, name: str, x: NDArray[Any]) -> Iterator[Case]:
 
 
 def _spans_decades(low: Any, high: Any) -> bool:
-    """Return whether steps between two limits are to be factors: both are positive, and far apart."""
+    """Return whether values between two limits are spaced logarithmically: both are positive and far apart."""
     return bool(np.all(low > 0) and np.all(high > 10 * low))
 
 
 def constants_added(scene: Scene, name: str, x: NDArray[Any]) -> Iterator[Case]:
-    """List constants added: incompatible data of a singular system are projected or refused, never amplified."""
+    """List added constants. Incompatible data of a singular system must not be amplified."""
     if x.size <= 1 or not np.any(x):
         return
     size = root_mean_square(x)
@@ -476,7 +477,7 @@ def constants_added(scene: Scene, name: str, x: NDArray[Any]) -> Iterator[Case]:
 
 
 def not_finite(scene: Scene, name: str, x: NDArray[Any]) -> Iterator[Case]:
-    """List arrays with one entry NaN or infinite, the one with the largest derivative, if the loss depends on it."""
+    """List arrays in which the entry with the largest derivative is NaN or infinite."""
     if scene.base.refusal:
         return
     slopes = dict(zip(scene.leaves, scene.point.slopes(scene.base.gradient)))
@@ -490,7 +491,7 @@ def not_finite(scene: Scene, name: str, x: NDArray[Any]) -> Iterator[Case]:
 
 
 def kinds_of_arrays(scene: Scene, name: str, x: NDArray[Any]) -> Iterator[Case]:
-    """List the same numbers in other layouts and dtypes, and arrays that have to be refused."""
+    """List the same values in other memory layouts and dtypes, and arrays for which an error is expected."""
     if not x.ndim:
         return
     for case, same in layouts(x).items():
@@ -514,11 +515,11 @@ class Group(NamedTuple):
     Attributes
     ----------
     cases : callable
-        ``cases(scene, name, x)`` lists (case, other value, grade) of one parameter.
+        ``cases(scene, name, x)`` yields (case, changed value, grading function) for one parameter.
     reason : str
-        Why it may have no case in a scene.
+        Reason to report if the group has no case in a scene.
     only_legal : bool
-        Whether values outside the range of a parameter are skipped, except those that have to be refused.
+        If True, values outside the range of a parameter are skipped, unless an error is expected for them.
     """
 
     cases: Callable[..., Iterator[Case]]
@@ -526,7 +527,7 @@ class Group(NamedTuple):
     only_legal: bool = False
 
 
-WHOLE = "as given"  # the group of the scene as a whole: its other value is a dict of all parameters
+WHOLE = "as given"  # the group for the whole scene: its cases change several parameters, given as a dict
 GROUPS = {
     WHOLE: Group(as_given, ""),
     "scaling": Group(scalings, "every parameter is 0, or its range leaves no room", only_legal=True),
@@ -543,7 +544,7 @@ GROUPS = {
 
 
 def cases(scene: Scene, groups: Sequence[str]) -> Iterator[tuple[str, str, str, Callable[[], Grade]]]:
-    """List (group, parameter, case, function that returns the grade) of a scene."""
+    """Yield (group, parameter, case, function that runs the case and returns its grade)."""
     for name in groups:
         group = GROUPS[name]
         if name == WHOLE:
