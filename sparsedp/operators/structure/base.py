@@ -1,4 +1,4 @@
-"""Structure: a linear map of flat arrays. The simplest kind is a matrix."""
+"""Structure: the base class of linear maps between flat arrays, and Matrix, its simplest subclass."""
 
 from __future__ import annotations
 
@@ -29,29 +29,29 @@ __all__ = [
 ]
 
 INT32_LIMIT = 2**31
-PROBES = 3  # random vectors by which the magnitude of a map without entries is estimated
+PROBES = 3  # number of random vectors for estimating the magnitude of a map whose entries are unknown
 
 
 class Structure(Uncached):
-    """A linear map on flat contiguous arrays. Frozen.
+    """An immutable linear map between flat contiguous arrays.
 
     Attributes
     ----------
     shape : (rows, columns)
     dtype : numpy dtype
-        float64 or complex128: the type of the entries.
+        Type of the entries, float64 or complex128.
     members : tuple of Structures
-        The structures that it combines, if it is a product or a sum.
+        The factors or terms, if the structure is a product or a sum.
     has_entries : bool
-        Whether `explicit()` can list the entries without applying the map to every unit vector.
+        Whether `explicit()` can compute the matrix without applying the map to every unit vector.
     takes_complex : bool
-        Whether `act` takes complex arrays; otherwise it is called for the real and the imaginary part.
+        Whether `act` accepts complex arrays. If not, it is called for the real and the imaginary part separately.
     separable : bool
-        Whether it is a Kronecker sum: one 1-D factor for each axis.
+        Whether the map is a Kronecker sum, that is, a sum of maps along single axes.
     depth : int
         Nesting depth of products and sums.
     passes : int
-        Number of passes over memory without fusion; the form of an operator depends on it.
+        Number of passes over memory in matrix-free form without fusion. The default form of an operator depends on it.
     """
 
     shape: tuple[int, int]
@@ -62,13 +62,13 @@ class Structure(Uncached):
     is_identity = False
     separable = False
     depth = 0
-    passes = 1  # over memory, of the matrix-free form
+    passes = 1
 
     def apply(self, x: NDArray, out: NDArray) -> None:
         """Write A x into `out`.
 
-        Both are flat and contiguous, `out` has the dtype ``result_dtype(self, x.dtype)``. The product is computed in
-        double precision and rounded once.
+        Both arrays are flat and contiguous, and `out` has the dtype ``result_dtype(self, x.dtype)``. For single
+        precision the product is computed in double precision and rounded once.
         """
         if x.dtype.char in "fF":
             np.copyto(out, self.product(x.astype(np.result_type(x.dtype, float))), casting="same_kind")
@@ -91,14 +91,17 @@ class Structure(Uncached):
         return columns_by_application(self)
 
     def scaled(self, factor: complex) -> Structure | None:
-        """Return factor * A; None if the structure cannot absorb the number."""
+        """Return factor * A as a structure of the same kind, or None if that is not possible."""
         return None
 
     def magnitude(self) -> Callable[[NDArray], NDArray]:
-        """Return a function of x >= 0 that bounds each entry of abs(A) x from above."""
+        """Return a function that computes upper bounds of the entries of abs(A) x for x >= 0.
+
+        If the entries of A are unknown, it computes an estimate.
+        """
         if self.has_entries:
             return abs(self.explicit()).dot
-        # Without entries, the largest response to random signs is the estimate for every row.
+        # Estimate the row sums of abs(A) by the largest entry of A x over a few random vectors x of signs.
         largest = max(float(np.max(np.abs(self.product(x)), initial=0.0)) for x in probes(self.shape[1]))
 
         def bound(x: NDArray) -> NDArray:
@@ -107,21 +110,21 @@ class Structure(Uncached):
         return bound
 
     def tangent(self) -> Structure:
-        """Return the same map for derivative rules, without checks that only primal data must pass."""
+        """Return the same map without checks of primal data, for the tangents and cotangents of derivative rules."""
         tangents = [member.tangent() for member in self.members]
         if all(map(is_, tangents, self.members)):
             return self
         return self.rebuilt(tangents)
 
     def __deepcopy__(self, memo: Any) -> Structure:
-        """Return the same frozen object, unless a member has state, as a solver has."""
+        """Return the object itself, because it is immutable, unless a member has state, as a solver has."""
         members = [deepcopy(member, memo) for member in self.members]
         if all(map(is_, members, self.members)):
             return self
         return self.rebuilt(members)
 
     def rebuilt(self, members: Sequence) -> Structure:
-        """Return the same combination of other members."""
+        """Return the same kind of product or sum with other members."""
         return type(self)(members)  # type: ignore[call-arg]
 
     def product(self, x: NDArray) -> NDArray:
@@ -132,12 +135,13 @@ class Structure(Uncached):
 
 
 class Matrix(Structure):
-    """The explicit form: a csr_array with 32-bit indices, owned and never changed.
+    """A linear map given by its matrix, a read-only csr_array with 32-bit indices.
 
     Parameters
     ----------
     matrix : sparse matrix or array
-        Copied unless it is compact already.
+        Converted to a csr_array in double precision. The arrays of a csr_array that needs no conversion are not copied,
+        and become read-only.
     """
 
     def __init__(self, matrix: Any) -> None:
@@ -166,7 +170,7 @@ class Matrix(Structure):
 
 
 class Turning(Structure):
-    """A map and its transpose, both computed by one object `inner`; `transposed` says which of them this is.
+    """A map or its transpose, both computed by the same object `inner`; `transposed` selects one of them.
 
     Parameters
     ----------
@@ -212,13 +216,13 @@ def compact(matrix: Any) -> sp.csr_array:
 
 
 def assembled(structure: Structure, name: str) -> Matrix:
-    """Return a structure as a Matrix, and count the assembly under the name of the operator."""
+    """Return a structure as a Matrix, and record the assembly in the counters under the name of the operator."""
     count(name, "assembled")
     return Matrix(structure.explicit())
 
 
 def probes(size: int) -> list[NDArray]:
-    """Return a few vectors of random signs, the same in every run."""
+    """Return a few vectors of random signs. The random generator has a fixed seed."""
     generator = np.random.default_rng(0)
     return [generator.choice([-1.0, 1.0], size) for _ in range(PROBES)]
 
@@ -229,7 +233,7 @@ def rows_of(matrix: sp.csr_array) -> NDArray:
 
 
 def columns_by_application(structure: Structure) -> sp.csr_array:
-    """Return the entries of a map by one application for each column."""
+    """Return the matrix of a map as a csr_array, by applying the map to every unit vector."""
     size = structure.shape[1]
     columns = [sp.csc_array(structure.product(np.eye(1, size, column)[0])[:, None]) for column in range(size)]
     if not columns:

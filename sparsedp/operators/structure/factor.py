@@ -1,4 +1,4 @@
-"""Factor: a small sparse matrix along one axis. Catalogue operators are defined by their factors."""
+"""Factor: a sparse matrix that is applied along one axis. Grid operators are Kronecker products of factors."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from sparsedp.operators.structure.base import rows_of
 
 __all__ = ["Factor"]
 
-MOST_DIAGONALS = 8  # with more diagonals the row form is at least as fast
-TINY = 2.0**-1000  # products below this would lose digits to underflow
+MOST_DIAGONALS = 8  # a matrix with more diagonals is applied row by row, which is then at least as fast
+TINY = 2.0**-1000  # products of factors below this would lose digits by underflow
 
 
 class Factor(Uncached):
-    """A matrix along one axis. Frozen; products and sums are new ones.
+    """An immutable sparse matrix that is applied along one axis of a field.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ class Factor(Uncached):
 
     @classmethod
     def from_diagonals(cls, shape: tuple[int, int], *diagonals: tuple) -> Factor:
-        """Return a Factor of triples of arrays (rows, columns, values)."""
+        """Return the Factor with the given entries: each argument is a triple of arrays (rows, columns, values)."""
         rows = np.concatenate([diagonal[0] for diagonal in diagonals])
         columns = np.concatenate([diagonal[1] for diagonal in diagonals])
         values = np.concatenate([diagonal[2] for diagonal in diagonals])
@@ -79,13 +79,13 @@ class Factor(Uncached):
 
     @cached_property
     def key(self) -> tuple:
-        """The content as a hashable value: equal factors have equal keys."""
+        """A hashable value for comparisons: equal factors have equal keys."""
         matrix = self.matrix
         return matrix.shape, matrix.indptr.tobytes(), matrix.indices.tobytes(), matrix.data.tobytes()
 
     @cached_property
     def rows(self) -> Rows:
-        """The record that the kernels read: see kernels/reference.py."""
+        """The entries in the format of the kernels: see kernels/reference.py."""
         matrix = self.matrix
         row = rows_of(matrix)
         offsets, first, diagonal = np.unique(matrix.indices - row, return_index=True, return_inverse=True)
@@ -112,7 +112,7 @@ class Factor(Uncached):
 
     @cached_property
     def tridiagonal(self) -> Tridiagonal | None:
-        """The three-point record of the fused kernel, or None if a row has entries beyond its neighbours."""
+        """The entries in the format of the fused kernel, or None if the factor is not (periodic) tridiagonal."""
         n, columns = self.shape
         matrix = self.matrix
         row = rows_of(matrix)
@@ -120,6 +120,6 @@ class Factor(Uncached):
         if n != columns or np.any((offset > 1) & (offset < n - 1)):
             return None
         bands = np.zeros((3, n))
-        # With one or two cells the neighbours coincide: an entry off the centre is an upper one, then a lower one.
+        # With two cells, the lower and the upper neighbour are the same cell, and its entry counts as the upper one.
         bands[np.where(offset > 1, 0, offset + 1), row] = matrix.data
         return Tridiagonal(*bands)

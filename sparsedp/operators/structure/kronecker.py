@@ -1,4 +1,4 @@
-"""Kronecker: blocks of sums of Kronecker products of 1-D factors, in matrix-free and in explicit form."""
+"""Kronecker: block matrices whose blocks are sums of Kronecker products of 1-D factors."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ __all__ = ["Kronecker", "Term"]
 
 
 class Term(NamedTuple):
-    """scale * (factor of axis 0) x (factor of axis 1) x ...; a factor None is the identity."""
+    """The Kronecker product scale * (factor of axis 0) x (factor of axis 1) x ...; None stands for the identity."""
 
     scale: float
     factors: tuple[Any, ...]
@@ -55,17 +55,18 @@ def _product(a, b):
 
 
 class Kronecker(Structure):
-    """A matrix of blocks, one for each pair (component of the result, component of the field).
+    """A block matrix with one block for each pair (component of the result, component of the argument).
 
     Parameters
     ----------
     out_parts, in_parts : tuples of shapes
-        Shapes of the components, all of one dimension.
+        Shapes of the components of the result and of the argument. All have the same number of axes.
     blocks : dict
-        (row, column) -> tuple of Terms; a missing pair is a zero block.
+        Keys are pairs (component of the result, component of the argument). Values are tuples of Terms, whose sum is
+        the block. Missing blocks are 0.
     """
 
-    takes_complex = False  # the loops take float64 only
+    takes_complex = False  # the kernels support float64 only
 
     def __init__(self, out_parts: Sequence, in_parts: Sequence, blocks: dict) -> None:
         self.out_parts = tuple(out_parts)
@@ -83,30 +84,30 @@ class Kronecker(Structure):
 
     @cached_property
     def is_identity(self) -> bool:  # type: ignore[override]
-        """Whether this is the identity, exactly."""
+        """Whether this is exactly the identity."""
         return self.out_parts == self.in_parts and self.blocks == Kronecker.identity(self.out_parts).blocks
 
     # ------------------------------------------------------------ properties of a Kronecker sum
 
     @cached_property
     def separable(self) -> bool:  # type: ignore[override]
-        """Whether it is a Kronecker sum on one component: one factor along one axis in each term."""
+        """Whether this is a Kronecker sum: it has one component, and each term has a factor along at most one axis."""
         has_one_component = len(self.out_parts) == 1 and self.out_parts == self.in_parts
         return has_one_component and all(len(term.axes) <= 1 for term in self.terms)
 
     @property
     def terms(self) -> tuple[Term, ...]:
-        """The terms of the first component."""
+        """The terms of block (0, 0), which is the only one of a Kronecker sum."""
         return self.blocks.get((0, 0), ())
 
     @cached_property
     def lines(self) -> dict[int, Factor]:
-        """The scaled factor of each axis that has one; the terms without factors are `shift`."""
+        """The scaled factors of a Kronecker sum by axis. The terms without factors are in `shift`."""
         return {axis: term.factors[axis].scaled(term.scale) for term in self.terms for axis in term.axes}
 
     @property
     def shift(self) -> float:
-        """The multiple of the identity that is added to the factors."""
+        """The multiple of the identity that a Kronecker sum contains."""
         return sum(term.scale for term in self.terms if not term.axes)
 
     def diagonal(self) -> NDArray:
@@ -133,7 +134,10 @@ class Kronecker(Structure):
         return labels.reshape(-1), count
 
     def may_be_triangular(self) -> bool:
-        """Return whether some rows of a Kronecker sum are part of no cycle: each axis must have such rows."""
+        """Return whether the graph of a Kronecker sum can have nodes that are on no cycle.
+
+        This requires, for every axis, that the graph of its factor has such nodes.
+        """
         for axis, n in enumerate(self.out_parts[0]):
             if axis in self.lines:
                 count, labels = connected_components(self.lines[axis].matrix, directed=True, connection="strong")
@@ -155,12 +159,12 @@ class Kronecker(Structure):
         return self._each(lambda term: Term(factor * term.scale, term.factors))
 
     def _each(self, change):
-        """Return the same blocks with a function applied to every term."""
+        """Return the structure with the function `change` applied to every term."""
         blocks = {key: tuple(map(change, terms)) for key, terms in self.blocks.items()}
         return Kronecker(self.out_parts, self.in_parts, blocks)
 
     def composed(self, other: Kronecker) -> Kronecker:
-        """Return self @ other, with matching components."""
+        """Return self @ other; the components of self's argument and of other's result must match."""
         blocks: defaultdict = defaultdict(tuple)
         for ((r, k), mine), ((j, c), theirs) in product(self.blocks.items(), other.blocks.items()):
             if k == j:
@@ -168,7 +172,7 @@ class Kronecker(Structure):
         return Kronecker(self.out_parts, other.in_parts, blocks)
 
     def added(self, other: Kronecker) -> Kronecker:
-        """Return self + other, with the same components."""
+        """Return self + other; both must have the same components."""
         keys = self.blocks | other.blocks
         blocks = {key: self.blocks.get(key, ()) + other.blocks.get(key, ()) for key in keys}
         return Kronecker(self.out_parts, self.in_parts, blocks)
@@ -179,7 +183,7 @@ class Kronecker(Structure):
 
     @cached_property
     def absolute(self) -> Kronecker:
-        """The map whose terms are the magnitudes of the terms."""
+        """The structure with every entry of every term replaced by its absolute value."""
         return self._each(_absolute)
 
     # ------------------------------------------------------------ forms
@@ -203,7 +207,7 @@ class Kronecker(Structure):
 
     @cached_property
     def _plan(self):
-        """For each component of the result, pairs (component of the field, pass over it) whose results are added up."""
+        """For each component of the result, pairs (component of the argument, function) whose results are added."""
         plans: list[list] = [[] for _ in self.out_parts]
         for (r, c), terms in self.blocks.items():
             shape = self.in_parts[c]
@@ -216,7 +220,7 @@ class Kronecker(Structure):
 
 
 def _fused_pass(terms, shape):
-    """Return the function (u, out, False) that adds up three-point terms in one pass over memory."""
+    """Return a function ``run(u, out, False)`` that computes a sum of tridiagonal terms in one pass over memory."""
     shift = sum(term.scale for term in terms if not term.axes)
     axes = [None] * 3
     first = 3 - len(shape)
@@ -227,7 +231,7 @@ def _fused_pass(terms, shape):
 
 
 def _pass(term, shape):
-    """Return the function (u, out, accumulate) of a term: it applies the factors axis by axis, the last into `out`."""
+    """Return a function ``run(u, out, accumulate)`` that applies a term axis by axis; the last result goes to `out`."""
     steps = []
     for axis in term.axes or (0,):
         factor = term.factors[axis] or Factor(sp.eye_array(shape[axis]))
@@ -248,12 +252,12 @@ def _pass(term, shape):
 
 
 def _absolute(term):
-    """Return a term of the magnitudes of its entries."""
+    """Return a term with every entry replaced by its absolute value."""
     return Term(abs(term.scale), tuple(factor and Factor(abs(factor.matrix)) for factor in term.factors))
 
 
 def _block(terms, out_part, in_part):
-    """Return the matrix of a block."""
+    """Return the sum of terms as a sparse matrix."""
     if not terms:
         return sp.csr_array((prod(out_part), prod(in_part)))
     return reduce(add, [_product_matrix(term, in_part) for term in terms])
@@ -271,7 +275,7 @@ def _product_matrix(term, in_part):
 
 
 def _merge(terms):
-    """Add up terms with the same single axis, and terms with the same factors, where that is exact."""
+    """Merge terms with factors along the same single axis, and terms with equal factors; drop terms that are 0."""
     merged: dict = {}
     for term in terms:
         has_one_axis = len(term.axes) == 1

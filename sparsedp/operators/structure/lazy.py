@@ -1,4 +1,4 @@
-"""Lazy structures: diagonals, products, sums and functions. Products are assembled only if their entries are needed."""
+"""Lazy structures: diagonals, products, sums and functions. Matrices of products are assembled only when needed."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ __all__ = [
     "total",
 ]
 
-DEEPEST = 200  # nested products and sums: recursion over deeper operators would exceed Python's limit
-FUSED_FROM = 16384  # cells; below, separate passes are as fast as a fused one
-ROW_FROM = 80  # cells along the last axis, the inner loop of the fused pass; shorter rows cost more than they save
+DEEPEST = 200  # maximum nesting depth of products and sums; deeper ones would exceed Python's recursion limit
+FUSED_FROM = 16384  # with fewer cells, separate passes are as fast as a fused one
+ROW_FROM = 80  # with fewer cells along the last axis, the inner loop, a fused pass is slower than separate ones
 
 
 class Diagonal(Structure):
-    """Multiplication by one number for each entry."""
+    """A diagonal matrix: elementwise multiplication by constant values."""
 
     def __init__(self, values: ArrayLike) -> None:
         self.values = np.array(values, np.result_type(values, float)).reshape(-1)
@@ -72,7 +72,7 @@ class Diagonal(Structure):
 
 
 class Mask(Diagonal):
-    """Exact zero outside `keep`, even for NaN; multiplication by one number for each entry inside."""
+    """A diagonal matrix whose product is exactly 0 where `keep` is False, even for NaN."""
 
     def __init__(self, keep: ArrayLike, values: ArrayLike = 1.0) -> None:
         self.keep = np.array(keep, dtype=bool).reshape(-1)
@@ -89,7 +89,7 @@ class Mask(Diagonal):
 
 
 class Chain(Structure):
-    """A product of structures, applied from right to left; products among its members are flattened."""
+    """A product of structures, applied from right to left. Members that are products are flattened."""
 
     def __init__(self, members: Sequence) -> None:
         self.members = tuple(inner for member in members for inner in _members(member, Chain))
@@ -110,7 +110,7 @@ class Chain(Structure):
 
     @cached_property
     def _fused(self):
-        """All members in one pass if they are differences through faces; else None."""
+        """A function that applies all members in one pass if they are differences through faces; else None."""
         middle = self.members[1:-1]
         if not all(isinstance(member, Diagonal) for member in middle):
             return None
@@ -144,7 +144,7 @@ class Sum(Structure):
     """A sum of structures."""
 
     def __init__(self, members: Sequence) -> None:
-        # A complex member is first: the others are added to its result.
+        # Complex members come first, so that the real ones are added to a complex result.
         self.members = tuple(sorted(members, key=lambda member: member.dtype.kind))
         self.shape = members[0].shape
         self.dtype = self.members[0].dtype
@@ -205,14 +205,14 @@ class Functions(Reconstructible, Structure):
         self.dtype = np.dtype(dtype)
 
     def recipe(self) -> tuple:
-        """Return the call that makes it again: see _utils/reconstruction.py."""
+        """Return the call that builds an equal object: see _utils/reconstruction.py."""
         return Functions, (self.forward, self.backward, self.domain, self.codomain, self.dtype)
 
     def apply(self, x: NDArray, out: NDArray) -> None:
         """Write A x into `out`: see `Structure.apply`."""
         if self.forward is None:
             raise DerivativeError("this operator has no transpose; give from_functions its second function")
-        y = np.asarray(self.forward(frozen(x.reshape(self.domain))))  # read-only for the function
+        y = np.asarray(self.forward(frozen(x.reshape(self.domain))))  # read-only, so the function cannot modify x
         check_shape("what the function returns", y, self.codomain)
         if y.dtype.kind == "c" and out.dtype.kind != "c":
             raise DerivativeError(
@@ -231,8 +231,9 @@ class Functions(Reconstructible, Structure):
 def compose(a: Structure, b: Structure) -> Structure:
     """Return the structure of a @ b.
 
-    Identities are dropped, products of factor-defined maps are factor-defined, products of diagonals are one diagonal.
-    Other products are a chain; so are products of Kronecker sums of several axes, which are no Kronecker sums.
+    Identities are dropped. Products of Kronecker structures are Kronecker structures, and products of diagonals are
+    diagonals. All other products are a Chain. So is the product of two Kronecker sums if it is not a Kronecker sum,
+    because a solver can invert the two sums one after the other.
     """
     members = _members(a, Chain)
     for member in _members(b, Chain):
@@ -267,7 +268,7 @@ def _members(structure, kind):
 
 
 def _merged_product(a, b):
-    """Return one structure for a @ b, or None if there is none."""
+    """Return a single structure that equals a @ b, or None if a Chain is needed."""
     if b.is_identity:
         return a
     if a.is_identity:
@@ -275,7 +276,7 @@ def _merged_product(a, b):
     if isinstance(a, Kronecker) and isinstance(b, Kronecker) and a.in_parts == b.out_parts:
         product = a.composed(b)
         if a.separable and b.separable and not product.separable:
-            return None  # as a chain, L @ L is solved by the eigenvectors of L
+            return None  # as a Chain, a product such as L @ L can be inverted by the eigenvectors of L
         return product
     if isinstance(a, Diagonal) and isinstance(b, Diagonal):
         masks = [member.keep for member in (a, b) if isinstance(member, Mask)]
@@ -310,7 +311,7 @@ def total(a: Structure, b: Structure) -> Structure:
 
 
 def _merged_sum(a, b):
-    """Return one structure for a + b, or None if there is none."""
+    """Return a single structure that equals a + b, or None if a Sum is needed."""
     if isinstance(a, Kronecker) and isinstance(b, Kronecker) and (a.out_parts, a.in_parts) == (b.out_parts, b.in_parts):
         return a.added(b)
     if isinstance(a, Diagonal) and isinstance(b, Diagonal):
@@ -318,24 +319,24 @@ def _merged_sum(a, b):
     return None
 
 
-# ---- products with faces between cells, in one pass ----
+# ---- products such as divergence @ diagonal @ gradient in one pass over memory ----
 
 
 def through_faces(left: Structure, middle: Sequence[Any], right: Structure) -> Callable | None:
-    """Return the product L K R in one pass over memory.
+    """Return a function that computes the product L K R x in one pass over memory.
 
     Parameters
     ----------
     left, right : Structure
         L maps faces to cells, R maps cells to faces.
     middle : sequence of Diagonal
-        Their product is K.
+        The factors of the diagonal matrix K.
 
     Returns
     -------
     callable or None
-        ``run(x, out)`` writes the product into `out` and returns whether that was possible. None if the structures
-        are not of this form.
+        ``run(x, out)`` writes the product into `out` and returns True, or False if no compiled kernel is available.
+        None if the structures do not have this form.
     """
     if not (isinstance(left, Kronecker) and isinstance(right, Kronecker) and middle):
         return None
@@ -350,9 +351,9 @@ def through_faces(left: Structure, middle: Sequence[Any], right: Structure) -> C
     if any(line is None for line in lines) or k.dtype != float:
         return None
     if has_mask and not all(np.all(member.values[getattr(member, "keep", ...)] != 0) for member in middle):
-        return None  # 0 times NaN is NaN for some of the zeros, and 0 for others
+        return None  # K has zeros from masks (0 * NaN = 0) and other zeros (0 * NaN = NaN), which the kernel mixes up
     parts = components(k, right.out_parts)
-    if len(shape) == 2:  # insert an axis of one cell, without faces
+    if len(shape) == 2:  # insert an axis of one cell without faces, because the kernel is for 3-D
         shape = (shape[0], 1, shape[1])
         parts = [parts[0][:, None], np.zeros((0, 0, 0)), parts[1][:, None]]
         lines.insert(1, np.zeros((4, 2)))
@@ -365,10 +366,10 @@ def through_faces(left: Structure, middle: Sequence[Any], right: Structure) -> C
 
 
 def face_entries(left: Any, right: Any, axis: int, n: int) -> NDArray | None:
-    """Return the entries of R and of L for the cells below and above each face of an axis of n cells.
+    """Return the entries of R and of L for the lower and the upper cell of each face of an axis of n cells.
 
-    None if another axis, a second term or a cell that is not beside the face takes part. On a periodic axis the last
-    face is the first.
+    Return None if a face has entries for other cells than these two, or if there are several terms or axes. On a
+    periodic axis, the last face is a copy of the first.
     """
     right_terms = right.blocks.get((axis, 0), ())
     left_terms = left.blocks.get((0, axis), ())
@@ -382,20 +383,20 @@ def face_entries(left: Any, right: Any, axis: int, n: int) -> NDArray | None:
         _entries_beside_faces(difference.factors[axis].T, difference.scale, n),
     )
     for side in sides:
-        if side is None or np.any(side[:, 1:n] == 0):  # a cell with entry 0, which is not read, could hold NaN
+        if side is None or np.any(side[:, 1:n] == 0):  # the kernel would multiply a NaN in such a cell by 0
             return None
     return np.concatenate(sides)
 
 
 def _entries_beside_faces(factor, scale, n):
-    """Return the entries of a factor from n cells to faces for the cells below and above each face, or None."""
+    """Return the entries of a factor from n cells to faces, for the lower and upper cell of each face, or None."""
     matrix = factor.matrix
     row = rows_of(matrix)
     faces = factor.shape[0]
     is_below = matrix.indices == (row - 1) % faces
     is_above = matrix.indices == row
     if faces not in (n, n + 1) or not np.all(is_above ^ is_below):
-        return None  # more cells take part, or one periodic cell is on both sides of its face
+        return None  # a face has entries of other cells, or (one periodic cell) the two cells of a face are the same
     sides = np.zeros((2, n + 1))
     sides[np.where(is_below, 0, 1), row] = scale * matrix.data
     sides[:, faces:] = sides[:, : n + 1 - faces]
