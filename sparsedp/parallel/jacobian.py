@@ -1,4 +1,4 @@
-"""Jacobians of residuals whose unknowns are fields on ranks: each rank assembles the rows of its own block."""
+"""Jacobians of residuals whose unknowns are distributed fields. Each rank assembles the rows of its own block."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ __all__ = ["RanksJacobians"]
 
 
 class RanksJacobians(Jacobians):
-    """The source of the Jacobians of one residual of fields on ranks. Their pattern is a `Stencil`."""
+    """Computes the Jacobians of one residual of distributed fields. Their sparsity pattern is a `Stencil`."""
 
-    can_relax = False  # no rank has all rows
+    can_relax = False  # relaxation would need all rows, but each rank has only its own
 
     def _solver(self, op, near):
         return self._build(op, near)
@@ -43,7 +43,7 @@ class RanksJacobians(Jacobians):
     def _find_stencil(
         self, equation: Equation, points: Sequence[Any], leaves: Sequence[Any], incomplete: Stencil | None
     ) -> KnownPattern:
-        """Find and store the stencil of these unknowns; entries are added to an incomplete one."""
+        """Find and store the stencil of the unknowns; it includes the entries of `incomplete` if that is given."""
         unknowns = equation.unknowns
         self.description = f"the rows of each rank, {unknowns.backend}"
         if self.sparsity is not None:

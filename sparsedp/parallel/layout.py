@@ -1,4 +1,4 @@
-"""Layout: the backend of grids whose fields are stored in blocks on the ranks of MPI; see autodiff/backend.py."""
+"""Layout: the backend of grids whose fields are distributed over MPI ranks; see autodiff/backend.py."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from sparsedp.solvers.system import System
 
 __all__ = ["Layout"]
 
-# The functions that call `check_grid` or `check_operator` and work on ranks; all others raise TypeError.
+# Functions that support distributed grids; in all others `check_grid` and `check_operator` raise TypeError.
 SUPPORTED = {
     "component",
     "curl",
@@ -66,7 +66,7 @@ SUPPORTED = {
 
 
 class Layout(Partition, Backend):
-    """The partition of a grid, and how operators and fields use it."""
+    """The backend of a distributed grid: its partition, and the operations on operators and fields."""
 
     whole_fields = False
 
@@ -86,19 +86,19 @@ class Layout(Partition, Backend):
             raise TypeError(f"{name} does not work on ranks yet; give it the grid from before dp.distribute")
 
     def place(self, grid: Grid) -> Grid:
-        """Return a grid whose fields are on the same ranks."""
+        """Return a copy of a grid whose fields are distributed over the same ranks."""
         return grid_on_ranks(grid, self.comm)
 
     # ------------------------------------------------------------ operators
 
     def apply(self, op: Operator, u: Any, out: NDArray | None = None) -> Any:
-        """Return the result of an Operator for a field on ranks, or one that every rank holds."""
+        """Apply an Operator to a distributed field, or to an array that is the same on every rank."""
         if out is not None:
             raise TypeError(f"{op.name} takes no out on ranks; leave it out")
         return self.agreement.run(op.name, self._applied, op, u)
 
     def local_structure(self, op: Operator) -> Structure:
-        """Return what an operator does to the blocks of this rank."""
+        """Return the linear map of an operator between the blocks of this rank."""
         return local_structure(op.structure, storage(op.domain), storage(op.codomain))
 
     def _applied(self, op, u):
@@ -108,7 +108,7 @@ class Layout(Partition, Backend):
         return DistributedField(y, op.codomain)
 
     def _flat_argument(self, op, u):
-        """Return the entries of the argument of an operator that this rank holds."""
+        """Return the flat block of this rank of the argument of an operator; raise if the argument does not fit."""
         if not isinstance(u, DistributedField):
             u = field_array(op, u)
             if op.domain.backend.whole_fields:
@@ -142,7 +142,7 @@ class Layout(Partition, Backend):
         return u
 
     def implementation(self, default: Callable) -> Callable:
-        """Return what is called on ranks instead of a class or function of one process."""
+        """Return the class or function that replaces `default` for distributed fields; `default` if there is none."""
         replacements: dict[Callable, Callable] = {
             Jacobians: RanksJacobians,
             Polynomial: Explicit,
@@ -156,7 +156,7 @@ class Layout(Partition, Backend):
         return replacements.get(default, default)
 
     def system_and_choice(self, op: Operator, settings: SolveSettings, solves: str) -> tuple[RanksSystem, Choice]:
-        """Return the System of an operator on ranks, and that PETSc solves it."""
+        """Return the System of an operator for distributed fields, and the Choice of PETSc as its solver."""
         system = self.system(op, settings.rtol, settings.maxiter, settings.method, settings.options)
         return system, Choice("petsc", str(self))
 
@@ -167,13 +167,13 @@ class Layout(Partition, Backend):
         return minimize_on_ranks(self.comm, *arguments)
 
     def attempt(self, act: Callable, *args: Any) -> Any:
-        """Return ``act(*args)``; if it fails on one rank it fails on all."""
+        """Return ``act(*args)``. If it raises an exception on one rank, it is raised on all ranks."""
         return self.agreement.run("a trial", act, *args, at_once=True)
 
     # ------------------------------------------------------------ fields
 
     def volumes(self, space: Space) -> DistributedField:
-        """Return the control volumes as a field."""
+        """Return the control volumes as a distributed field."""
         blocks = []
         for axis, part in enumerate(space.parts):
             lines = self._own_parts(part, space.grid.control_lengths(space.kind, axis))
@@ -181,7 +181,7 @@ class Layout(Partition, Backend):
         return DistributedField(np.concatenate(blocks), space)
 
     def mesh(self, grid: Grid, lines: Sequence[NDArray]) -> tuple[DistributedField, ...]:
-        """Return a field of coordinates for each axis, from the coordinates along the axes."""
+        """Return one distributed field of coordinates for each axis, given the 1-D coordinates along the axes."""
         space = Space(tuple(line.size for line in lines), "places", grid)
         own_lines = self._own_parts(space.shape, lines)
         fields = np.meshgrid(*own_lines, indexing="ij")
@@ -196,23 +196,23 @@ class Layout(Partition, Backend):
         return tuple(fields)
 
     def fingerprint(self, field: DistributedField) -> int:
-        """Return a whole number that depends on all bits of a field, the same on all ranks."""
+        """Return a hash of a field, the same on all ranks."""
         return field.fingerprint()
 
     def flat(self, field: Any) -> Any:
-        """Return the field itself, whose operations act on the flat block."""
+        """Return the field itself: distributed fields need not be flattened."""
         return field
 
     def combinable(self, value: Any) -> Any:
-        """Return the value itself: fields on ranks take numbers and whole arrays as operands."""
+        """Return the value itself: numbers and whole arrays can be combined with distributed fields."""
         return value
 
     def field(self, space: Space, values: Any) -> DistributedField:
-        """Return a field on ranks of values that every rank holds."""
+        """Return a distributed field, given values that are the same on every rank."""
         return block(values, space)
 
     def space_of_fields(self, name: str, fields: Sequence[Any]) -> JointSpace:
-        """Return the space of some fields one after the other."""
+        """Return the joint space of several fields."""
         for field in fields:
             if not isinstance(field, DistributedField) or field.layout != self:
                 raise TypeError(
@@ -222,13 +222,13 @@ class Layout(Partition, Backend):
         return JointSpace([field.space for field in fields])
 
     def split(self, space: Space, v: Any) -> tuple:
-        """Return the components of a field, or the fields of a joint one; differentiable."""
+        """Return the components of a field, or the fields that a field on a joint space contains. Differentiable."""
         if type(space) is Space and not _is_distributed(v):
             return space.split_array(v)
         return tuple(piece.take(v) for piece in self._pieces(space))
 
     def join(self, space: Space, parts: Any) -> Any:
-        """Return one field of its components, or of fields; differentiable."""
+        """Return one field from its components, or a field on a joint space from several fields. Differentiable."""
         if type(space) is Space and not any(map(_is_distributed, parts)):
             return space.join_arrays(parts)
         pairs = zip(self._pieces(space), parts, strict=True)
@@ -238,17 +238,17 @@ class Layout(Partition, Backend):
 
 
 def method_and_rule_on_ranks(settings: TransportSettings) -> tuple[TransportMethod, TransportOnBlocks]:
-    """Return a scheme of transport, and the differentiable rule of a step on ranks."""
+    """Return a transport scheme, and the differentiable function that computes a step of distributed fields."""
     return TransportMethod(settings), TransportOnBlocks(settings)
 
 
 def grid_on_ranks(grid: Grid, comm: MPI.Comm) -> Grid:
-    """Return a grid whose fields are on the ranks of a communicator."""
+    """Return a copy of a grid whose fields are distributed over the ranks of a communicator."""
     return grid.stored_by(Layout(grid.shape, grid.periodic, comm))
 
 
 class JointSpace(Space):
-    """The space of some fields, one after the other, as one flat field.
+    """The space of several fields that are concatenated to one flat field.
 
     Parameters
     ----------
@@ -264,7 +264,7 @@ class JointSpace(Space):
 
     @cached_property
     def volumes(self) -> Any:
-        """Control volume of each value; ones where those of a field are not known, as on one process."""
+        """Control volume of each value; all ones if one of the spaces has no control volumes, as on one process."""
         if any(node_axes(space.kind, 0, space.grid.dim) is None for space in self.spaces):
             return block(1.0, self)
         return self.backend.join(self, [space.volumes for space in self.spaces])
@@ -277,9 +277,9 @@ class Piece(NamedTuple):
     ----------
     space : Space
     take : Rule
-        From a field on the whole space to its part on this one.
+        Extracts the part from a field on the whole space.
     embed : Rule
-        The transpose: zeros elsewhere.
+        The transpose of `take`: a field on the whole space that is 0 outside the part.
     """
 
     space: Space

@@ -1,11 +1,12 @@
-"""Stencils of Jacobians whose unknowns are fields on ranks: which entries each rank assembles, and their colours.
+"""Sparsity patterns and column colourings of Jacobians whose unknowns are distributed fields.
 
-Residuals composed of operators on a grid couple each number to the same few neighbours everywhere. A few probes find
-them: products with one entry, in the middle of each component and at its ends. From these steps every rank knows where
-the entries of its rows are, and a colour for each column, without looking at the rest of the grid (see
-solvers/sparsity.py); a product for each colour gives the entries. Before a derivative is taken, and after a slow Newton
-step, the matrix is compared with a product along a random direction (solvers/jacobian.py): missing entries are searched
-for again, or an error is raised.
+If a residual is composed of operators on a grid, each unknown is coupled to a few neighbours whose relative positions
+(the stencil) are the same everywhere. The stencil is found by products of the Jacobian with unit vectors, for an entry
+in the middle of each component and at its ends. From the stencil each rank computes the sparsity pattern of its rows
+and a colour for each column, without knowledge of the rest of the grid (see solvers/sparsity.py). One Jacobian-vector
+product for each colour then gives the entries. Before a derivative is computed, and after a slow Newton step, the
+matrix is compared with the Jacobian in a random direction (solvers/jacobian.py). If entries are missing, the search is
+repeated, or an error is raised.
 """
 
 from __future__ import annotations
@@ -37,24 +38,25 @@ from sparsedp.solvers.sparsity import (
 
 __all__ = ["Stencil", "find_stencil"]
 
-MOST_COLOURS = 8  # in units of the entries of the fullest row: a stencil needs fewer
+MOST_COLOURS = 8  # maximum number of colours per entry of the fullest row; stencils need fewer
 
 Step: TypeAlias = tuple[int, ...]  # (component of the column, component of the row, cells to the row along each axis)
 Product: TypeAlias = Callable[[DistributedField], Any]
 
 
 def find_stencil(name: str, space: Space, products: Sequence[Product], incomplete: Stencil | None = None) -> Stencil:
-    """Return the Stencil of a Jacobian from products with it at several points.
+    """Return the Stencil of a Jacobian, given functions that multiply it by vectors at several points.
 
     Parameters
     ----------
     name : str
-        Of the root, for messages.
+        Name of the nonlinear solve, for error messages.
     space : Space
-        Of the unknowns.
+        Space of the unknowns.
     products : sequence of callables
+        One Jacobian-vector product for each point.
     incomplete : Stencil, optional
-        One to which entries are added.
+        A Stencil whose entries are included in the result.
 
     Raises
     ------
