@@ -1,4 +1,4 @@
-"""Solves on ranks: PETSc's Krylov methods and multigrid inside the contract of one process.
+"""Linear solves with distributed fields, by PETSc's Krylov methods and multigrid.
 
 The contract (solvers/solve.py) is unchanged: true residual, powers of two, both null spaces, refinement, errors. Sizes
 that it takes from a System are sums over all ranks here, with the same bits on each: all ranks take the same branch,
@@ -41,11 +41,11 @@ CG: dict[str, Any] = {"ksp_type": "cg", "pc_type": "hypre"}
 GAMG: dict[str, Any] = {"ksp_type": "gmres", "pc_type": "gamg", "ksp_pc_side": "right"}
 # For fields on cells and on faces together, such as velocity and pressure, PETSc has no suitable multigrid.
 LU = {"ksp_type": "gmres", "pc_type": "lu", "pc_factor_mat_solver_type": "mumps", "ksp_pc_side": "right"}
-SPARE = 14, 200  # of MUMPS: percent of memory beyond its estimate, which the pivots of saddle points exceed
+SPARE = 14, 200  # MUMPS option ICNTL(14): 200 % more memory than estimated, because saddle points need more pivots
 # On the coarsest level BoomerAMG uses Gaussian elimination, which may find a pivot of 0 in a singular matrix.
 HYPRE_SINGULAR = {"pc_hypre_boomeramg_relax_type_coarse": "symmetric-SOR/Jacobi"}
-MOST = 500  # iterations of one call
-TIGHT = 1e-14  # smallest tolerance that PETSc gets; the contract refines
+MOST = 500  # maximum number of iterations of one call of PETSc
+TIGHT = 1e-14  # smallest relative tolerance given to PETSc; iterative refinement reaches smaller ones
 
 
 # ---- matrices ----
