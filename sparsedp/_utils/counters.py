@@ -1,4 +1,6 @@
-"""Counters: numbers of calls of each rule, operator and solve, and facts about them. `explain` prints them.
+"""Count the calls of each derivative rule, operator and linear solver, and store properties such as methods.
+
+`explain` prints these counters.
 
 The kinds of calls are forward, vjp and jvp. Solves also count: solve, adjoint, iterations, setup, reused, hierarchy,
 skipped (no solve was needed). Operators also count: assembled (the matrix was built). A time loop counts its steps as

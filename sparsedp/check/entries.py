@@ -298,7 +298,7 @@ def listed(
     spaces: Sequence[Any],
     source: str = "the gradient",
 ) -> list[str]:
-    """Return a sentence about each gap: the entry, both derivatives, and the region that contains the whole gap.
+    """Return a sentence for each entry in which two derivatives differ: its place, both values, the region affected.
 
     Parameters
     ----------

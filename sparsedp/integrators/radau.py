@@ -218,7 +218,10 @@ class Radau(Adaptive):
         return run.rounded(new)
 
     def interval(self, u: Any, params: Any, t: Any, h: Any) -> tuple[Radau, tuple]:
-        """Return a copy of this object for an interval, and arguments: flat state, traced params, time and length."""
+        """Return a copy of this object for one time interval, and the arguments to call it with.
+
+        The arguments are the flat state, the traced params, the start time and the length of the interval.
+        """
         run = copy(self)
         run.problem = FlatProblem(self.problem, u, self.name)
         run.params = constant(untraced(params))

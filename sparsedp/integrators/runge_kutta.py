@@ -177,7 +177,7 @@ class Polynomial(Scheme):
 def taylor(op: Operator, name: str, order: int, power: int = 0) -> Rule:
     """Return the rule of (z, u) for L^power T_order(z L) u, with the Taylor polynomial T of the exponential.
 
-    Its derivative in z is the same rule with order - 1 and power + 1.
+    Its derivative with respect to z is again such a rule, with order - 1 and power + 1.
     """
     if name.endswith(".T"):
         other = name.removesuffix(".T")

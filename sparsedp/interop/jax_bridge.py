@@ -320,7 +320,10 @@ def from_jax(function: Callable) -> Callable:
 
 
 class _JaxRule:
-    """A JAX function that returns a list, as a rule of the tape. Its derivatives are JAX functions, too."""
+    """Wrap a JAX function that returns a list, so that the tape records and differentiates it like a built-in function.
+
+    Its derivatives are JAX functions, too.
+    """
 
     def __init__(self, function):
         self.function = function

@@ -75,7 +75,7 @@ def slopes(grid: Grid, axis: int, sides: Any) -> Factor:
 
 
 def means(grid: Grid, axis: int, sides: Any) -> Factor:
-    """Return the factor that interpolates linearly from cells to faces.
+    """Return the 1-D matrix (a factor of a Kronecker product) that interpolates linearly from cells to faces.
 
     On a wall it computes the value that the boundary condition with value 0 implies.
     """

@@ -71,7 +71,7 @@ def assembled(block: Structure, layout: Partition) -> Any:
 
 
 def _matrix(shape, indptr, columns, data, layout):
-    """Return PETSc's matrix of the rows of each rank; `shape`: of blocks."""
+    """Return the distributed PETSc matrix built from the rows that each rank owns, of the local `shape`."""
     rows = (indptr.astype(PETSc.IntType), columns.astype(PETSc.IntType), data)
     return PETSc.Mat().createAIJ([(n, None) for n in shape], csr=rows, comm=layout.comm)
 

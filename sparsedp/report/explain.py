@@ -161,8 +161,8 @@ class Plan(Result):
     skipped : list of str
         Sentences about work that was not needed.
     rows : list of dict
-        One dict for each operator, rule and solver, in the order of first use: name, counts, seconds, and the form of
-        the operator or the method of the solver.
+        One dict for each operator, derivative rule and solver, in the order of first use: its name, numbers of calls,
+        seconds, and how the operator is stored or which method the solver uses.
     tape_nodes, tape_bytes : int
         Number of calls on the tape after the forward pass, and bytes of the arrays that they keep.
     recomputation : float
