@@ -1,11 +1,11 @@
-"""The derivative rule of a linear solve whose matrix depends on parameters: s of A(p) s = b, differentiable in b and p.
+"""The derivative rule of a linear solve A(p) s = b: the solution s is differentiable in b and in the parameters p.
 
-    A s' = b' - A' s,       A' s the derivative of A s along p'
-    b_bar = y  with  A^T y = g,         p_bar = -grad <y, A s>,  with y and s held fixed,
+    JVP:  A s' = b' - A' s,  where A' s is the derivative of A s along p' for constant s
+    VJP:  A^T y = g,  b_bar = y,  p_bar = -grad_p <y, A s>  for constant y and s
 
-in the convention of tape.py for complex numbers too: plain transposes, and the real part for real values. One
-solve with the transpose serves all arguments. The transposed solve has a rule of the same form: each is used in the
-derivative of the other, and derivatives of every order follow.
+Complex numbers follow the convention of tape.py: transposes are not conjugated, and the cotangent of a real argument
+is real. One solve with the transpose gives the cotangents of all arguments. The transposed solve has a rule of the same
+form. Each of the two rules uses the other in its derivative, so derivatives of every order exist.
 """
 
 from __future__ import annotations
@@ -34,22 +34,23 @@ def solve_rule(
     transposed: bool = False,
     checked: bool = False,
 ) -> Rule:
-    """Return the Rule of (b, *params): s of A(params) s = b, or of the transposed system.
+    """Return the derivative Rule that maps (b, *params) to the solution s of A(params) s = b or of its transpose.
 
-    The Rule is created for each solve and not kept, because it holds its solver.
+    A Rule is created for each solve and is not stored, because it references the solver.
 
     Parameters
     ----------
     name : str
     solve : callable
-        ``solve(transposed, checked, b, *params)`` of plain values.
+        ``solve(transposed, checked, b, *params)`` returns s; no argument is traced.
     back : callable
-        ``back(params, places, y, s)`` returns -grad <y, A s> in the params at these places, in their order.
+        ``back(params, places, y, s)`` returns the gradients of -<y, A s> with respect to ``params[place]`` for each
+        place in `places`, in this order.
     product : callable
-        ``product(transposed, s, *params)`` returns A s or A^T s, differentiable in the params.
+        ``product(transposed, s, *params)`` returns A s or A^T s, and is differentiable in the params.
     transposed : bool
     checked : bool
-        Whether b are primal data, not those of a derivative.
+        Whether b is a right-hand side of the user. False for the solves of derivatives.
     """
     rule = partial(solve_rule, name, solve, back, product)
 
@@ -60,7 +61,7 @@ def solve_rule(
             adjoint = rule(not transposed)(g, *params)
             y, s = (ans, adjoint) if transposed else (adjoint, ans)
             slopes = []
-            with np.errstate(over="ignore", invalid="ignore"):  # overflow is refused below
+            with np.errstate(over="ignore", invalid="ignore"):  # _finite raises an error on overflow
                 if not nums[0]:
                     slopes.append(of_argument(adjoint, b))
                 if places:
@@ -78,12 +79,12 @@ def solve_rule(
             total = total - change
         return rule(transposed)(total, *params)
 
-    forward = partial(solve, transposed, checked)  # the rule has the names of its arguments
+    forward = partial(solve, transposed, checked)  # Rule reads its signature: (b, *params)
     return Rule(f"{name}.T" if transposed else name, forward, vjp, jvp)
 
 
 def vary(fun: Callable[..., Any], args: Sequence, places: Sequence[int]) -> tuple[Callable[[Sequence], Any], list]:
-    """Return fun(*args) as a function of the list of the arguments at some places, and that list."""
+    """Return `fun` as a function of a list of the arguments at `places` only, and the list of their values."""
 
     def varied(values: Sequence) -> Any:
         return fun(*placed(args, places, values))
@@ -92,6 +93,6 @@ def vary(fun: Callable[..., Any], args: Sequence, places: Sequence[int]) -> tupl
 
 
 def _finite(name: str, cotangent: Any) -> Any:
-    """Refuse products of two solutions that overflow."""
+    """Return the cotangent; raise NonFiniteError if it overflowed."""
     check_finite(f"a gradient of {name}", plain(cotangent), advice="; scale the loss or the right-hand side")
     return cotangent

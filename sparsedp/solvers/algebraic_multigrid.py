@@ -1,4 +1,4 @@
-"""Algebraic multigrid: hierarchies by PyAMG (Ruge-Stueben), and a cycle of our own that has a transpose.
+"""Algebraic multigrid: PyAMG builds the Ruge-Stueben hierarchy; the cycle is implemented here with its transpose.
 
 One cycle is a linear map M ~ A^-1. With pre-smoothing sweeps s_1 ... s_m, prolongation P, restriction R
 and post-smoothing sweeps t_1 ... t_n, its transpose is the cycle on A^T with prolongation R^T,
@@ -43,14 +43,14 @@ __all__ = [
     "ruge_stueben",
 ]
 
-CYCLES = {"V": 1, "W": 2}  # visits of the next level in one cycle
+CYCLES = {"V": 1, "W": 2}  # how often one cycle visits the next coarser level
 MIRRORED = {"forward": "backward", "backward": "forward"}
-COARSEST = 100  # unknowns up to which a level is not coarsened further, but solved by a dense matrix
-DENSE_UP_TO = 2000  # unknowns of a coarsest level, where coarsening ends before: its matrix takes 32 MB
+COARSEST = 100  # a level with at most this number of unknowns is not coarsened, but solved by dense LU
+DENSE_UP_TO = 2000  # largest coarsest level if coarsening ends before COARSEST; its dense matrix takes 32 MB
 MAXITER = 200
-RESIDUE = 1e-13  # share of the entries that were added up, below which a row of a coarse level is rounding
-ZERO_ROW_SUM = 1e-9  # share of the entries of a row below which their sum is 0
-SMALLEST_PIVOT = 1e-14  # share of the largest entry of a row
+RESIDUE = 1e-13  # a coarse row is rounding error below this fraction of the fine entries summed for it
+ZERO_ROW_SUM = 1e-9  # a row sum below this fraction of the sum of magnitudes counts as 0
+SMALLEST_PIVOT = 1e-14  # a pivot below this fraction of the largest entry of its row counts as 0
 PINV_CUTOFF = 1e-10  # relative singular value below which the pseudo-inverse treats it as 0
 
 
@@ -62,21 +62,22 @@ def multigrid_engine(
     sweeps: Sequence[Sweeps] = (("forward",), ("backward",)),
     levels: int = 25,
 ) -> Multigrid:
-    """Build conjugate gradients, or GMRES when the operator is not symmetric, around one multigrid cycle.
+    """Build a Krylov solver preconditioned by one multigrid cycle: conjugate gradients, or GMRES if not symmetric.
 
     Parameters
     ----------
     system : System
-        With entries, and a diagonal of one sign.
+        Its matrix entries must be known, and all diagonal entries must have the same sign.
     cycle : "V" or "W"
-        W costs more for each iteration and needs fewer where coefficients jump. The F cycle is not
-        offered: its transpose is another cycle.
+        A W-cycle costs more per iteration, and needs fewer iterations where coefficients jump. There is no F-cycle,
+        because its transpose is not an F-cycle.
     strength : float
-        A coefficient counts as strong from this share of the largest in its row, 0 <= strength < 1.
+        An off-diagonal entry is a strong connection if it is at least this fraction of the largest one in its row,
+        0 <= strength < 1.
     sweeps : pair of tuples of "forward" and "backward"
         Gauss-Seidel sweeps before and after the coarse correction.
     levels : int
-        Most levels.
+        Largest number of levels.
 
     Returns
     -------
@@ -85,14 +86,14 @@ def multigrid_engine(
     Raises
     ------
     ValueError
-        If the diagonal has both signs or a zero, there are no entries, or an option is out of range.
+        If the diagonal entries do not have one sign, the matrix entries are not known, or an option is out of range.
     ConvergenceError
-        With status setup_failed, when coarsening ends at a level of more than 2000 unknowns.
+        With status "setup_failed", if coarsening ends at a level of more than 2000 unknowns.
 
     Notes
     -----
-    The coarsest level is solved by a dense matrix. It has at most 100 unknowns, or 2000 where `levels` is reached or
-    the matrix does not coarsen further. The set-up is deterministic.
+    The coarsest level is solved by dense LU. It has at most 100 unknowns, or at most 2000 if `levels` is reached or the
+    matrix cannot be coarsened further. The set-up is deterministic.
 
     References
     ----------
@@ -121,7 +122,7 @@ def check_multigrid_options(
     sweeps: Sequence[Sweeps] = (("forward",), ("backward",)),
     levels: int = 25,
 ) -> tuple[float, int]:
-    """Refuse options of `multigrid_engine` that are out of range; return `strength` and `levels` as numbers."""
+    """Raise an error for invalid options of `multigrid_engine`; return `strength` and `levels` as numbers."""
     check_choice("cycle", cycle, CYCLES, "; the F cycle has no transpose of its own kind")
     strength = check_number("strength", strength, "from 0 to below 1", "; the default is 0.25")
     if not _are_sweeps(sweeps):
@@ -133,7 +134,7 @@ def check_multigrid_options(
 
 
 def _are_sweeps(sweeps: Any) -> bool:
-    """Return whether an argument is two tuples or lists of the names of sweeps, not both empty."""
+    """Return whether an argument is a pair of sequences of sweep names that are not both empty."""
     if not isinstance(sweeps, (tuple, list)) or len(sweeps) != 2 or not any(sweeps):
         return False
     names = tuple(MIRRORED)
@@ -141,17 +142,17 @@ def _are_sweeps(sweeps: Any) -> bool:
 
 
 class Multigrid(Krylov):
-    """The engine: a kept hierarchy, its cycle and the transposed cycle.
+    """The Krylov solver whose preconditioner is one cycle of a stored multigrid hierarchy.
 
     Parameters
     ----------
     system : System
     visits : int
-        Of the next level in one cycle.
-    strength : float
-    sweeps : pair of tuples
+        How often one cycle visits the next coarser level: 1 for a V-cycle, 2 for a W-cycle.
+    strength, sweeps
+        See `multigrid_engine`.
     levels : int
-        Most levels.
+        Largest number of levels.
     """
 
     method = "multigrid"
@@ -164,7 +165,7 @@ class Multigrid(Krylov):
         super().__init__(system, maxiter=MAXITER)
         before, after = sweeps
         self.symmetric = system.symmetric and before == _mirrored(after)
-        unit = 2.0 ** -exponent_of(system.norm(False))  # PyAMG prints where entries are far from 1
+        unit = 2.0 ** -exponent_of(system.norm(False))  # PyAMG prints warnings if entries are far from 1
         self._scale: Any = unit * system.sign
         if self.symmetric:
             self._scale = self._scale * system.weights
@@ -181,13 +182,16 @@ class Multigrid(Krylov):
         self.hierarchy = self.forward.words
 
     def precondition(self, r: np.ndarray, transposed: bool) -> np.ndarray:
-        """Return one cycle, or one transposed cycle."""
+        """Return the result of one cycle, or of one transposed cycle, for the right-hand side r."""
         hierarchy = self.forward.T if transposed else self.forward
         return hierarchy.cycle(self._scale * r)
 
 
 class Level(NamedTuple):
-    """A matrix with the prolongation from and the restriction to the next level, None on the coarsest one."""
+    """The matrix A of a level, the prolongation P from the next coarser level, and the restriction R to it.
+
+    P and R are None on the coarsest level.
+    """
 
     A: Any
     P: Any = None
@@ -195,17 +199,17 @@ class Level(NamedTuple):
 
 
 class Hierarchy:
-    """Levels, sweeps, and a dense solve on the coarsest level without the null modes.
+    """A multigrid hierarchy: the levels, the smoothing sweeps, and the solve on the coarsest level.
 
     Parameters
     ----------
     levels : list of Levels
     visits : int
-        Of the next level in one cycle.
+        How often one cycle visits the next coarser level.
     before, after : tuples of "forward" and "backward"
         Gauss-Seidel sweeps before and after the coarse correction.
     coarse : callable, optional
-        ``coarse(b, transposed)`` solves on the coarsest level. Default: `coarse_solver`.
+        ``coarse(b, transposed)`` solves on the coarsest level. Default: the dense solve of `coarse_solver`.
     """
 
     def __init__(
@@ -229,7 +233,10 @@ class Hierarchy:
         return Hierarchy(levels, self.visits, _mirrored(self.after), _mirrored(self.before), coarse)
 
     def cycle(self, b: np.ndarray, number: int = 0) -> np.ndarray:
-        """Return M b, one cycle from 0 that starts at a level, as a fresh array."""
+        """Return the result of one cycle for the right-hand side b, as a new array.
+
+        The cycle starts at level `number` with the initial guess 0.
+        """
         level = self.levels[number]
         if level is self.levels[-1]:
             return self._coarse(b, False)
@@ -247,7 +254,7 @@ class Hierarchy:
 
     @staticmethod
     def _smooth(A: csr_array, x: np.ndarray, b: np.ndarray, sweeps: Sweeps) -> None:
-        """Apply Gauss-Seidel sweeps to x."""
+        """Apply Gauss-Seidel sweeps for A x = b to x in place."""
         from pyamg import amg_core
 
         for sweep in sweeps:
@@ -258,7 +265,7 @@ class Hierarchy:
 
     @property
     def words(self) -> str:
-        """Levels, unknowns and operator complexity in one line."""
+        """A description in one line: number of levels, unknowns of each level, and operator complexity."""
         sizes = " > ".join(str(level.A.shape[0]) for level in self.levels)
         entries = [level.A.nnz for level in self.levels]
         return f"{len(self.levels)} levels, unknowns {sizes}, operator complexity {sum(entries) / entries[0]:.2f}"
@@ -270,20 +277,23 @@ def _mirrored(sweeps: Sweeps) -> Sweeps:
 
 
 def _transposed(matrix: csr_array | None) -> csr_array | None:
-    """Return the transpose of a matrix, None for None."""
+    """Return the transpose of a matrix; return None if the argument is None."""
     if matrix is None:
         return None
     return csr_array(matrix.T.tocsr())
 
 
 def ruge_stueben(matrix: csr_array, strength: float, levels: int) -> list[Level]:
-    """Return the levels that PyAMG builds; this splitting draws no random numbers."""
+    """Return the levels that PyAMG builds.
+
+    The result is reproducible, because the coarse-fine splitting that is used here draws no random numbers.
+    """
     from pyamg import ruge_stuben_solver
 
     solver = ruge_stuben_solver(
-        csr_matrix(matrix),  # PyAMG asks for the matrix class, not the array class
+        csr_matrix(matrix),  # PyAMG requires csr_matrix and does not accept csr_array
         strength=("classical", {"theta": strength}),
-        CF=("RS", {"second_pass": True}),  # with random jumps the first pass alone does not converge
+        CF=("RS", {"second_pass": True}),  # needed for convergence if coefficients jump randomly
         max_levels=levels,
         max_coarse=COARSEST,
     )
@@ -291,17 +301,17 @@ def ruge_stueben(matrix: csr_array, strength: float, levels: int) -> list[Level]
 
 
 def colour_graph(links: sparray) -> np.ndarray:
-    """Return a colour for each row of a symmetric sparse matrix: two linked rows have different ones."""
+    """Return a colour number for each row of a symmetric sparse matrix, so that linked rows have different colours."""
     from pyamg.graph import vertex_coloring
 
-    return vertex_coloring(csr_matrix(links), method="MIS")  # by maximal independent sets; it draws no random numbers
+    return vertex_coloring(csr_matrix(links), method="MIS")  # maximal independent sets: deterministic
 
 
 def _without_residues(pyamg_levels: Sequence) -> list[Level]:
-    """Return the Levels of PyAMG, with rows of rounding residues replaced by empty ones.
+    """Return the levels of PyAMG as Levels, with rows and columns that are only rounding error set to 0.
 
-    A region that no boundary condition holds ends in one unknown whose row is 0 up to rounding: a sweep or the
-    coarsest solve would divide by it. Both leave out empty rows.
+    A region without a boundary condition that fixes its level is coarsened to one unknown. The row of this unknown is 0
+    up to rounding, and a sweep or the coarsest solve would divide by its diagonal. Both skip empty rows.
     """
     levels: list[Level] = []
     reference = np.zeros(0)
@@ -324,11 +334,12 @@ def _without_residues(pyamg_levels: Sequence) -> list[Level]:
 
 
 def coarse_solver(matrix: csr_array) -> Solve:
-    """Return solve(b, transposed) for the matrix of the coarsest level: dense LU without the null modes.
+    """Return a function ``solve(b, transposed)`` for the matrix of the coarsest level, by dense LU.
 
-    A component whose rows sum to 0 (constants are its null mode) is made regular by adding the mean, scaled to its
-    entries: for data in its range the solution has mean 0, and so has the solution of the transposed system.
-    Other singular matrices (null vectors that are not constant) get the pseudo-inverse.
+    If all rows of a connected component sum to 0, constants are in its null space. Then a multiple of the averaging
+    matrix is added to this block, which makes it regular. For data in the range of the original block, the solution has
+    mean 0, and so has the solution of the transposed system. If the null vectors of a singular matrix are not constant,
+    the pseudo-inverse is used.
     """
     dense = matrix.toarray()
     ones = np.ones(matrix.shape[0])
@@ -344,7 +355,7 @@ def coarse_solver(matrix: csr_array) -> Solve:
     if np.all(np.abs(np.diag(factors)) > SMALLEST_PIVOT * np.max(np.abs(dense), axis=1)):
 
         def solve(b: np.ndarray, transposed: bool) -> np.ndarray:
-            # A copy, because SciPy changes the pivots during a solve, and another thread may be solving too.
+            # Copy the pivots: SciPy modifies them during a solve, and another thread may use them at the same time.
             return la.lu_solve((factors, pivots.copy()), b, trans=int(transposed), check_finite=False)
 
         return solve

@@ -1,4 +1,4 @@
-"""Cache: the last few values that were computed from arrays, looked up by the content of those arrays."""
+"""Cache: a small cache of values that were computed from arrays, looked up by the content of those arrays."""
 
 from __future__ import annotations
 
@@ -10,23 +10,24 @@ __all__ = ["Cache"]
 
 
 class Cache:
-    """Values by the content of their keys. It holds copies of the keys; keys must be plain, never traced.
+    """A least-recently-used cache whose keys are compared by content.
 
-    The list of entries is replaced, never changed, because other threads may be reading it.
+    The cache stores copies of the arrays in the keys. These arrays must not be traced by autograd. The list of entries
+    is replaced by a new list and never modified in place, because other threads may be reading it.
 
     Parameters
     ----------
     most : int
-        Number of values that are kept; the least recently used one is dropped. Two serve a forward and a backward
-        pass, or two alternating sets of data.
+        Largest number of values; beyond it the least recently used value is dropped. Two values are enough for a
+        forward and a backward pass, or for two data sets that alternate.
     """
 
     def __init__(self, most: int = 2) -> None:
         self.most = most
-        self._entries: list[tuple[tuple, Any]] = []  # (key, value), the last used first
+        self._entries: list[tuple[tuple, Any]] = []  # (key, value), the most recently used first
 
     def find(self, key: tuple) -> Any:
-        """Return the value of an equal key, or None."""
+        """Return the value that is stored under an equal key, or None."""
         entries = self._entries
         for entry in entries:
             entry_key, value = entry
@@ -36,7 +37,7 @@ class Cache:
         return None
 
     def put(self, key: tuple, value: Any) -> Any:
-        """Keep a value, and return it."""
+        """Store a value under a key, and return the value."""
         key = tuple(np.array(part) if isinstance(part, np.ndarray) else part for part in key)
         self._entries = [(key, value), *self._entries[: self.most - 1]]
         return value
@@ -46,7 +47,7 @@ class Cache:
 
     @property
     def last(self) -> Any:
-        """The value that was used last, or None."""
+        """The most recently used value, or None if the cache is empty."""
         entries = self._entries
         if not entries:
             return None
@@ -55,9 +56,9 @@ class Cache:
 
 
 def _are_equal(one: Any, other: Any) -> bool:
-    """Return whether two parts of keys are equal, in type and dtype too."""
+    """Return whether two parts of keys have equal values, and the same type or dtype."""
     if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
-        # float32 and float64 data of equal value have different derivatives.
+        # Compare dtypes too: the derivatives for float32 and float64 data differ even if the values are equal.
         return getattr(one, "dtype", None) == getattr(other, "dtype", None) and np.array_equal(one, other)
     if one is other:
         return True

@@ -1,4 +1,4 @@
-"""Methods of `inverse`: their options, the fixed rule by which "auto" chooses one, and the set-up of its engine."""
+"""The methods of `inverse`: their options, the fixed rule of method "auto", and the set-up of the linear solver."""
 
 from __future__ import annotations
 
@@ -37,7 +37,8 @@ __all__ = [
     "engine_of",
 ]
 
-# Each method with the function that builds its engine: from a System, and options that are keyword-only.
+# For each method the function that builds its solver (an Engine). The function takes a System, and the options of the
+# method as keyword-only arguments.
 METHODS: dict[str, Any] = {
     "separable": separable_engine,
     "direct": direct_engine,
@@ -45,7 +46,8 @@ METHODS: dict[str, Any] = {
     "multigrid": multigrid_engine,
     "krylov": krylov_engine,
 }
-# Functions that refuse values of options of a method that has nothing to solve.
+# Functions that check the option values of a method. They are called when substitution solves for all unknowns: the
+# method itself is then not set up, so nothing else would check its options.
 OPTION_CHECKS: dict[str, Any] = {
     "direct": check_precision,
     "structured": check_precision,
@@ -61,39 +63,40 @@ SYNONYMS = {
     "fft": "separable",
 }
 
-# Transforms are chosen from this number of unknowns on, in 2-D and 3-D, while the axes that need dense eigenvectors are
-# not longer than this.
+# In 2-D and 3-D, "separable" is chosen from SEPARABLE_FROM unknowns on. Axes that need a dense matrix of eigenvectors
+# may have at most LONGEST_EIGENVECTORS of them.
 SEPARABLE_FROM = 1024
 LONGEST_EIGENVECTORS = 2048
 
-# Largest number of unknowns for which kept LU factors are chosen, by dimension (0: no grid), when one set-up serves
-# many solves, and when it serves two. Measured: at 512^2 LU costs 5 times the set-up of multigrid and a sixth of its
-# solve; in 3-D both cost the same at 32^3.
+# Largest number of unknowns for which sparse LU is chosen, for each dimension of the grid (0: no grid). The set-up is
+# used for "many" solves or for a "few", about two. Measured at 512^2: the set-up of LU takes 5 times as long as that of
+# multigrid, and a solve a sixth of the time. In 3-D, LU and multigrid take the same time at 32^3.
 DIRECT_UP_TO = {
     "many": {0: 50_000, 1: 10_000_000, 2: 262_144, 3: 13_824},
     "few": {0: 10_000, 1: 10_000_000, 2: 16_384, 3: 2_000},
 }
 
-# The same where structured multigrid is possible. Measured in 3-D: at 16^3 LU takes 5 times its set-up and a third
-# of its solve, at 24^3 26 times and 1.3 times.
+# The same limits for operators that structured multigrid can solve. Measured in 3-D, LU relative to structured
+# multigrid: at 16^3 the set-up takes 5 times as long and a solve a third of the time; at 24^3 the set-up takes 26 times
+# and a solve 1.3 times as long.
 DIRECT_BELOW_STRUCTURED = {"many": {1: 10_000_000, 2: 16_384, 3: 4_096}, "few": {1: 10_000_000, 2: 4_096, 3: 1_000}}
 
-# The same for complex entries, which multigrid does not take. Measured, value and gradient of waves: LU 96 s and 8.3 GB
-# at 2048^2, where GMRES does not converge; in 3-D 5 s and 0.6 GB at 32^3 and 67 s and 2.7 GB at 48^3, GMRES 2 s
-# and 0.3 GB, 7 s and 0.7 GB.
+# The same limits for matrices with complex entries, which multigrid cannot solve. Measured for the value and gradient
+# of a wave problem: at 2048^2 LU takes 96 s and 8.3 GB, and GMRES does not converge. At 32^3 LU takes 5 s and 0.6 GB,
+# and GMRES 2 s and 0.3 GB. At 48^3 LU takes 67 s and 2.7 GB, and GMRES 7 s and 0.7 GB.
 COMPLEX_UP_TO = {0: 1_048_576, 1: 10_000_000, 2: 4_194_304, 3: 27_000}
 
 
 class Choice(NamedTuple):
-    """The method of a solve.
+    """The method that was chosen for a linear system.
 
     Attributes
     ----------
     method : str
     reason : str
-        In words, for ``print(inv)``.
+        Why this method was chosen, as ``print(inv)`` shows it.
     engine : Engine, optional
-        Of the coupled unknowns, without options, if it was built to decide.
+        The solver for the coupled unknowns, with default options, if the choice required building it.
     """
 
     method: str
@@ -129,7 +132,7 @@ def check_settings(
 
 
 def _method_advice(method: Any) -> str:
-    """Return advice for a wrong method: a right-hand side in its place, or the name of another library."""
+    """Return advice for an invalid `method`, such as a right-hand side or the name that another library uses."""
     if isinstance(method, np.ndarray):
         return "; write dp.inverse(op)(b) for a right-hand side b"
     if isinstance(method, str) and method in SYNONYMS:
@@ -138,7 +141,7 @@ def _method_advice(method: Any) -> str:
 
 
 def check_options(method: str, options: dict[str, Any]) -> None:
-    """Refuse options that a method, or with "auto" every method, does not take."""
+    """Raise TypeError for an option that the method does not take; for "auto", that no method takes."""
     builders = METHODS.values() if method == "auto" else [METHODS[method]]
     parameters = [parameter for build in builders for parameter in inspect.signature(build).parameters.values()]
     names = list(dict.fromkeys(parameter.name for parameter in parameters if parameter.kind == parameter.KEYWORD_ONLY))
@@ -149,7 +152,7 @@ def check_options(method: str, options: dict[str, Any]) -> None:
 
 
 def check_unknowns(system: System) -> None:
-    """Refuse an operator with an unknown that no row uses, while its own row has entries."""
+    """Raise ConvergenceError if a column of the operator is empty while the row with the same number is not."""
     number = system.unused_unknown
     if number is not None:
         raise ConvergenceError(
@@ -160,11 +163,11 @@ def check_unknowns(system: System) -> None:
         )
 
 
-# ---- the engine of a method ----
+# ---- set-up of a method ----
 
 
 def engine_of(system: System, choice: Choice, options: dict[str, Any], near: Engine | None = None) -> Engine:
-    """Build the engine of a method.
+    """Build the solver (an Engine) of the chosen method.
 
     Parameters
     ----------
@@ -172,7 +175,7 @@ def engine_of(system: System, choice: Choice, options: dict[str, Any], near: Eng
     choice : Choice
     options : dict
     near : Engine, optional
-        The engine of a matrix close to this one, for the direct method.
+        The solver of a similar matrix. The direct method uses its LU factors as a preconditioner.
 
     Raises
     ------
@@ -189,7 +192,7 @@ def engine_of(system: System, choice: Choice, options: dict[str, Any], near: Eng
         )
     try:
         engine = _engine(system, choice, options, near)
-        _ = system.null_space  # found here, so that its failure is one of the set-up
+        _ = system.null_space  # computed now, so that a failure is reported as one of the set-up
     except ArithmeticError as error:
         message = f"{system.unscaled} is singular and cannot be projected: {error}; add a shift"
         raise ConvergenceError(message, info=failure("setup_failed")) from None
@@ -197,7 +200,7 @@ def engine_of(system: System, choice: Choice, options: dict[str, Any], near: Eng
 
 
 def _engine(system: System, choice: Choice, options: dict[str, Any], near: Engine | None) -> Engine:
-    """Build the engine of a system with unknowns, with substitution around it for those that are not coupled."""
+    """Build the solver of a nonempty system; unknowns that are not coupled to others are found by substitution."""
     method = choice.method
     if system.splitting is not None:
         if system.coupled.unknowns:
@@ -216,13 +219,13 @@ def _engine(system: System, choice: Choice, options: dict[str, Any], near: Engin
 
 
 def choose_method(system: System, solves: str) -> Choice:
-    """Choose a method by a fixed rule that depends on the operator alone, so that results are reproducible.
+    """Choose a method by a fixed rule that uses only the operator and `solves`, so that results are reproducible.
 
     Parameters
     ----------
     system : System
     solves : "many" or "few"
-        How many solves are expected of the set-up.
+        How many solves are expected to use this set-up.
     """
     structure = system.op.structure
     grid = system.op.domain.grid
@@ -231,7 +234,7 @@ def choose_method(system: System, solves: str) -> Choice:
         dimension = grid.dim
     engine = _transforms(system, dimension)
     if engine is not None:
-        system.splitting = None  # transforms solve for all unknowns
+        system.splitting = None  # the transforms solve for all unknowns at once
         kind = "a sum of 1-D factors" if structure.separable else "a function of a sum of 1-D factors"
         reason = f"{system.unknowns} unknowns in {dimension}-D, {kind}: transforms solve it exactly"
         return Choice("separable", reason, engine)
@@ -247,7 +250,7 @@ def choose_method(system: System, solves: str) -> Choice:
 
 
 def _transforms(system: System, dimension: int) -> Engine | None:
-    """Return the engine of a sum of 1-D factors, or a function of one, if transforms along them are fast; else None."""
+    """Return the transform solver if the operator is (a function of) a sum of 1-D factors and it is fast; else None."""
     structure = system.op.structure
     is_small = dimension < 2 or system.size < SEPARABLE_FROM
     if (structure.has_entries and is_small) or system.active is not None:
@@ -262,7 +265,10 @@ def _transforms(system: System, dimension: int) -> Engine | None:
 
 
 def _splitting(system: System) -> Splitting | None:
-    """Return the Splitting of a system or None; None for a singular one, which is refused when the engine is built."""
+    """Return the Splitting of a system, or None.
+
+    Also return None if computing it raises ArithmeticError: the set-up that follows reports the singular system.
+    """
     try:
         return system.splitting
     except ArithmeticError:
@@ -270,9 +276,9 @@ def _splitting(system: System) -> Splitting | None:
 
 
 def _choose_by_entries(system: System, solves: str, dimension: int, others: str) -> Choice:
-    """Choose a method for a system with entries that no transform solves.
+    """Choose a method for a system whose matrix entries are known and that no transform solves.
 
-    `others` describes the unknowns that substitution finds and that are not in this system.
+    `others` is a phrase about the unknowns outside this system, which are found by substitution; it may be empty.
     """
     kind = "coupled " if others else ""
     if system.complex:
@@ -319,13 +325,13 @@ def _choose_for_complex_entries(system: System, dimension: int, kind: str, other
 
 
 def _size_in_words(system: System, kind: str, dimension: int) -> str:
-    """Return the number of unknowns of some kind and the dimension of the grid in words."""
+    """Return a phrase with the number of unknowns, their kind, and the dimension of the grid."""
     place = f"in {dimension}-D" if dimension else "without a grid"
     return f"{system.unknowns} {kind}unknowns {place}"
 
 
 def _largest_factored(system: System) -> int:
-    """Return the number of unknowns of the largest block that LU factors take together."""
+    """Return the number of unknowns in the largest diagonal block that LU must factor."""
     if system.faces is not None:
         return system.unknowns
     largest, triangular = largest_block(system.matrix)

@@ -1,4 +1,4 @@
-"""Engine: the interface between the solve contract and a method that solves linear systems."""
+"""Engine: the base class of all linear solvers, which `Solver` in solve.py calls."""
 
 from __future__ import annotations
 
@@ -10,32 +10,35 @@ __all__ = ["EmptySystem", "Engine"]
 
 
 class Engine:
-    """A method with its set-up. The contract in solve.py calls `solve`, and refines with further calls on the residual.
+    """Base class of linear solvers: one method, set up for one matrix.
 
-    A subclass defines `solve` and sets the attributes in which it differs. The function that builds it takes a System
-    (system.py) and the options of the method as keyword-only arguments.
+    `Solver` in solve.py calls `solve` with the right-hand side, and again with the residual for iterative refinement.
+    A subclass defines `solve` and overrides the attributes whose defaults do not fit. The function that builds it takes
+    a System (system.py), and the options of the method as keyword-only arguments.
 
     Attributes
     ----------
     method : str
-        What a user writes for it, such as "direct".
+        Name of the method, as users write it in ``inverse(op, method=...)``, such as "direct".
     unit : str
-        What an iteration is called in messages: "iterations" or "cycles".
+        Word for iterations in error messages: "iterations" or "cycles".
     hierarchy : str
-        Size of the set-up in one line: levels, unknowns, entries.
+        Description of the set-up in one line: levels, unknowns, matrix entries.
     iterative : bool
-        Whether the residual that it leaves depends on the tolerance.
+        Whether the residual after one call of `solve` depends on the tolerance.
     hierarchical : bool
-        Whether its set-up is a multigrid hierarchy.
+        Whether the set-up is a multigrid hierarchy.
     refines : bool
-        False: one call, without refinement and without an error (a fixed number of iterations).
+        If False, `solve` is called once, and no error is raised if the residual does not meet the tolerance. This is
+        for a fixed number of iterations.
     most_refinements : int
+        Largest number of calls of `solve` for one right-hand side.
     reduction : float
-        Each refinement must reduce the residual to this share of it or less.
+        Refinement stops when a call does not reduce the residual norm to this fraction of the previous one.
     advice : str
-        End of the message of a solve that does not meet the tolerance.
+        Text at the end of the error message of a solve that does not meet the tolerance.
     unrolled : bool
-        Whether derivatives go through its iterations, by `unroll`.
+        Whether derivatives are computed by differentiating the iterations, which `unroll` records.
     """
 
     method: str = "engine"
@@ -55,33 +58,34 @@ class Engine:
         Parameters
         ----------
         b : array, shape (n,)
-            float64, or complex128 if the operator is complex. It is in the range of the operator, 0 where there is no
-            unknown, of a norm between 2^-255 and 2^200, and must not be changed.
+            float64, or complex128 if the operator is complex. It lies in the range of the operator, is 0 where there
+            is no unknown, and has a norm between 2^-255 and 2^200. It must not be modified.
         goal : float
-            Stop when |b - A x| <= goal (2-norm) or when |b - A x| is at the level of rounding.
+            Stop when |b - A x| <= goal (2-norm), or when |b - A x| is at the level of rounding errors.
         transposed : bool
 
         Returns
         -------
         x : array, shape (n,)
-            A fresh array. Its component along the null space, and its values where there is no unknown, do not matter.
+            A new array. The caller removes its component along the null space and its values where there is no unknown.
         iterations : int
         status : str
-            "" if it stopped as described, else one of STATUS_WORDS.
+            "" if the solve stopped by one of the criteria of `goal`, else one of STATUS_WORDS.
 
         Notes
         -----
-        An engine is homogeneous: scaling b by a power of two scales x by it, so there are no absolute thresholds.
+        The method must be homogeneous: if b and `goal` are multiplied by a power of two, x is multiplied by the same
+        power. Therefore it must not use absolute thresholds.
         """
         raise TypeError(f"{type(self).__name__} defines no solve")
 
     def unroll(self, b: Any, goal: float, transposed: bool) -> tuple[Any, int, str]:
-        """Solve as `solve` does, where b may be traced: the iterations are recorded."""
+        """Solve as `solve` does, but with operations that autograd can record: b may be traced."""
         raise TypeError(f"{type(self).__name__} defines no unroll")
 
 
 class EmptySystem(Engine):
-    """The engine of a system without unknowns; its solve is never called."""
+    """The solver of a system without unknowns; its `solve` is never called."""
 
     method = "none"
     hierarchy = "no unknowns"

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Inverse", "Solution", "build", "build_dense", "inverse"]
 
-FRAMES = 10  # Python calls inside a solve, in units of those that a nested product or sum of operators takes
+FRAMES = 10  # nesting depth of a solve; one nested product or sum of operators has depth 1
 
 
 def inverse(
@@ -53,43 +53,47 @@ def inverse(
     nullspace: str = "raise",
     **options: Any,
 ) -> Inverse:
-    """Set up the inverse of an operator: ``x = inv(b)`` solves op(x) = b, ``inv.T(g)`` the transposed system.
+    """Set up the inverse of an operator: ``x = inv(b)`` solves op(x) = b, ``y = inv.T(g)`` solves op.T(y) = g.
 
     Parameters
     ----------
     op : Operator
-        Square: its domain and its codomain hold the same fields.
+        A square operator: fields on its domain and on its codomain have the same layout.
     method : str
-        "auto" chooses by a fixed rule; ``print(inv)`` says why. Else "separable", "direct", "structured",
-        "multigrid" or "krylov".
+        "auto", "separable", "direct", "structured", "multigrid" or "krylov". With "auto" a fixed rule chooses the
+        method, and ``print(inv)`` shows the reason.
     rtol : float
-        Tolerance on the true residual relative to the right-hand side, 0 < rtol < 1, forward and adjoint.
+        Relative tolerance, 0 < rtol < 1: a solve succeeds if |b - op(x)| <= rtol |b|, or if the residual is at the
+        level of rounding errors. The residual is computed from x. Adjoint solves use the same tolerance.
     maxiter : int, optional
-        Most iterations of one solve. Default: enough for the method.
+        Largest number of iterations of an iterative method. Default: depends on the method.
     nullspace : "raise" or "project"
-        What to do with data outside the range of a singular operator: refuse them, or project them onto the range.
+        What to do if the operator is singular and the right-hand side is not in its range: raise IncompatibleError, or
+        project the right-hand side onto the range.
     **options
-        Of the method. separable has none; auto takes those of all.
+        Options of the method. "separable" has none. "auto" accepts the options of all methods; the chosen method must
+        accept them too.
 
         ==========  ==============  ==========  =================================================================
         method      option          default     meaning
         ==========  ==============  ==========  =================================================================
-        multigrid   cycle           "V"         "V" or "W", which costs more and needs fewer iterations
-        multigrid   strength        0.25        share of the largest entry of a row from which one is strong
-        multigrid   sweeps          see right   Gauss-Seidel sweeps, (('forward',), ('backward',)): before, after
-        multigrid   levels          25          most levels
+        multigrid   cycle           "V"         "V" or "W"; a W-cycle costs more and needs fewer iterations
+        multigrid   strength        0.25        an entry is strong from this fraction of the largest in its row
+        multigrid   sweeps          see right   pre- and post-smoothing sweeps, (('forward',), ('backward',))
+        multigrid   levels          25          largest number of levels
         krylov      preconditioner  None        "jacobi", "shifted_laplace" (for waves), Operator or function
-        krylov      diff            "implicit"  "unrolled": derivatives go through the iterations
-        krylov      iterations      None        exactly this number, whatever the residual
-        structured  precision       "auto"      "single" or "double", of the cycle
-        direct      precision       "auto"      "single" or "double", of the factors
+        krylov      diff            "implicit"  "implicit" or "unrolled" (differentiate the iterations)
+        krylov      iterations      None        fixed number of iterations; the residual is not tested
+        structured  precision       "auto"      precision of the cycle: "single" or "double"
+        direct      precision       "auto"      precision of the LU factors: "single" or "double"
         ==========  ==============  ==========  =================================================================
 
     Returns
     -------
     Inverse
-        An Operator from fields b on the codomain of `op` to fields x on its domain. `inv.info` holds the records of
-        the last forward and adjoint solve. The set-up is done here, once.
+        An Operator that maps a field b on the codomain of `op` to a field x on its domain. The set-up, such as an LU
+        factorisation, is computed once, by this call. `inv.info` holds the records of the last forward and the last
+        adjoint solve.
 
     Raises
     ------
@@ -100,11 +104,11 @@ def inverse(
     ValueError
         If `rtol`, `maxiter`, `nullspace` or `method` is out of range.
     ConvergenceError
-        If the set-up fails, and on use, when a solve does not meet `rtol`.
+        If the set-up fails. Also when ``inv(b)`` or ``inv.T(g)`` is called, if the solve does not meet `rtol`.
     IncompatibleError
-        On use, if the operator is singular, the right-hand side out of its range, and nullspace="raise".
+        When ``inv(b)`` is called, if the operator is singular, b is not in its range, and nullspace="raise".
     NonFiniteError
-        On use, if the right-hand side holds NaN or infinity, or the solution cannot be represented.
+        When a solve is called, if the right-hand side contains NaN or infinity, or the solution overflows.
 
     See Also
     --------
@@ -112,14 +116,19 @@ def inverse(
 
     Notes
     -----
-    Null space: one vector for each connected component, found from the entries. Data are projected
-    with it, and the solution has volume-weighted mean 0 on each singular component; see nullspace.py.
-    Transpose: `inv.T` uses the same set-up, is exact to rtol, and never refuses.
-    Triangular parts: "direct", "structured", "multigrid" and "auto" find by substitution the unknowns that depend on
-    no coupled ones, and those that no other equation uses; only the coupled ones are factored or iterated on. A system
-    that is triangular in some order, such as a chain or upwind differences, takes one pass over its entries.
-    Memory: the coarsest level of "multigrid" is a dense matrix of at most 2000 unknowns; a larger one is refused.
-    Threads: several may solve at once, to the same bits; `inv.info` is of the solve that ended last.
+    Null space: each connected component of the matrix has at most one null vector, which is computed in the set-up. The
+    right-hand side is projected onto the range. For a pure Neumann problem the solution has volume-weighted mean 0 on
+    each singular component; nullspace.py describes the general case.
+    Transpose: `inv.T` uses the same set-up and the same `rtol`. It projects its data onto the range, and never raises
+    IncompatibleError.
+    Triangular parts: "direct", "structured", "multigrid" and "auto" use substitution for the unknowns that do not
+    depend on coupled unknowns, and for those that appear in no other equation. Only the coupled unknowns are factored
+    or iterated on. Substitution alone solves a system that is triangular after a permutation, such as a chain or upwind
+    differences, in one pass over its entries.
+    Memory: the matrix of the coarsest level of "multigrid" is dense. If that level has more than 2000 unknowns, the
+    set-up raises ConvergenceError.
+    Threads: several threads may call the same inverse at once, and obtain the same results bit for bit. `inv.info`
+    describes the solve that ended last.
     Complex numbers: see docs/guides/complex_numbers.md.
 
     Examples
@@ -158,16 +167,16 @@ def build(
     op : Operator
     settings : SolveSettings
     name : str, optional
-        Of the inverse in messages and counts.
+        Name of the inverse in error messages and counters. Default: "inverse(...)" around the name of `op`.
     log : SolveLog, optional
-        Where its solves are recorded.
+        Log in which the solves are recorded. Default: a new one.
     solves : "many" or "few"
-        How many solves the caller expects of this set-up.
+        How many solves the caller expects to do with this set-up.
     near : Engine, optional
-        The engine of a matrix close to this one, whose LU factors may serve as a preconditioner.
+        The solver of a similar matrix; its LU factors may be used as a preconditioner.
     all_rows : bool
-        Refuse an operator with a row whose own unknown no row uses. False if the caller tests the residual of such
-        rows, or leaves them out on purpose.
+        Whether to raise ConvergenceError if an unknown appears in no row although the row with its number has entries.
+        False if the caller tests the residual of such rows, or ignores them on purpose.
     """
     start_time = perf_counter()
     choose = op.backend.implementation(system_and_choice)
@@ -185,11 +194,11 @@ def build(
 
 
 def system_and_choice(op: Operator, settings: SolveSettings, solves: str) -> tuple[System, Choice]:
-    """Return the System of an operator, and the method that solves it: see `build`."""
+    """Return the System of an operator, and the Choice of its method; the parameters are those of `build`."""
     method = settings.method
     system = System(op, settings.rtol, settings.maxiter)
     if method in ("krylov", "separable"):
-        system.splitting = None  # these solve for all unknowns, without looking at the entries
+        system.splitting = None  # these methods solve for all unknowns and do not use the matrix entries
     if method == "auto":
         choice = choose_method(system, solves)
     else:
@@ -211,7 +220,7 @@ def build_dense(op: Operator, rtol: float, nullspace: str, name: str) -> Solver 
 
 
 def _record_set_up(solver: Solver, start_time: float) -> None:
-    """Record the time and the size of a set-up, and count it."""
+    """Record the duration and the description of a set-up in the log, and increment the counters."""
     log = solver.log
     log.setup_seconds = perf_counter() - start_time
     log.hierarchy = solver.engine.hierarchy
@@ -224,17 +233,17 @@ def _record_set_up(solver: Solver, start_time: float) -> None:
 
 
 class Solution(Structure):
-    """The solve as a linear map on flat arrays. Transposes and tangents share the set-up and the log.
+    """The solve as a linear map on flat arrays. Its transpose and its tangent map share the set-up and the log.
 
     Parameters
     ----------
     solver : Solver
     transposed : bool
     checked : bool
-        Whether it is applied to primal data, which must be in the range of a singular operator. Data of transposes and
-        tangents are projected onto it, so that derivatives of every order are never refused.
+        Whether a right-hand side outside the range of a singular operator raises IncompatibleError. If False, it is
+        projected onto the range. Transposes and tangent maps always project, so that derivatives of every order exist.
     start : array, shape (n,), optional
-        First guess; transposes and tangents have none.
+        Initial guess; transposes and tangent maps have none.
     """
 
     has_entries = False
@@ -252,9 +261,10 @@ class Solution(Structure):
         self.depth = system.op.structure.depth + FRAMES
 
     def product(self, x: np.ndarray) -> np.ndarray:
-        """Return A^-1 x as a fresh array: solved in double precision, and rounded once to the precision of x.
+        """Return A^-1 x as a new array.
 
-        Real and imaginary part of complex data are solved for one after the other if the operator is real.
+        The solve uses double precision; only the solution is rounded to the precision of x. If the operator is real and
+        x is complex, two solves are done: one for the real part and one for the imaginary part.
         """
         if x.dtype == self.dtype and self.start is None:
             return self.solver.solve(x, self.transposed, self.checked)
@@ -289,7 +299,7 @@ class Solution(Structure):
             half = Solution(self.solver, self.transposed, self.checked, start).product(getattr(x, part).copy())
             getattr(solution, part)[...] = half
             records.append(log.last(self.transposed))
-        if records[0] is not last:  # an observed solve may leave no record
+        if records[0] is not last:  # a solve that a hook handles may leave no record
             log.note(merged(*records), self.transposed)
         return solution
 
@@ -298,7 +308,7 @@ class Solution(Structure):
         return Solution(self.solver, not self.transposed, checked=False)
 
     def tangent(self) -> Solution:
-        """Return the same map without a first guess and without refusals of data."""
+        """Return the same map without an initial guess; it projects its data and never raises IncompatibleError."""
         if self.checked or self.start is not None:
             return Solution(self.solver, self.transposed, checked=False)
         return self
@@ -311,7 +321,8 @@ class Solution(Structure):
 class Inverse(Operator):
     """The inverse of an Operator, as an Operator: ``inv(b)`` solves, ``inv.T(g)`` solves the transposed system.
 
-    `inverse` sets it up. For singular operators it is the generalised inverse that nullspace.py defines.
+    Instances are created by `inverse`. The inverse of a singular operator is the generalised inverse that is defined in
+    nullspace.py.
 
     Parameters
     ----------
@@ -334,42 +345,42 @@ class Inverse(Operator):
         return Inverse(structure)
 
     def recipe(self) -> tuple[Callable, tuple]:
-        """Return the class and the arguments that build it again."""
+        """Return the class and the arguments that reconstruct this object."""
         return Inverse, (self.structure,)
 
     @property
     def info(self) -> SolveLog:
         """Records of the last solves, shared with the transpose: .forward, .adjoint, .setup_seconds, .hierarchy.
 
-        Complex data are two solves for a real operator, with one record: the sum of their iterations and seconds, and
-        the worse of the other figures.
+        A real operator solves for complex data by two solves, which have one record: `iterations` and `seconds` are
+        sums, and each of the other values is the worse one of the two solves.
         """
         return self.solver.log
 
     @property
     def reason(self) -> str:
-        """Why this method was chosen."""
+        """The reason for which this method was chosen, as text."""
         return self.solver.reason
 
     @property
     def method(self) -> str:
-        """The method in use."""
+        """The name of the method in use."""
         return self.solver.engine.method
 
     # ------------------------------------------------------------ application
 
     @public("dp.inverse(op)")
     def __call__(self, b: Any, start: Any = None) -> Any:
-        """Solve for a field b, or a batch of them; differentiable in b.
+        """Solve op(x) = b for a field b or a batch of fields; the result is differentiable in b.
 
         Parameters
         ----------
         b : array, shape (..., *`domain.shape`)
             Leading axes are a batch.
         start : array, shape `codomain.shape`, optional
-            First guess, which saves iterations of iterative methods. Derivatives do not depend on it, and the
-            derivative in it is 0; with the option diff="unrolled" of krylov the iterations themselves are
-            differentiated, in b and in `start`.
+            Initial guess for one field b, not for a batch. A good guess saves iterations of iterative methods. The
+            derivative with respect to `start` is 0. Exception: with method="krylov" and diff="unrolled" the iterations
+            are differentiated with respect to b and `start`.
 
         Returns
         -------
@@ -382,7 +393,7 @@ class Inverse(Operator):
         return self.apply(b)
 
     def apply(self, u: Any, out: np.ndarray | None = None) -> Any:
-        """Solve for plain data, without the tape: see `Operator.apply`."""
+        """Solve for data that are not traced, without recording; see `Operator.apply`."""
         if (
             type(u) is np.ndarray
             and u.shape == self.domain.shape
@@ -390,22 +401,22 @@ class Inverse(Operator):
             and u.flags.c_contiguous
             and out is None
             and self.backend.whole_fields
-        ):  # one field as the solver takes it: its solution is returned without a copy
+        ):  # the solver can use one such field directly, without a conversion or a copy of the solution
             return self.structure.product(u.reshape(-1)).reshape(self.codomain.shape)
         return super().apply(u, out)
 
     def _solve_from(self, b: Any, start: Any) -> Any:
-        """Solve from a first guess, or by iterations that are differentiated."""
+        """Solve from an initial guess, or by iterations that autograd records."""
         if start is not None:
             check_native(self.name, start)
             check_finite(f"the start of {self.name}", plain(start))
             check_on(f"{self.name}, as start,", start, self.codomain)
         structure = self.structure
         if self.solver.engine.unrolled:
-            if np.ndim(b) > len(self.domain.shape):  # a batch: the iterations of each solve are recorded
+            if np.ndim(b) > len(self.domain.shape):  # a batch: solve for one field after the other
                 return anp.array([self(field, start) for field in b])
             return self.solver.unroll(b, start, structure.transposed)
-        field_array(self, plain(b))  # a start is for one field
+        field_array(self, plain(b))  # raises ShapeError for a batch: a start belongs to one field
         start = np.asarray(plain(start)).reshape(-1)
         return Inverse(Solution(self.solver, structure.transposed, structure.checked, start))(b)
 
@@ -415,7 +426,7 @@ class Inverse(Operator):
         return f"<{self.name}: {self.domain} -> {self.codomain}, {self.method}>"
 
     def _facts(self) -> dict[str, str]:
-        """Return a description of the set-up."""
+        """Return the labels and values that describe the set-up."""
         system = self.solver.system
         singular = system.null_space.count
         by_substitution = ""

@@ -1,4 +1,4 @@
-"""Records of solves: what `inv.info` holds, and what errors of solves carry."""
+"""Records of solves: the content of `inv.info`, and of the attribute `info` of errors that solves raise."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 __all__ = ["STATUS_WORDS", "SolveInfo", "SolveLog", "failure", "merged"]
 
-STATUS_WORDS = (  # from good to bad: the record of two solves has the later of their words
+STATUS_WORDS = (  # from best to worst: the merged record of two solves has the worse status
     "exact_zero_rhs",
     "converged",
     "converged_at_roundoff",
@@ -45,8 +45,8 @@ class SolveInfo:
     backward_error : float
         |b - A x| / (|A| |x| + |b|).
     defect : float
-        Component of the right-hand side along the null space, relative to its norm; the largest of all singular
-        components of the operator.
+        Component of the right-hand side outside the range, relative to its norm: |l.b| / (|l| |b|) with the left null
+        vector l. It is the largest value over all singular components of the operator.
     seconds : float
     """
 
@@ -64,7 +64,7 @@ class SolveInfo:
 
 @dataclass(slots=True)
 class SolveLog:
-    """The last forward and the last adjoint solve of an inverse, in any thread, and its set-up.
+    """Records of the last forward and the last adjoint solve of an inverse, by any thread, and of its set-up.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class SolveLog:
         None before the first solve.
     setup_seconds : float
     hierarchy : str
-        Size of the set-up: levels, unknowns, entries.
+        Description of the set-up: levels, unknowns, matrix entries.
     """
 
     forward: SolveInfo | None = None
@@ -108,7 +108,7 @@ def failure(status: str) -> SolveInfo:
 
 
 def merged(one: SolveInfo, other: SolveInfo) -> SolveInfo:
-    """Return one record of two solves: sums of iterations and seconds, and the worse of the other figures."""
+    """Return one record for two solves: iterations and seconds are added, of other values the worse is taken."""
     return SolveInfo(
         max(one.status, other.status, key=STATUS_WORDS.index),
         one.iterations + other.iterations,

@@ -59,38 +59,39 @@ def implicit(
     nullspace: str = "raise",
     **options: Any,
 ) -> Root:
-    """Return the function root(guess, *params) that solves residual(x, *params) = 0, differentiable in the parameters.
+    """Return a function root(guess, *params) that solves residual(x, *params) = 0; it is differentiable in `params`.
 
     Parameters
     ----------
     residual : callable
-        ``residual(x, *params)`` returns as many real numbers as x has. It is written with autograd.numpy, Operators
-        and other differentiable functions, and uses only its arguments and constants. The backward pass calls it
-        again, so arrays that are not arguments must not change until then.
+        ``residual(x, *params)`` returns as many real numbers as x has. It must be written with autograd.numpy,
+        Operators and other differentiable functions. Apart from its arguments it may use constants only: the backward
+        pass calls it again, so these constants must not change until then.
     jacobian : callable, optional
         ``jacobian(x, *params)`` returns the derivative of the residual in x as a sparse matrix, 2-D array or
-        Operator, rows and columns in the order of the flat x. Default: from derivatives of the residual.
+        Operator, rows and columns in the order of the flat x. Default: computed from derivatives of
+        the residual.
     method : str
-        How Newton steps are solved. "auto": the Jacobian is assembled where it is sparse or small, and the method is
-        chosen as by `inverse`. "krylov": by products with the Jacobian only. Others as in `inverse`.
+        Method of the linear solves. "auto": the Jacobian is assembled if it is sparse or small, and `inverse` chooses
+        the method. "krylov": only products with the Jacobian are computed. The other methods are those of `inverse`.
     rtol : float
         Relative tolerance of the nonlinear residual, and of each adjoint solve.
     maxiter : int
         Largest number of Newton steps and pseudo-time steps together.
     sparsity : sparse matrix or 2-D array, optional
-        Where the Jacobian may have entries. Default: found by probing.
+        A matrix whose nonzero entries show where the Jacobian may be nonzero. Default: found by probing.
     nullspace : "raise" or "project"
-        Where the Jacobian is singular at the root: refuse a derivative, or return the one without a component
-        along the null space.
+        What to do if a derivative is requested and the Jacobian is singular at the root: raise ConvergenceError, or
+        return the derivative without its component along the null space.
     **options
         Options of the method, as in `inverse`.
 
     Returns
     -------
     Root
-        Call it as ``root(guess, *params)``: the guess is a number, an array, or a tree of arrays, the params are any
-        trees of arrays, and the result x has the shapes and dtypes of the guess. The derivative in the guess is 0.
-        `root.info` holds the records.
+        Call it as ``root(guess, *params)``. The guess is a number, an array or a pytree of arrays; each parameter is a
+        pytree of arrays. The result x has the shapes and dtypes of the guess. The derivative with respect to the guess
+        is 0. `root.info` holds the records of the last solves.
 
     Raises
     ------
@@ -120,17 +121,19 @@ def implicit(
     parameters. Derivatives of every order exist.
 
     **Tolerance.** See newton.py. The residual may be scaled by any power of two, and each field of a tree meets the
-    tolerance by itself. Where Newton steps stall, the solve restarts from the guess with pseudo-time steps (not in
-    `stepper`). A trial point is rejected if the residual there is not finite, or raises UnstableStepError,
+    tolerance by itself. If Newton steps stall, the solve starts again from the guess with pseudo-time steps (except in
+    `stepper`). The line search rejects a trial point at which the residual is not finite or raises UnstableStepError,
     NonFiniteError or ConvergenceError.
 
-    **Cost.** For each Jacobian one product per colour (3 for three points in 1-D, 5 in 2-D, 7 in 3-D) and one set-up.
-    A Jacobian serves one Newton step, or several while they contract (with more than 64 unknowns, and in `stepper`);
-    each adjoint solve has its own. Products with J^T share one tape. The first call also searches the pattern. J is
-    set up on the grid of the Operators in the residual where it is symmetric there; up to 64 unknowns by dense LU.
+    **Cost.** Each Jacobian costs one Jacobian-vector product per colour, and one set-up of the linear solver. For a
+    nearest-neighbour stencil there are 3 colours in 1-D, 5 in 2-D and 7 in 3-D. A Jacobian is used for one Newton step.
+    With more than 64 unknowns, and in `stepper`, it is used for several steps while these converge fast. Each adjoint
+    solve uses the Jacobian at the root, and all products with its transpose share one recording. The first call also
+    searches the sparsity pattern. Jacobians of up to 64 unknowns are solved by dense LU. For a larger Jacobian, the
+    linear solver uses the grid of the Operators in the residual if the Jacobian is symmetric on that grid.
 
-    **Ranks.** Fields may be distributed (`distribute`) if the residual has local coupling; then without pseudo-time
-    and without `sparsity`.
+    **Ranks.** Fields may be distributed (see `distribute`) if the residual has local coupling. Pseudo-time steps and
+    `sparsity` are then not available.
 
     Examples
     --------
@@ -150,34 +153,36 @@ def implicit(
 
 
 def steady(residual: Callable[..., Any], guess: Any, *params: Any, **options: Any) -> Any:
-    """Find a steady state, x with residual(x, *params) = 0, without a loop over time.
+    """Find a steady state x, for which residual(x, *params) = 0, without time integration.
 
-    This is ``implicit(residual, **options)(guess, *params)``. For many solves, as in a descent, call
-    ``root = implicit(residual)`` once: it keeps the sparsity pattern of the Jacobian, and the records.
+    This is ``implicit(residual, **options)(guess, *params)``. For many solves, as in an optimisation, call
+    ``root = implicit(residual)`` once, because `root` stores the sparsity pattern of the Jacobian.
 
     Parameters
     ----------
     residual : callable
-        ``residual(x, *params)`` returns the rate of change of each field, or any equation for it, as a tree like x;
-        entries of dicts are paired by name.
+        ``residual(x, *params)`` returns a pytree with the structure of x. For each field it holds the rate of change,
+        or the residual of any other equation for this field. Entries of dicts are matched by name.
     guess : number, array, or tree of arrays
-        The state at rest, or the solution for nearby parameters: ``{"v": faces, "p": cells}`` of a flow.
+        Initial guess, such as the state at rest or the solution for nearby parameters. For a flow it may be
+        ``{"v": faces, "p": cells}``.
     *params : trees of arrays
     **options
-        Of `implicit`: method, rtol, maxiter, jacobian, sparsity, nullspace.
+        Options of `implicit`: method, rtol, maxiter, jacobian, sparsity, nullspace.
 
     Returns
     -------
     x, like the guess
-        Differentiable in the parameters; the derivative in the guess is 0. The state may be unstable: that is not
-        tested.
+        The steady state. It is differentiable in the parameters; the derivative with respect to the guess is 0. Its
+        stability is not tested.
 
     Raises
     ------
     TypeError, ValueError, ShapeError, DerivativeError
         As `implicit`.
     ConvergenceError
-        If Newton's method and pseudo-time fail, or the Jacobian is singular: at a fold, or where a constant is free.
+        If Newton's method and pseudo-time steps fail. Also if the Jacobian is singular, as at a fold, or if a field is
+        determined only up to a constant.
     NonFiniteError
         If the guess, a parameter or the residual at the guess holds NaN or infinity.
 
@@ -187,18 +192,19 @@ def steady(residual: Callable[..., Any], guess: Any, *params: Any, **options: An
 
     Notes
     -----
-    Newton's method with a line search; where it stalls, pseudo-time steps from the guess (see newton.py), then
-    Newton's method again. Each field of a tree meets the tolerance by itself.
+    Newton's method with a line search. If it stalls, pseudo-time steps start again from the guess (see newton.py), and
+    Newton's method continues from their result. Each field of a pytree meets the tolerance by itself.
 
-    A field that is determined up to a constant needs one value in its equation: ``"p": D(v) + pin * p`` with ``pin``
-    1 in one cell and 0 elsewhere, which keeps D(v) = 0 in all cells. Faces in walls need an equation:
-    ``inside(rate) + v - inside(v)``. Differences of states from a near guess (`check.gradient`) resolve the
-    tolerance: write rtol=1e-13.
+    If a field is determined only up to a constant, its equation must fix one value: for a pressure p write
+    ``"p": D(v) + pin * p`` with ``pin`` 1 in one cell and 0 elsewhere. D(v) = 0 then still holds in all cells.
+    Velocities on faces in walls need an equation too: ``inside(rate) + v - inside(v)``. Finite differences of steady
+    states, as in `check.gradient`, contain the error of the solves: write rtol=1e-13.
 
-    **Cost.** Sparse LU of the Jacobian. From 10 000 unknowns on, one LU serves several steps, as the preconditioner
-    of GMRES for the next Jacobians. A gradient takes one more LU, which is kept for further gradients.
+    **Cost.** Sparse LU of the Jacobian. From 10 000 unknowns on, one factorisation is used for several Newton steps: it
+    is the preconditioner of GMRES for the next Jacobians. A gradient takes one more factorisation, which is stored for
+    further gradients at the same root.
 
-    **Ranks.** As for `implicit`: no pseudo-time, no `sparsity`.
+    **Ranks.** As for `implicit`: pseudo-time steps and `sparsity` are not available for distributed fields.
 
     References
     ----------
@@ -227,7 +233,7 @@ class Root(Reconstructible):
     residual, jacobian, sparsity, maxiter
         As in `implicit`.
     settings : SolveSettings
-        Of the linear solves.
+        Settings of the linear solves.
 
     Attributes
     ----------
@@ -262,7 +268,7 @@ class Root(Reconstructible):
 
     @contextmanager
     def series(self) -> Iterator[None]:
-        """Let each solve inside start with the Jacobian of the previous one: the context of a time integration."""
+        """Return a context in which each solve starts with the Jacobian of the previous one, as in a time loop."""
         self._series[get_ident()] = {}
         try:
             yield
@@ -301,7 +307,7 @@ class Root(Reconstructible):
         return x
 
     def _jacobians_of(self, equation: Equation) -> Jacobians:
-        """Return the source of the Jacobians for unknowns that are stored by the backend of these."""
+        """Return the Jacobians object for the backend that stores the unknowns of this equation."""
         backend = equation.unknowns.backend
         jacobians = self._jacobians.get(backend)
         if jacobians is None:
@@ -314,7 +320,7 @@ class Root(Reconstructible):
     def newton_correction(
         self, equation: Equation, x: Any, leaves: Sequence[Any], forcing: float, residual: Any = 0.0
     ) -> Any:
-        """Take one Newton step from x towards F(x) = residual, solved for to the relative residual `forcing`."""
+        """Return x after one Newton step towards F(x) = residual; the linear solve has the tolerance `forcing`."""
         F = equation.value(x, leaves) - residual
         if not np.any(F):
             return x
@@ -357,7 +363,7 @@ class Root(Reconstructible):
 
     @staticmethod
     def _residual_of_leaves(nums, x, equation, leaves):
-        """Return the residual at x as a function of the leaves with these argument numbers, and these leaves."""
+        """Return the residual at x as a function of the leaves with argument numbers `nums`, and their values."""
 
         def residual(*values):
             return equation(x, *values)
@@ -365,11 +371,12 @@ class Root(Reconstructible):
         return vary(residual, leaves, [num - 2 for num in nums])
 
     def _check_root(self, equation, x, g, y, F, leaves):
-        """Refuse a derivative where x is no longer a root, because something that the residual uses has changed.
+        """Raise DerivativeError if x is no longer a root, because something that the residual uses has changed.
 
-        To first order the change of the root along g is y.F; one more Newton step then confirms it.
+        To first order, the root has moved by y.F in the direction of g. If this estimate is too large, one more Newton
+        step is computed to confirm it.
         """
-        if equation.root_residual is None:  # x was not found by this solver
+        if equation.root_residual is None:  # not set, because x was not computed by newton_solve
             return
         if length(F) <= SAME_RESIDUAL * equation.root_residual:
             return

@@ -1,16 +1,17 @@
-"""The solve contract: the one path of every linear solve, forward and adjoint.
+"""The solve contract: every linear solve, forward or adjoint, runs through `Solver` and follows these rules.
 
-1. Scale. Data near an end of the range of floats are scaled by a power of two, and the solution is scaled back. In
-   between, scaling would change no bit, because every method is homogeneous.
-2. Tolerance. The true residual r = b - A x is computed from the solution: a solve has converged if |r| <= rtol |b|, or
-   if |r| <= 8 eps (|A| |x| + |b|), the attainable accuracy (converged_at_roundoff). There is no absolute tolerance.
-   Callers with a looser tolerance (a Newton step, a correction) use `Solver.approximate`.
-3. Transpose. inv.T solves with the transpose of the same set-up.
-4. Derivatives. A derivative rule calls one adjoint solve.
-5. Null space. Data and solution are projected on both sides of a singular system (see nullspace.py). Primal data
-   outside the range are refused unless nullspace="project"; derivatives are never refused.
-6. Failure. A solve that does not meet its tolerance raises an error with its best iterate.
-7. Record. `inv.info` holds the figures of the last forward and the last adjoint solve.
+1. Scaling. If the norm of b is so large or so small that its square could overflow or underflow, b is multiplied by a
+   power of two, and the solution is scaled back. Other b need no scaling, because every method is homogeneous: a power
+   of two would not change a bit of the result.
+2. Tolerance. The residual r = b - A x is computed from the solution. A solve has converged if |r| <= rtol |b|, or if
+   |r| <= 8 eps (|A| |x| + |b|), the attainable accuracy (status "converged_at_roundoff"). There is no absolute
+   tolerance. Callers with a looser tolerance (a Newton step, a correction) use `Solver.approximate`.
+3. Transpose. inv.T uses the same set-up: the transposes of the same factors or of the same cycle.
+4. Derivatives. A VJP of a solve is one adjoint solve.
+5. Null space. If the system is singular, b and x are projected (see nullspace.py). A right-hand side of the user that
+   is not in the range raises IncompatibleError unless nullspace="project". Solves for derivatives always project.
+6. Failure. A solve that does not meet its tolerance raises ConvergenceError, which holds the best iterate.
+7. Record. `inv.info` holds the records of the last forward and of the last adjoint solve.
 """
 
 from __future__ import annotations
@@ -39,24 +40,24 @@ if TYPE_CHECKING:
 
 __all__ = ["Run", "Solver"]
 
-COMPATIBLE = 1e-6  # largest relative defect of primal data that counts as rounding
-MOST_OF_DATA = 0.7  # a projection that leaves less than this share of the data is applied twice
-LARGEST_AT_ROUNDOFF = 0.1  # share of the data beyond which a residual is not accepted, however large x is
+COMPATIBLE = 1e-6  # a right-hand side with a relative defect up to this is accepted as being in the range
+MOST_OF_DATA = 0.7  # the projection is repeated if it reduces |b| below this fraction: cancellation
+LARGEST_AT_ROUNDOFF = 0.1  # a residual above this fraction of |b| is not accepted, however large x is
 ADVICE = {"indefinite_operator": "; write method='direct'"}
 
 
 @dataclass(slots=True)
 class Run:
-    """The figures of a solve in progress, and the request.
+    """A solve in progress: its parameters, and the values for its record.
 
     Attributes
     ----------
     transposed : bool
     checked : bool
-        Whether b are primal data, which must be in the range of a singular operator.
+        Whether a right-hand side outside the range of a singular operator is an error.
     rtol : float
     exponent : int or int array
-        The solution is the one that the engine computes times 2 to this power.
+        The solution of the scaled system times 2^exponent is the solution of the original system.
     status, iterations, residual, backward_error, defect
         See SolveInfo.
     start_time : float
@@ -74,20 +75,20 @@ class Run:
     start_time: float = field(default_factory=perf_counter)
 
     def assess(self, residual: float, goal: float, data: float, terms: float, largest: float = np.inf) -> str:
-        """Note the figures of a solution, and return the status of its residual.
+        """Store the relative residual and the backward error of a solution, and return its status.
 
         Parameters
         ----------
         residual : float
             Norm of the residual.
         goal : float
-            A residual up to it is accepted.
+            A residual is accepted if its norm is at most this value.
         data : float
             Norm of the right-hand side.
         terms : float
             Sum of the norms of all terms of the residual.
         largest : float
-            A residual beyond it is not accepted at roundoff.
+            A residual above this value is not accepted as "converged_at_roundoff".
 
         Returns
         -------
@@ -117,19 +118,21 @@ class Run:
 
 
 class Solver(Reconstructible):
-    """A system and an engine that is set up for it: solves to a tolerance, with the matrix and with its transpose.
+    """Solve linear systems with one matrix, or with its transpose, to a tolerance.
 
     Parameters
     ----------
     system : System
+        The matrix and its properties.
     engine : Engine
+        The solver that is set up for this matrix.
     nullspace : "raise" or "project"
     log : SolveLog
     name : str
     made : (function, arguments)
-        The call that sets up the same inverse again: factors and hierarchies are not pickled.
+        A call that sets up the same inverse again. A pickle holds this call, and no factors or hierarchies.
     reason : str
-        Why this method, in words.
+        Why this method was chosen.
     """
 
     def __init__(
@@ -149,7 +152,7 @@ class Solver(Reconstructible):
         self.name = name
         self.made = (_remade, made)
         self.reason = reason
-        self.reused = not thread.calls  # whether the next solve reuses the set-up, as far as open recordings know
+        self.reused = not thread.calls  # for the counters: whether the next solve reuses the set-up
 
     # ------------------------------------------------------------ solves
 
@@ -162,7 +165,7 @@ class Solver(Reconstructible):
         rtol: float | None = None,
         observed: bool = True,
     ) -> np.ndarray:
-        """Solve A x = b, or A^T x = b: observers, counts and records of every solve are here.
+        """Solve A x = b, or A^T x = b. This method calls the solve hook, updates the counters, and records the solve.
 
         Parameters
         ----------
@@ -170,18 +173,18 @@ class Solver(Reconstructible):
             float64, or complex128 if the operator is complex.
         transposed : bool
         checked : bool
-            Whether b are primal data, which must be in the range of a singular operator.
+            Whether b must be in the range of a singular operator. It need not be if `transposed`.
         start : array, shape (n,), optional
-            First guess.
+            Initial guess.
         rtol : float, optional
-            Tolerance of this solve alone, which is then not recorded in the log.
+            Tolerance of this solve, in place of that of the system. If given, the solve is not recorded in the log.
         observed : bool
-            False if the caller is the observer of solves.
+            Whether to call the solve hook, if there is one. A hook that calls this method sets it to False.
 
         Returns
         -------
         array, shape (n,)
-            Fresh.
+            A new array.
 
         Raises
         ------
@@ -208,7 +211,7 @@ class Solver(Reconstructible):
                 count(self.name, "skipped", run.status == "exact_zero_rhs")
 
     def approximate(self, b: np.ndarray, rtol: float, transposed: bool = False) -> np.ndarray:
-        """Solve to the relative residual `rtol` if that can be reached; the caller tests the result."""
+        """Solve to the relative residual `rtol`; if that fails, return the best iterate, which the caller must test."""
         try:
             return self.solve(b, transposed, checked=False, rtol=rtol, observed=False)
         except ConvergenceError as error:
@@ -217,10 +220,10 @@ class Solver(Reconstructible):
             return self.system.flat(error.best)
 
     def _solve(self, b: np.ndarray, run: Run, start: np.ndarray | None) -> np.ndarray:
-        """Rescale, project, solve and refine, accept or raise, scale back."""
+        """Do one solve: scale, project, solve and refine, test the residual, and scale back."""
         system = self.system
 
-        # Rescale: the norms of data and solution stay in the middle of the range of floats.
+        # Scale b, so that its norm is far from overflow and underflow.
         size = system.size_of(b)
         exponent = 0
         if not SMALL < size < LARGE:
@@ -233,10 +236,10 @@ class Solver(Reconstructible):
         run.exponent = exponent
         if start is not None:
             start = shifted(start, -exponent)
-            if not in_range(system.size_of(start)):  # 0, or as far from the solution as 0 is
+            if not in_range(system.size_of(start)):  # of no use as an initial guess for the scaled data
                 start = None
 
-        # Project: the data are in the range of the operator.
+        # Project b onto the range of the operator.
         data = size
         if system.active is not None or system.null_space.count:
             b, data = self._projected(b, size, run)
@@ -244,8 +247,8 @@ class Solver(Reconstructible):
             run.status = "converged_at_roundoff" if data else "exact_zero_rhs"
             return np.zeros_like(b)
 
-        # A tolerance relative to all data would leave no digits to a region with small data. They are scaled up; the
-        # tolerance stays relative to the norm of the unscaled data.
+        # In a component whose data are much smaller than those of others, a solution with no correct digit could meet
+        # the tolerance. Therefore its data are scaled up. The tolerance stays relative to the norm of the unscaled b.
         lift = None
         if self.engine.iterative:
             lift = system.lift(b, data)
@@ -256,7 +259,7 @@ class Solver(Reconstructible):
             if start is not None:
                 start = shifted(start, lift)
 
-        # Solve and refine. Accept or raise.
+        # Solve and refine. Raise an error if the residual is not accepted.
         x = self._refined(b, data, run, start)
         if self.engine.refines and run.status not in ("converged", "converged_at_roundoff"):
             raise self._not_converged(run, x, why=f" ({run.status}){ADVICE.get(run.status, self.engine.advice)}")
@@ -272,9 +275,9 @@ class Solver(Reconstructible):
         return x
 
     def _refined(self, b: np.ndarray, data: float, run: Run, start: np.ndarray | None) -> np.ndarray:
-        """Call the engine on the residual until the true residual is accepted or stops decreasing.
+        """Solve with iterative refinement until the residual is accepted or stops decreasing.
 
-        `data` is the norm of the data. The status is written into `run`.
+        `data` is the norm of b before small components were scaled up. The status is written into `run`.
         """
         system = self.system
         engine = self.engine
@@ -294,7 +297,7 @@ class Solver(Reconstructible):
                 r, residual = system.null_space.projected(r, transposed)
             status = run.assess(residual, goal, data, size_of_matrix * length + data, LARGEST_AT_ROUNDOFF * data)
         rounds = engine.most_refinements
-        if status:  # the first guess is a solution
+        if status:  # the initial guess is a solution
             rounds = 0
         for _ in range(rounds):
             # A correction need not be more accurate than the rounding errors of the whole solution.
@@ -318,7 +321,7 @@ class Solver(Reconstructible):
                 status = run.assess(residual, goal, data, size_of_matrix * length + data, LARGEST_AT_ROUNDOFF * data)
             if trouble or not reduced or not engine.refines or status == "converged":
                 break
-            # The accuracy that is attainable by the norm of A is not the limit where rows differ in size.
+            # If rows differ in size, more accuracy is attainable than the bound with |A| tells: refine further.
             if status and x is not None and residual <= 2 * system.rounding(x, data, transposed):
                 break
         if x is None:
@@ -398,7 +401,7 @@ class Solver(Reconstructible):
     # ------------------------------------------------------------ scale and range of the data
 
     def _exponent(self, b: np.ndarray, run: Run) -> int:
-        """Return the exponent by which b is scaled; refuse data that are not finite."""
+        """Return the exponent by which b is scaled; raise NonFiniteError if b is not finite."""
         system = self.system
         largest = system.largest(b)
         if not np.isfinite(largest):
@@ -411,7 +414,10 @@ class Solver(Reconstructible):
         return exponent_of(largest)
 
     def _projected(self, b: np.ndarray, size: float, run: Run) -> tuple[np.ndarray, float]:
-        """Return the part of b in the range of the operator, and its norm; refuse primal data outside of it."""
+        """Return the projection of b onto the range, and its norm.
+
+        Raise IncompatibleError if b is not in the range, `run.checked` is True and nullspace="raise".
+        """
         system = self.system
         space = system.null_space
         refuses = run.checked and self.nullspace == "raise"
@@ -427,12 +433,12 @@ class Solver(Reconstructible):
                 self._refuse_defect(run, defect, component)
             unprojected = data
             b, data = space.projected(b, run.transposed, sums=sums)
-            if data < MOST_OF_DATA * unprojected:  # the remainder is small: project it to its own rounding
+            if data < MOST_OF_DATA * unprojected:  # cancellation left rounding errors along the null space
                 b, data = space.projected(b, run.transposed, into=b)
         return b, data
 
     def _on_unknowns(self, b: np.ndarray, size: float, run: Run, refuses: bool) -> np.ndarray:
-        """Return b with zeros where there is no unknown; refuse primal data that are not 0 there."""
+        """Return b with zeros where there is no unknown; raise if `refuses` is set and b was not 0 there."""
         system = self.system
         active: Any = system.active
         outside = np.where(active, 0.0, b)
@@ -448,7 +454,7 @@ class Solver(Reconstructible):
         return np.where(active, b, 0.0)
 
     def _refuse_defect(self, run: Run, defect: float, component: int) -> None:
-        """Raise for data with a component along a null vector."""
+        """Raise IncompatibleError for a b that is not orthogonal to a left null vector."""
         space = self.system.null_space
         cells = space.cells(component)
         share = number_beside(defect, COMPATIBLE, digits=1, style="e")
@@ -460,16 +466,16 @@ class Solver(Reconstructible):
         )
 
     def _cell(self, number: int) -> str:
-        """Return the indices of an entry of the right-hand side."""
+        """Return the grid indices of the entry with this number in the flat right-hand side, as text."""
         return place(int(number), self.system.op.codomain.shape)
 
     def _refuse_data(self, run: Run, reason: str) -> None:
-        """Raise for data outside the range."""
+        """Raise IncompatibleError for a right-hand side outside the range."""
         run.status = "incompatible_rhs"
         raise IncompatibleError(f"{self.name}{reason} or write nullspace='project'", info=run.info())
 
     def _not_converged(self, run: Run, x: np.ndarray, how: str = "", why: str = "") -> ConvergenceError:
-        """Return the error of a solve whose solution x does not meet the tolerance."""
+        """Return the ConvergenceError of a solve whose best iterate is x."""
         op = self.system.operator(run.transposed)
         reached = number_beside(run.residual, run.rtol, digits=1, style="e")
         return ConvergenceError(
@@ -481,5 +487,5 @@ class Solver(Reconstructible):
 
 
 def _remade(build: Callable, arguments: tuple) -> Solver:
-    """Set up a Solver again from its recipe."""
+    """Reconstruct a Solver by the call that sets up its inverse."""
     return build(*arguments).solver

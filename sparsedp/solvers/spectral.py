@@ -1,4 +1,4 @@
-"""Functions of a separable operator as operators: exponentials, powers, and any function of its eigenvalues."""
+"""Matrix functions of a separable operator: exponentials, powers, and any function of its eigenvalues."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ __all__ = ["matrix_exponential", "matrix_function", "matrix_power"]
 
 
 def matrix_exponential(op: Operator, time: float = 1.0) -> Operator:
-    """Return the operator exp(time * op), such as exact diffusion over any time.
+    """Return the operator exp(time * op), for example exact diffusion over a given time.
 
     Parameters
     ----------
     op : Operator
         A Kronecker sum from a space to itself (``op.separable``), such as a laplacian; or a function of one.
     time : float
-        Finite [1 / unit of the operator].
+        Time [1 / unit of the operator]; must be finite, may be negative.
 
     Returns
     -------
@@ -40,7 +40,7 @@ def matrix_exponential(op: Operator, time: float = 1.0) -> Operator:
     TypeError
         If `time` is not one real number.
     NonFiniteError
-        If `time` is not finite, or the exponential leaves the range of floats.
+        If `time` is not finite, or the exponential overflows.
 
     See Also
     --------
@@ -66,14 +66,14 @@ def matrix_exponential(op: Operator, time: float = 1.0) -> Operator:
 
 
 def matrix_power(op: Operator, exponent: float) -> Operator:
-    """Return the operator op^exponent, such as a square root or a smoothing power.
+    """Return the operator op^exponent, for example a square root.
 
     Parameters
     ----------
     op : Operator
         A Kronecker sum from a space to itself (``op.separable``); or a function of one.
     exponent : float
-        An integer, or any number if no eigenvalue is negative.
+        An integer. If no eigenvalue is negative, it may be any real number.
 
     Returns
     -------
@@ -87,7 +87,7 @@ def matrix_power(op: Operator, exponent: float) -> Operator:
     TypeError
         If `exponent` is not one real number.
     NonFiniteError
-        If `exponent` is not finite, or the power leaves the range of floats.
+        If `exponent` is not finite, or the power overflows.
 
     See Also
     --------
@@ -95,8 +95,8 @@ def matrix_power(op: Operator, exponent: float) -> Operator:
 
     Notes
     -----
-    A negative exponent gives 0 on the null space: the generalised inverse. No residual is computed; use `inverse` to
-    solve op x = b to a tolerance.
+    For a negative exponent, vectors in the null space are mapped to 0, as by a generalised inverse. No residual is
+    tested; use `inverse` to solve op(x) = b to a tolerance.
 
     Examples
     --------
@@ -120,28 +120,28 @@ def matrix_power(op: Operator, exponent: float) -> Operator:
 
 
 def matrix_function(op: Operator, f: Callable[[NDArray[Any]], ArrayLike]) -> Operator:
-    """Return the operator f(op), f applied to the eigenvalues, such as a polynomial in a Laplacian.
+    """Return the operator f(op), whose eigenvalues are f(e), for example a polynomial in a Laplacian.
 
     Parameters
     ----------
     op : Operator
         A Kronecker sum from a space to itself (``op.separable``); or a function of one.
     f : callable
-        ``f(e)`` takes an array of eigenvalues [unit of the operator] and returns a real number for each. It is
-        called once.
+        ``f(e)`` takes the array of all eigenvalues [unit of the operator] and returns an array of real numbers of the
+        same shape. It is called once.
 
     Returns
     -------
     Operator
-        Matrix-free: two transforms for each application. As `linear` of ``stepper("etdrk4", ...)`` it is integrated
-        exactly.
+        Matrix-free: two transforms for each application. ``stepper("etdrk4", ...)`` accepts it as its argument
+        `linear`, and integrates this part exactly.
 
     Raises
     ------
     ValueError
         If the operator is not separable or cannot be diagonalised.
     ShapeError
-        If the result of f has another shape.
+        If the result of f does not have the shape of the eigenvalues.
     TypeError
         If f is not a function, or its values are not real numbers.
     NonFiniteError
@@ -166,7 +166,7 @@ def matrix_function(op: Operator, f: Callable[[NDArray[Any]], ArrayLike]) -> Ope
     """
     check_function("matrix_function", f, "lambda e: -e**2 - e")
     basis = require_eigenbasis(op, "matrix_function")
-    with np.errstate(all="ignore"):  # NaN is refused below
+    with np.errstate(all="ignore"):  # check_finite in _function_of raises an error for NaN and infinity
         values = np.asarray(f(basis.eigenvalues.copy()))
     advice = "; give a number for each eigenvalue"
     check_shape("f(e) of matrix_function", values, basis.eigenvalues.shape, advice)
@@ -175,6 +175,6 @@ def matrix_function(op: Operator, f: Callable[[NDArray[Any]], ArrayLike]) -> Ope
 
 
 def _function_of(op, basis, values, name, advice):
-    """Return the Operator with these values for the eigenvalues; refuse values beyond the range of floats."""
+    """Return the Operator with the same eigenvectors and the eigenvalues `values`; raise if one is not finite."""
     check_finite(name, values, "must be finite at the eigenvalues", advice=advice)
     return Operator(SpectralFunction(Eigenbasis(basis.spectrum, values), op.shape), op.domain, op.codomain, name)
