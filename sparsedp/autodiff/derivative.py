@@ -140,7 +140,7 @@ def value_and_grad(loss: Callable, argnum: int = 0) -> Callable[..., tuple[Any, 
     callable
         ``f(*args) -> (value, gradient)``. The gradient has the tree structure of `x`, and each of its leaves has the
         shape and dtype of the leaf of `x`. Leaves that are not floating (int, bool, None, str) are passed to the loss
-        unchanged, and the gradient has None in their place.
+        unchanged, and the gradient has None at their positions.
 
     Raises
     ------
@@ -232,7 +232,7 @@ def vjp(fun: Callable, *x: Any) -> tuple[Any, Callable]:
         ``fun(*x) -> array``.
     *x : trees of arrays
         Arguments. Leaves that are not floating (int, None, str) are passed to `fun` unchanged, and the cotangent has
-        None in their place.
+        None at their positions.
 
     Returns
     -------
@@ -248,7 +248,7 @@ def vjp(fun: Callable, *x: Any) -> tuple[Any, Callable]:
     DerivativeError
         If no leaf of `x` is a floating array or number, or the value of `fun` is not one array.
     ShapeError
-        When `pull` is called, if the shape of `g` is not that of the value.
+        When `pull` is called, if `g` and the value have different shapes.
 
     Warns
     -----
@@ -310,7 +310,7 @@ def pullback(fun: Callable, x: Any) -> tuple[Any, Callable]:
     DerivativeError
         If no leaf of `x` is a floating array or number, or the value of `fun` is not one array.
     ShapeError
-        When `pull` is called, if the shape of `g` is not that of the value.
+        When `pull` is called, if `g` and the value have different shapes.
 
     Notes
     -----

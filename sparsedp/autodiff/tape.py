@@ -1005,7 +1005,7 @@ def fit(name: str, value: Any, cotangent: Any, g: Any) -> Any:
     Raises
     ------
     ShapeError
-        If the shape of the derivative is not that of the value.
+        If the derivative and the value have different shapes.
     DerivativeError
         If the derivative is complex and the value real, or if its dtype cannot be converted without loss.
     """

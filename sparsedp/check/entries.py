@@ -231,7 +231,7 @@ def gaps_along_entries(
 ) -> list[EntryGap]:
     """Find the entries with the largest gaps between gradient and finite difference.
 
-    The step of the differences is that of the direction with the largest gap.
+    The differences use the step of the direction with the largest gap.
 
     Returns
     -------

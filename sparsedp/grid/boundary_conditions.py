@@ -129,8 +129,8 @@ neumann = Condition(
 
     Operators use the slope 0, as for an insulated or impermeable wall; add other slopes by `lift`. neumann is the
     default for axes that a dict of conditions does not name. In `transport`, where the velocity points inwards, the
-    value that flows in is that of the cell at the wall. Use this condition in the argument ``boundary=`` of `gradient`,
-    `laplacian`, `upwind`, `average`, `lift` and `transport`, alone (for all walls) or in a dict, and in
+    value that flows in is the value of the cell at the wall. Use this condition in the argument ``boundary=`` of
+    `gradient`, `laplacian`, `upwind`, `average`, `lift` and `transport`, alone (for all walls) or in a dict, and in
     ``solid_boundary=`` for the surfaces of obstacles.
 
     See Also
@@ -328,7 +328,7 @@ inflow = FlowCondition(
 
         v = prescribed,   w_side = prescribed,   dw/dn = (w_side - w_c) / (h / 2),   dp/dn = 0
 
-    The value of v is that of the boundary faces in the velocity field, which `projection` does not change: set it in
+    The value of v is read from the boundary faces of the velocity field, which `projection` does not change: set it in
     the initial state, or by ``inflow=`` of `flow_step`. w_side is 0 unless it is given by `face_lift` or by ``walls=``
     of `flow_step`. A domain with an inflow also needs an outflow. Use this condition in the argument ``boundary=`` of
     `projection`, `flow_step`, `face_laplacian`, `face_lift`, `convection` and `forces`. In `conservation_law` the state

@@ -7,7 +7,7 @@ If a rate jumps, at a time or on a surface of the state, it has two values there
 value before it, a step that begins there the value after it. So the stepper passes the params as `Sided`, and `Problem`
 evaluates the rate at a time inside the interval, shifted by a rounding error, and at a state on the side of the surface
 where the step began. The shifts are constants without a derivative. So if a Runge-Kutta stage lies beyond a surface,
-its derivative is that of the smooth continuation of the rate, up to an error of the size of the shift.
+its derivative is the derivative of the smooth continuation of the rate, up to an error of the size of the shift.
 """
 
 from __future__ import annotations

@@ -283,7 +283,7 @@ def to_velocity(
 
     It is written to `gw` if `fresh`, else added to `gw`. `given` holds cotangents of cells, which start at the four
     indices `places`: of the cells themselves, weighted for their lower and for their upper sides, and of the cells
-    beyond these sides. The value at a side is that of the upstream cell, or the mean of both cells where w is 0.
+    beyond these sides. The value at a side is the value of the upstream cell, or the mean of both cells where w is 0.
     """
     below, above = sides
     rest = 1.0 - flux

@@ -211,7 +211,7 @@ class Objective:
                 raise
 
     def in_units_of_loss(self, number: float) -> float:
-        """Convert a value or gradient norm of the scaled objective to that of the user's loss."""
+        """Convert a value or gradient norm of the scaled objective to the value or norm of the user's loss."""
         scale = self.residual_scale or 1.0
         return number * scale * scale
 

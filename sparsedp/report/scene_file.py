@@ -51,8 +51,9 @@ def load_scene(target: str) -> SceneFile:
     Parameters
     ----------
     target : str
-        ``FILE.py[:loss[:start]]``. The default name of the loss is `loss`, that of the point `start` or `x`. If the
-        loss takes several arguments, the point is the tuple of arguments. The file may also define the dicts
+        ``FILE.py[:loss[:start]]``. The default name of the loss is `loss`, and the default name of the point
+        is `start` or `x`. If the loss takes several arguments, the point is the tuple of arguments. The file may also
+        define the dicts
         `work_precision_options` (problem, methods, ...) and `stress_options` (ranges, step, ...).
 
     Raises

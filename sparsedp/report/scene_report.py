@@ -26,7 +26,7 @@ __all__ = ["PAGES", "write_report"]
 
 PAGES = ("report.md", "report.html")
 NO_PROBLEM = "the file gives no work_precision_options (problem, methods, over)"
-MEANINGS = {  # from worst to best; the worst verdict of all parts is that of the report
+MEANINGS = {  # from worst to best; the report has the worst verdict of its parts
     "disagrees": "Something is wrong: the gradient is not what differences of the loss say, or a case below FAILED.",
     "inconclusive": "Nothing is proved: the reason stands below. This is no pass.",
     "agrees": "The gradient is what differences of the loss say, and no stiff or extreme case failed.",

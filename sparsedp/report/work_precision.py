@@ -93,8 +93,8 @@ def work_precision(
     problem : callable
         ``problem(**settings)`` returns (loss, x) or (loss, x, facts). The dict `facts` has values for the columns
         "unknowns", "steps" and "tolerance". It may also have a function "output": then the forward error is that of
-        the array output(x), and not that of the loss. If x is None, loss() is called without arguments, for example to
-        run an optimizer; its result is compared with the reference, and there is no gradient.
+        the array output(x), and not the error of the loss. If x is None, loss() is called without arguments, for
+        example to run an optimizer; its result is compared with the reference, and there is no gradient.
     methods : dict
         A dict of settings for each method, by name of the method.
     over : dict, optional
@@ -140,8 +140,8 @@ def work_precision(
     Before it is timed, a run is repeated until its time no longer decreases. If this does not happen, the row has the
     status "not_warm" and no times. The set-up time is the time of problem(...) and of the set-ups of solvers in the
     first run. The backward time is the time of value and gradient minus the time of the value. The peak bytes are
-    measured by tracemalloc in one run. A run that raises an exception has a row, too; its status is that of the failed
-    solve, or the name of the exception.
+    measured by tracemalloc in one run. A run that raises an exception has a row, too; its status is the status of the
+    failed solve, or the name of the exception.
 
     Examples
     --------

@@ -177,7 +177,8 @@ class Solver(Reconstructible):
         start : array, shape (n,), optional
             Initial guess.
         rtol : float, optional
-            Tolerance of this solve, in place of that of the system. If given, the solve is not recorded in the log.
+            Tolerance of this solve, in place of the tolerance of the system. If given, the solve is not recorded in
+            the log.
         observed : bool
             Whether to call the solve hook, if there is one. A hook that calls this method sets it to False.
 

@@ -376,7 +376,7 @@ class RolloutRule(Rule):
     def _backward_pass(self, args: tuple, g: list, runs: list) -> tuple:
         """Return the cotangents, without a check that they are finite.
 
-        With limited memory the backward pass frees the states of the run that it uses; if it is called once more, the
+        With limited memory the backward pass frees the states of the run that it uses; if it is called again, the
         forward pass is repeated first.
         """
         specification = self.specification

@@ -124,8 +124,8 @@ def rollout(
 
     Notes
     -----
-    Cost: the forward pass runs n steps. The backward pass runs every step whose tape was not kept once more, on a
-    tape, and repeats steps to recompute states: with s states kept and each step run at most r times,
+    Cost: the forward pass runs n steps. The backward pass repeats, on a tape, every step whose tape was not
+    kept, and repeats other steps to recompute states: with s states kept and each step run at most r times,
     n <= (s + r)! / (s! r!) steps can be differentiated. The gradient is the same bit for bit for every `memory` in
     bytes. A forward derivative needs the memory of one step, and the derivative of a gradient (`hvp`) twice the memory
     of the gradient. The gradient of a gradient records all calls of both passes on its tape.

@@ -119,7 +119,12 @@ def steps():
     A root whose residual has a sum in it is found of whole states alone.
     """
     for number, (name, make) in enumerate(EVERYWHERE.items()):
-        fields = (as_array,) if make is root else (as_array, in_blocks) if make is tree else (in_blocks,)
+        if make is root:
+            fields = (as_array,)
+        elif make is tree:
+            fields = (as_array, in_blocks)
+        else:
+            fields = (in_blocks,)
         plain = UNEVEN if number % 2 else PLAIN
         on_both(name, plain, partial(steps_and_derivatives, name, make), fields=fields)
 
