@@ -23,7 +23,7 @@ import numpy as np
 from sparsedp._utils.calls import deprecated_attribute
 from sparsedp._utils.counters import Calls, recording
 from sparsedp._utils.pytree import leaves
-from sparsedp._utils.validation import check_function, check_whole
+from sparsedp._utils.validation import check_function, check_type, check_whole
 from sparsedp.autodiff.backend import process_count
 from sparsedp.autodiff.derivative import value_and_grad
 from sparsedp.check.summary import Result
@@ -66,6 +66,7 @@ COLUMNS = (
 )
 KEY = ("scene", "method", "settings", "seed", "versions")  # columns that identify a row
 TEXTS = (*KEY, "status")  # the other columns are numbers
+FACTS = ("unknowns", "steps", "tolerance")  # columns that `problem` may give
 COUNTS = {"solves_forward": "solve", "solves_adjoint": "adjoint", "iterations": "iterations"}  # column: kind of call
 SETTLED_RATIO = 2.0  # the warm-up ends if the previous run took at most this many times as long
 MOST_WARM_UPS = 7
@@ -92,13 +93,15 @@ def work_precision(
     ----------
     problem : callable
         ``problem(**settings)`` returns (loss, x) or (loss, x, facts). The dict `facts` has values for the columns
-        "unknowns", "steps" and "tolerance". It may also have a function "output": then the forward error is that of
-        the array output(x), and not the error of the loss. If x is None, loss() is called without arguments, for
-        example to run an optimizer; its result is compared with the reference, and there is no gradient.
+        "unknowns", "steps" and "tolerance". Other numbers and strings in it become further columns. It may also have
+        a function "output": then the forward error is that of the array output(x), and not the error of the loss. If
+        x is None, loss() is called without arguments, for example to run an optimizer; its result is compared with
+        the reference, and there is no gradient.
     methods : dict
         A dict of settings for each method, by name of the method.
     over : dict, optional
-        A list of values for each setting, by name of the setting. Every method is run with every combination.
+        A list of values for each setting, by name of the setting. Every method is run with every combination. The
+        printed table has a column for each of these settings.
     reference : (value, gradient), callable, dict, or list of two dicts
         The exact value and gradient, or a function of the settings in `over` that returns them. A dict of settings
         means that the reference is computed by `problem` with these settings in addition to those in `over`. With a
@@ -129,7 +132,8 @@ def work_precision(
     ValueError
         If `repeats` is not an integer >= 1, `methods` is empty, or `file` is another kind of file.
     TypeError
-        If `problem` does not return (loss, x), or the program runs on several MPI ranks.
+        If `problem` does not return (loss, x) or its facts cannot be columns, `reference` has another form, or the
+        program runs on several MPI ranks.
 
     See Also
     --------
@@ -166,6 +170,7 @@ def work_precision(
             raise TypeError(
                 f"over of work_precision takes a list of values for {name!r}, got {values!r}; write [{values!r}]"
             )
+    _check_reference(reference)
     scene = scene or getattr(problem, "__name__", "scene")
     compare = compare or distance
     versions = _versions()
@@ -187,16 +192,21 @@ def work_precision(
             continue
         key = (scene, str(method), _text_of(settings), str(seed), versions)
         if key not in finished:
-            figures = _measure(problem, settings, repeats)
-            if "answer" in figures:
+            figures, answer = _measure(problem, settings, repeats)
+            if answer is not None:
                 shared = {name: settings[name] for name in over}
-                figures |= _errors(figures, references, shared)
-            row = {name: figures.get(name, nan) for name in COLUMNS}
-            finished[key] = row | dict(zip(KEY, key))
+                figures |= _errors(answer, references, shared)
+            finished[key] = dict.fromkeys(COLUMNS, nan) | figures | dict(zip(KEY, key))
             if file:
-                write_file(file, table_of([*_stored(file), finished[key]], COLUMNS).csv())
+                write_file(file, table_of(_same_columns([*_stored(file), finished[key]])).csv())
         rows.append(finished[key])
-    return Rows(scene=scene, over=tuple(over), rows=rows, skipped=skipped)
+    return Rows(scene=scene, over=tuple(over), rows=_same_columns(rows), skipped=skipped)
+
+
+def _same_columns(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the rows with the columns of all of them. A fact that a row does not have is NaN."""
+    columns = dict.fromkeys([*COLUMNS, *(name for row in rows for name in row)], nan)
+    return [columns | row for row in rows]
 
 
 def words_of(settings: Mapping[str, Any]) -> str:
@@ -223,6 +233,9 @@ def _versions() -> str:
 # ---------------------------------------------------------------- one run: time, memory, counts
 
 
+Answer = tuple[np.ndarray, Any]  # what the forward error is about, and the gradient or None
+
+
 @dataclass
 class _Task:
     """What `problem` returned for some settings.
@@ -233,7 +246,7 @@ class _Task:
         Functions without arguments that compute the value, and value and gradient. If `x` is None: only loss().
     x : tree or None
     facts : dict
-        Values of columns.
+        Values of columns, without "output".
     output : callable or None
         ``output(x)`` returns the array whose error is the forward error.
     """
@@ -243,7 +256,7 @@ class _Task:
     facts: dict[str, Any]
     output: Callable[[Any], Any] | None
 
-    def answer(self, result: Any) -> tuple[Any, Any]:
+    def answer(self, result: Any) -> Answer:
         """Return the answer, which the forward error is about, and the gradient from the result of the last run."""
         value = result
         gradient = None
@@ -261,11 +274,12 @@ def _prepare(problem: Callable[..., Any], settings: Mapping[str, Any]) -> _Task:
         kind = type(parts).__name__
         raise TypeError(f"a problem gives (loss, x) or (loss, x, facts), got {kind}; write return loss, x")
     loss, x = parts[:2]
+    facts: dict[str, Any] = {}
     if len(parts) == 3:
-        facts = parts[2]
-    else:
-        facts = {}
-    output = facts.get("output")
+        check_type("the third result of a problem", parts[2], dict, "a dict", "{'steps': n}")
+        facts |= parts[2]
+    output = facts.pop("output", None)
+    _check_facts(facts)
     if x is None:  # loss() is run without arguments, and its result is the answer
         return _Task([loss], x, facts, output)
     unknowns = sum(map(np.size, leaves(x)))
@@ -273,8 +287,20 @@ def _prepare(problem: Callable[..., Any], settings: Mapping[str, Any]) -> _Task:
     return _Task(runs, x, {"unknowns": unknowns, **facts}, output)
 
 
-def _measure(problem: Callable[..., Any], settings: Mapping[str, Any], repeats: int) -> dict[str, Any]:
-    """Return the measured values of a run, its answer and its gradient; only a status if the run fails."""
+def _check_facts(facts: Mapping[str, Any]) -> None:
+    """Refuse facts that work_precision measures itself, and facts that do not fit into a cell of a table."""
+    for name, value in facts.items():
+        if name in COLUMNS and name not in FACTS:
+            raise TypeError(f"work_precision fills the column {name!r} itself; give the fact another name")
+        if not isinstance(value, (str, int, float, np.number)):
+            kind = type(value).__name__
+            raise TypeError(f"a fact of a problem is a number or a string, got {kind} for {name!r}")
+
+
+def _measure(
+    problem: Callable[..., Any], settings: Mapping[str, Any], repeats: int
+) -> tuple[dict[str, Any], Answer | None]:
+    """Return the columns of a run and its answer; only a status and None if the run fails."""
     try:
         start = perf_counter()
         task = _prepare(problem, settings)
@@ -285,20 +311,19 @@ def _measure(problem: Callable[..., Any], settings: Mapping[str, Any], repeats: 
         else:
             times = {}
         peak_bytes, result = _peak_bytes(task.runs[-1])
-        answer, gradient = task.answer(result)
+        answer = task.answer(result)
     except FAILURES as error:
-        return {"status": _status_of(error)}
-    return {
-        "answer": answer,
-        "gradient": gradient,
-        "unknowns": answer.size,
+        return {"status": _status_of(error)}, None
+    row = {
+        "unknowns": answer[0].size,
         **task.facts,
         "peak_bytes": peak_bytes,
         **times,
         **{column: total(last_calls, kind) for column, kind in COUNTS.items()},
         "seconds_setup": seconds + total(first_calls.seconds, "setup"),
-        "status": status if np.all(np.isfinite(answer)) else "nonfinite",
+        "status": status if np.all(np.isfinite(answer[0])) else "nonfinite",
     }
+    return row, answer
 
 
 def _warm_up(run: Callable[[], Any]) -> tuple[str, Calls, Calls]:
@@ -364,6 +389,17 @@ def _status_of(error: BaseException) -> str:
 # ---------------------------------------------------------------- reference
 
 
+def _check_reference(reference: Any) -> None:
+    """Refuse a reference that has none of the documented forms."""
+    is_pair = isinstance(reference, tuple) and len(reference) == 2
+    is_list = isinstance(reference, list) and reference and all(isinstance(part, dict) for part in reference)
+    if not (reference is None or callable(reference) or isinstance(reference, dict) or is_pair or is_list):
+        raise TypeError(
+            "reference of work_precision must be (value, gradient), a function of the settings, a dict of settings or "
+            f"a list of such dicts, got {reference!r}; without an exact gradient write (value, None)"
+        )
+
+
 class _References:
     """The reference in any of its forms. It is computed once for each combination of settings in `over`."""
 
@@ -387,9 +423,14 @@ class _References:
             return None, None, nan
         if callable(reference):
             reference = reference(**shared)
-            return *reference, 0.0
+            if not isinstance(reference, tuple) or len(reference) != 2:
+                raise TypeError(
+                    f"the function reference of work_precision must return (value, gradient), got {reference!r}; "
+                    "without an exact gradient return (value, None)"
+                )
         if isinstance(reference, tuple):
-            return *reference, 0.0
+            value, gradient = reference
+            return value, gradient, 0.0
         if isinstance(reference, dict):
             refinements = [reference]
         else:
@@ -403,15 +444,15 @@ class _References:
         return *finest, max(gaps, default=nan)
 
 
-def _errors(figures: dict[str, Any], references: _References, shared: dict[str, Any]) -> dict[str, Any]:
+def _errors(answer: Answer, references: _References, shared: dict[str, Any]) -> dict[str, Any]:
     """Return the columns with the errors of one run."""
     try:
         value, gradient, error = references.at(shared)
         row = {"reference_error": error}
         if value is not None:
-            row["forward_error"] = references.compare(figures["answer"], value)
-        if gradient is not None and figures["gradient"] is not None:
-            row["gradient_error"] = references.compare(figures["gradient"], gradient)
+            row["forward_error"] = references.compare(answer[0], value)
+        if gradient is not None and answer[1] is not None:
+            row["gradient_error"] = references.compare(answer[1], gradient)
         return row
     except FAILURES as failure:
         return {"status": f"reference: {_status_of(failure)}"}
@@ -429,7 +470,7 @@ class Rows(Result):
     over : tuple of str
         Names of the settings that vary.
     rows : list of dict
-        The keys are COLUMNS. A value that was not measured is NaN.
+        The keys are COLUMNS and the names of further facts. A value that was not measured is NaN.
     skipped : list of str
         Sentences about runs that were skipped, with the reasons.
     """
@@ -467,21 +508,36 @@ class Rows(Result):
         """Return the fastest row whose error is at most `error`, or None."""
         return next((row for row in self.pareto(which) if row[which] <= error), None)
 
+    def _settings_columns(self) -> dict[str, str]:
+        """Return the name of the column of each setting that varies.
+
+        It is "name (setting)" if the rows already have another value under that name.
+        """
+        columns = {}
+        for name in self.over:
+            values = [(json.loads(row["settings"])[name], row.get(name, nan)) for row in self.rows]
+            is_same = all(value == setting or value != value for setting, value in values)
+            columns[name] = name if is_same else f"{name} (setting)"
+        return columns
+
     def parts(self) -> list[str | Table]:
         """Return the table of all rows, the skipped runs, and the fastest method for each error."""
         error = self.main_error
         best = [row for row in self.pareto(error) if row[error] < 1]
+        columns = self._settings_columns()
         rows = []
         for row in self.rows:
             if row in best:
                 star = "*"
             else:
                 star = ""
-            rows.append(json.loads(row["settings"]) | row | {"best": star})
-        settings = [name for name in self.over if name not in COLUMNS]
+            settings = {column: json.loads(row["settings"])[name] for name, column in columns.items()}
+            rows.append(row | settings | {"best": star})
+        further = [name for row in self.rows[:1] for name in row if name not in COLUMNS]
+        names = dict.fromkeys(["method", *columns.values(), *SHOWN, *further, "best"])
         parts: list[str | Table] = [
             f"{self.scene}: error against run time",
-            table_of(rows, ["method", *settings, *SHOWN, "best"]),
+            table_of(rows, list(names)),
             *self.omissions(),
             *self._recommendations(error),
             "A star: an error below 1, and no other row is both faster and more exact (the Pareto set).",
@@ -566,14 +622,18 @@ def _stored(file: Any) -> list[dict[str, Any]]:
         stream = open(file, encoding="utf-8", newline="")
     with stream:
         reader = csv.DictReader(stream)
-        if reader.fieldnames not in (None, list(COLUMNS)):
+        names = list(reader.fieldnames or COLUMNS)
+        if tuple(names[: len(COLUMNS)]) != COLUMNS:
             raise ValueError(f"{Path(file).name} is no table of work_precision; give another file name")
-        complete = [row for row in reader if row[COLUMNS[-1]] is not None]
-    return [{name: text if name in TEXTS else _number(text) for name, text in row.items()} for row in complete]
+        complete = [row for row in reader if row[names[-1]] is not None]
+    return [{name: text if name in TEXTS else _value(text) for name, text in row.items()} for row in complete]
 
 
-def _number(text: str) -> float:
-    """Return the number in a cell. An empty cell is NaN."""
+def _value(text: str) -> float | str:
+    """Return the number in a cell; its text if it is not a number. An empty cell is NaN."""
     if text.isdigit():
         return int(text)
-    return float(text or "nan")
+    try:
+        return float(text or "nan")
+    except ValueError:
+        return text

@@ -103,6 +103,63 @@ def test_references():
     assert math.isnan(table(reference=None).rows[0]["forward_error"])
 
 
+def test_settings_and_facts_are_columns(tmp_path):
+    """Also a setting with the name of another column, and facts that only some rows have."""
+
+    def decay(method, steps, seed=0):
+        facts = {"energy": 0.25 * steps, "note": "a|b"} if method == "direct" else {"steps": 2 * steps}
+        return lambda: 1.0, None, facts
+
+    def tables(**options):
+        over = {"method": ["direct", "krylov"], "steps": [10, 1], "seed": [3]}
+        return dp.work_precision(decay, {"all": {}}, over, reference=(1.0, None), repeats=1, **options)
+
+    found = tables(file=tmp_path / "rows.csv")
+    lines = [line.strip("| ").split(" | ") for line in found.markdown().splitlines() if line.startswith("| ")]
+    assert lines[0][:6] == ["method", "method (setting)", "steps (setting)", "seed (setting)", "unknowns", "steps"]
+    assert [line[1:4] for line in lines[1:]] == [
+        ["direct", "10", "3"],
+        ["direct", "1", "3"],
+        ["krylov", "10", "3"],
+        ["krylov", "1", "3"],
+    ]
+    column = lines[0].index("energy")
+    assert lines[0][column:] == ["energy", "note", "best"] and lines[1][column:][:2] == ["2.5", "a\\|b"]
+    assert [row["steps"] for row in found.rows[2:]] == [20, 2] and math.isnan(found.rows[2]["energy"])
+    assert [row["energy"] for row in found.rows[:2]] == [2.5, 0.25] and found.rows[0]["note"] == "a|b"
+    assert "energy,note\n" in found.csv() and all(list(row) == list(found.rows[0]) for row in found.rows)
+    assert str(tables(file=tmp_path / "rows.csv")) == str(found)
+
+    alone = dp.work_precision(lambda steps: (lambda: 1.0, None), {"all": {}}, {"steps": [10, 1]}, repeats=1)
+    assert "| method | steps | unknowns |" in alone.markdown() and "| all | 10 |" in alone.markdown()
+    with pytest.raises(
+        TypeError, match="work_precision fills the column 'iterations' itself; give the fact another name"
+    ):
+        dp.work_precision(lambda: (lambda: 1.0, None, {"iterations": 3}), {"all": {}})
+    with pytest.raises(TypeError, match="the third result of a problem takes a dict, got float; write {'steps': n}"):
+        dp.work_precision(lambda: (lambda: 1.0, None, 3.0), {"all": {}})
+    with pytest.raises(TypeError, match="a fact of a problem is a number or a string, got ndarray for 'x'"):
+        dp.work_precision(lambda: (lambda: 1.0, None, {"x": np.zeros(3)}), {"all": {}})
+
+
+def test_references_of_a_wrong_form():
+    with pytest.raises(
+        TypeError,
+        match=r"reference of work_precision must be \(value, gradient\), a function of the settings, a dict of "
+        r"settings or a list of such dicts, got 1.0; without an exact gradient write \(value, None\)",
+    ):
+        table(reference=1.0)
+    for wrong in ((1.0, 2.0, 3.0), [], [1.0, 2.0], np.ones(2)):
+        with pytest.raises(TypeError, match=r"reference of work_precision must be \(value, gradient\)"):
+            table(reference=wrong)
+    with pytest.raises(
+        TypeError,
+        match=r"the function reference of work_precision must return \(value, gradient\), got 1.0; "
+        r"without an exact gradient return \(value, None\)",
+    ):
+        dp.work_precision(lambda: (lambda: 1.0, None), {"all": {}}, reference=lambda: 1.0)
+
+
 def test_failures_keep_their_row():
     def scene(kind):
         if kind == "stuck":
