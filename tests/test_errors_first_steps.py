@@ -157,7 +157,8 @@ WRONG = [
         lambda: dp.minimize(lambda x: anp.sum(x**2), np.ones(9), bounds=[(0, 1)] * 9),
         ValueError,
         "bounds must be a pair (lower, upper), each a number, None or a tree like start, got [(0, 1), (0, 1), (0, 1), "
-        "(0, 1), (0, 1), (0, 1), ...]; write (0.0, None) for x >= 0",
+        "(0, 1), (0, 1), (0, 1), ...]; write tuple(map(np.array, zip(*bounds))), with -np.inf or np.inf in place of "
+        "None",
     ),
 ]
 

@@ -16,7 +16,7 @@ from sparsedp.autodiff.backend import backend_of, collectively
 from sparsedp.autodiff.flattening import Packing
 from sparsedp.optimize.admm import ADMM
 from sparsedp.optimize.batches import Batches
-from sparsedp.optimize.box import Box
+from sparsedp.optimize.box import Box, pair_of_bounds
 from sparsedp.optimize.checkpoint import Checkpoint
 from sparsedp.optimize.first_order import Adam, GradientDescent
 from sparsedp.optimize.lbfgs import LBFGS
@@ -97,11 +97,12 @@ def minimize(
     gradient : callable, optional
         ``gradient(x)`` returns the gradient, a tree with the structure of x; entries of dicts are matched by key.
         Default: reverse-mode differentiation of the loss.
-    bounds : (lower, upper), optional
+    bounds : (lower, upper) or scipy.optimize.Bounds, optional
         Each of the two is a number, None (no bound), or a tree like start. In a tree, a number or None may replace a
-        subtree and then applies to all of its entries; entries of dicts are matched by key. Points outside the bounds
-        are clipped. half_inverse does not compare losses, so with bounds it may converge to another point than the
-        other methods.
+        subtree and then applies to all of its entries; entries of dicts are matched by key. An array may replace a
+        tuple or a list, with one bound for each entry. SciPy's sequence of one pair for each unknown is refused: write
+        ``tuple(map(np.array, zip(*pairs)))``. Points outside the bounds are clipped. half_inverse does not compare
+        losses, so with bounds it may converge to another point than the other methods.
     project : callable, optional
         ``project(x)``, a differentiable projection onto a linear or affine space, such as dp.projection(grid).
         loss(project(x)) is minimized, and the returned x is a projected one. At the start and at the result, test
@@ -220,6 +221,7 @@ def minimize(
     chosen = _method(method, options)
     maxiter = check_whole("maxiter of minimize", maxiter, 0, "; the default is 100")
     _check_tolerance(tolerance)
+    bounds = pair_of_bounds(bounds)
     other_arguments = {
         "progress": progress,
         "gradient": gradient,

@@ -3,7 +3,7 @@
 import autograd.numpy as anp
 import numpy as np
 import pytest
-from scipy.optimize import least_squares, lsq_linear, minimize
+from scipy.optimize import Bounds, least_squares, lsq_linear, minimize
 
 import sparsedp as dp
 
@@ -65,6 +65,62 @@ def test_bounds_as_trees_and_on_one_side():
     assert np.allclose(best.x["a"], [1, 2]) and best.x["b"] == 4.0 and best.x["n"] == 3 and best.converged
     assert np.allclose(dp.minimize(lambda x: anp.sum(x**2), np.ones(3), "adam", bounds=(0.5, None), rate=0.1).x, 0.5)
     assert np.allclose(dp.minimize(lambda x: x - 2.0, np.zeros(3), "levenberg_marquardt", bounds=(None, 1.0)).x, 1.0)
+
+
+def distance_from_far(x):
+    """Return a loss whose minimum in a box is the corner of the upper bounds."""
+    return sum(anp.sum((leaf - 9.0) ** 2) for leaf in x)
+
+
+PAIRS_OR_SIDES = [
+    ([0.5, 2.5], ((0, 1), (2, 3))),
+    ((0.5, 2.5), [(0, 1), (2, 3)]),
+    ([0.5, 2.5], ((0, 1), (0, 1))),  # read as (lower, upper), both unknowns would be fixed
+    ([0.5, 2.5], ((0, None), (1, None))),
+    ((np.ones(3), 2.5), ((0, 1), (2, 3))),
+    ((np.ones(2), np.ones(2)), ((np.zeros(2), 2 * np.ones(2)), (np.ones(2), 3 * np.ones(2)))),
+    (((0.5, 0.6), (0.7, 0.8)), (((0, 1), (0, 2)), ((1, 3), (1, 4)))),
+    (np.array([0.5, 2.5]), ((0, 1), (2, 3))),
+]
+
+
+@pytest.mark.parametrize("start, bounds", PAIRS_OR_SIDES)
+def test_two_pairs_that_may_be_sides_are_refused(start, bounds):
+    with pytest.raises(ValueError, match="bounds is ambiguous: .* may be two pairs"):
+        dp.minimize(lambda x: 1 / 0, start, bounds=bounds)
+
+
+@pytest.mark.parametrize("start", [[0.5, 2.5], (0.5, 2.5), np.array([0.5, 2.5])])
+def test_both_readings_of_two_pairs_can_be_written_with_arrays(start):
+    bounds = (0, 1), (2, 3)
+    for written, corner in (
+        (tuple(map(np.array, zip(*bounds))), [1.0, 3.0]),
+        (tuple(map(np.array, bounds)), [2.0, 3.0]),
+        (Bounds([0, 2], [1, 3]), [1.0, 3.0]),
+        (Bounds(0, 4), [4.0, 4.0]),
+    ):
+        best = dp.minimize(distance_from_far, start, bounds=written)
+        assert type(best.x) is type(start) and np.array_equal(best.x, corner)
+
+
+@pytest.mark.parametrize(
+    "bounds, corner",
+    [
+        (((0, -5), (10, 5)), [9.0, 5.0]),  # 0 <= -5 is false: no pairs
+        (((0, 1), (1, 3)), [1.0, 3.0]),  # the same box in both readings
+        (((0, 0), (1, 1)), [1.0, 1.0]),  # as pairs, both unknowns would be fixed
+        ((None, (1, 3)), [1.0, 3.0]),
+        (((0, 1), 3), [3.0, 3.0]),
+    ],
+)
+def test_two_sides_that_cannot_be_pairs_are_accepted(bounds, corner):
+    assert dp.minimize(distance_from_far, [0.5, 2.5], bounds=bounds).x == pytest.approx(corner)
+
+
+def test_pairs_that_cannot_be_sides_are_refused():
+    for start in ([0.5, 2.5], np.array([0.5, 2.5])):
+        with pytest.raises(ValueError, match="bounds must be .lower, upper., got one pair for each entry of start"):
+            dp.minimize(lambda x: 1 / 0, start, bounds=((3, 4), (0, 1)))
 
 
 def test_bounds_ignore_leaves_that_are_not_floating():

@@ -44,6 +44,31 @@ WRONG = [
         "got 3; write (0.0, None) for x >= 0",
     ),
     (
+        run(bounds={"a": (0.0, 1.0)}),
+        ValueError,
+        "bounds must be a pair (lower, upper), each a number, None or a tree like start, "
+        "got {'a': (0.0, 1.0)}; write a dict of lower and a dict of upper bounds",
+    ),
+    (
+        run(bounds=np.zeros((2, 2))),
+        ValueError,
+        "bounds must be a pair (lower, upper), each a number, None or a tree like start, "
+        "got array([[0., 0...    [0., 0.]]); write tuple(bounds) if its rows are the lower and the upper bounds",
+    ),
+    (
+        run(bounds=((0, 1), (2, 3))),
+        ValueError,
+        "bounds is ambiguous: ((0, 1), (2, 3)) may be two pairs (lower, upper), or all lower and all upper bounds; "
+        "write tuple(map(np.array, zip(*bounds))) for the former and tuple(map(np.array, bounds)) for the latter, "
+        "with -np.inf or np.inf in place of None",
+    ),
+    (
+        run(bounds=[(3, 4), (0, 1)]),
+        ValueError,
+        "bounds must be (lower, upper), got one pair for each entry of start, [(3, 4), (0, 1)]; write "
+        "tuple(map(np.array, zip(*bounds))), with -np.inf or np.inf in place of None",
+    ),
+    (
         run(bounds=(2.0, 1.0)),
         ValueError,
         "bounds must be numbers with lower <= upper, got 2.0 and 1.0; write None for a side without a bound",
