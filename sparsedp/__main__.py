@@ -106,10 +106,10 @@ def _parser() -> Parser:
 def run_check(options: argparse.Namespace) -> int:
     """Check the gradient of a loss that is defined in a file."""
     from sparsedp.check.gradient_check import gradient
-    from sparsedp.report.scene_file import guarded, load_scene
+    from sparsedp.report.scene_file import errors_as_value_error, load_scene
 
     scene = load_scene(options.scene)
-    with guarded(options.scene):
+    with errors_as_value_error(options.scene):
         audit = gradient(scene.loss, scene.x, quick=options.quick)
     print(audit)
     return EXIT_CODES[audit.verdict]
@@ -165,7 +165,7 @@ def run_demo(options: argparse.Namespace) -> int:
     grids = story.grids_for(ground, options.size)
     folder = options.out or free_folder(Path("sparsedp-demo"), story.FILES, options.force)
     claim_folder(folder, story.FILES, options.force)
-    is_right = story.tell(story.prepare(ground, grids), folder, options.force)
+    is_right = story.run(story.prepare(ground, grids), folder, options.force)
     return 0 if is_right else 1
 
 

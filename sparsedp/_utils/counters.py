@@ -34,7 +34,7 @@ class Thread(local):
         Objects that are called in every solve, the last one first.
     loop_hooks : list of callables
         Called with (step, state, params, inputs, n) before a time loop runs.
-    witnesses : list of callables
+    node_hooks : list of callables
         Called for every new node of a tape: see `Recorder`.
     solves : int
         Number of forward and adjoint solves of the thread; also counted if no `recording()` block is open.
@@ -52,7 +52,7 @@ class Thread(local):
         self.calls: list[Calls] = []
         self.solve_hooks: list[Any] = []
         self.loop_hooks: list[Any] = []
-        self.witnesses: list[Any] = []
+        self.node_hooks: list[Any] = []
         self.inner: list[float] = []
         self.solves = 0
         self.controlled = 0
@@ -73,7 +73,7 @@ class Calls(Counter):
         For the same keys the time of the calls, without the time of timed calls inside them.
     notes : dict of Counter
         For each key (name, fact) the number of times that each value was noted.
-    actors : dict of dict
+    method_objects : dict of dict
         For each name the objects whose methods were called; the inner keys are their ids.
     """
 
@@ -81,7 +81,7 @@ class Calls(Counter):
         super().__init__(*counts)
         self.seconds: Any = Counter()
         self.notes: dict[tuple, Counter] = {}
-        self.actors: dict[str, dict] = {}
+        self.method_objects: dict[str, dict] = {}
 
 
 @contextmanager
@@ -130,11 +130,11 @@ def timed(name: str, kind: str, function: Callable, *args: Any) -> Any:
     """Call a function; if a block is open, count the call, measure its time, and record the object of a method."""
     if not active:
         return function(*args)
-    actor = getattr(function, "__self__", None)
+    method_object = getattr(function, "__self__", None)
     for calls in thread.calls:
         calls[name, kind] += 1
-        if actor is not None:
-            calls.actors.setdefault(name, {})[id(actor)] = actor
+        if method_object is not None:
+            calls.method_objects.setdefault(name, {})[id(method_object)] = method_object
     thread.inner.append(0.0)
     clock = perf_counter()
     try:

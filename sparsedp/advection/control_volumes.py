@@ -19,15 +19,15 @@ from sparsedp.grid.boundary_conditions import neumann
 from sparsedp.kernels.fluxes import (
     COLUMN,
     EXTRA,
-    ITSELF,
+    HAS_COLUMNS,
+    IS_UNEVEN,
     ON_SIDES,
     PROPERTIES,
     ROUND,
+    SAME_AS_CELL,
     SPEED,
     STRIDE,
     TILE,
-    UNEVEN,
-    VARIES,
     WALL,
     N,
 )
@@ -128,7 +128,7 @@ def components(settings: TransportSettings, limited: bool) -> list[Component]:
             if settings.sides[axis]:
                 for side, condition in enumerate(settings.sides[axis]):
                     if condition == neumann:
-                        row[WALL + side] = ITSELF
+                        row[WALL + side] = SAME_AS_CELL
                     else:
                         row[WALL + side] = wall_values + side * lines
                 wall_values += 2 * lines
@@ -137,14 +137,14 @@ def components(settings: TransportSettings, limited: bool) -> list[Component]:
             staggered = settings.of == "faces" and axis == number
             table = _lengths(settings.grid, axis, staggered, settings.at_points, limited)
             row[COLUMN] = sum(map(len, tables))
-            row[VARIES] = len(table) > 1
+            row[HAS_COLUMNS] = len(table) > 1
             tables.append(table)
             speeds += points + row[EXTRA] * (lines // row[STRIDE])
         free = np.zeros((2 * len(shape), 0), bool)
         if solid_points is not None:
             solid = solid_points[field_start:][:points]
             free = np.concatenate([~(solid | solid[_sides(row, np.arange(points)).beyond]) for row in axes])
-        axes[:, UNEVEN] = free.size or any(np.any(table[:, :4] != table[0, 0]) for table in tables)
+        axes[:, IS_UNEVEN] = free.size or any(np.any(table[:, :4] != table[0, 0]) for table in tables)
         result.append(
             Component(
                 field=slice(field_start, field_start + points),
@@ -180,17 +180,17 @@ def _sides(row: NDArray[np.int64], points: NDArray[np.int64]) -> Sides:
         speed=row[SPEED] + points + block * row[EXTRA] + (sign > 0) * row[ON_SIDES] * to_next_side,
         wall=np.where(at_end & (walls >= 0), walls + block * stride + points % stride, -1),
         at_wall=at_end & bounded,
-        column=row[COLUMN] + row[VARIES] * position,
+        column=row[COLUMN] + row[HAS_COLUMNS] * position,
     )
 
 
 def _lengths(grid: Grid, axis: int, staggered: bool, at_points: bool, limited: bool) -> NDArray[np.float64]:
     """Return the table of lengths of an axis: one row for each position along it, or a single row if all are equal.
 
-    The columns are the inverse lengths of `sparsedp.kernels.fluxes` (OWN, THEIRS) and, if `limited`, the distances to
-    the neighbours. The lengths are the widths of the control volumes (infinite if a width is 0). If the velocity is
-    given at points and the scheme has no slopes, they are the distances between points instead; at a wall they remain
-    the width of the control volume.
+    The columns are the inverse lengths of `sparsedp.kernels.fluxes` (INVERSE_LENGTH, INVERSE_LENGTH_BEYOND)
+    and, if `limited`, the distances to the neighbours. The lengths are the widths of the control volumes (infinite if a
+    width is 0). If the velocity is given at points and the scheme has no slopes, they are the distances between points
+    instead; at a wall they remain the width of the control volume.
     """
     cells = grid.widths[axis]
     spacings = grid.spacings(axis)

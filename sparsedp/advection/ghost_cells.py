@@ -16,7 +16,7 @@ import scipy.sparse as sp
 from sparsedp.advection.settings import wall_space
 from sparsedp.grid.boundary_conditions import dirichlet
 from sparsedp.kernels.interpolation_weights import PAD
-from sparsedp.operators.stencils import cell_beside
+from sparsedp.operators.stencils import adjacent_cell
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -91,6 +91,6 @@ def solid_filling(grid: Grid, solid: NDArray[np.bool_]) -> sp.csr_array:
 
 def _neighbours(grid: Grid, axis: int) -> sp.csr_array:
     """Return the adjacency matrix of the cells along an axis; a cell at a wall is also adjacent to itself."""
-    below = cell_beside(grid, axis, False).matrix
-    above = cell_beside(grid, axis, True).matrix
+    below = adjacent_cell(grid, axis, False).matrix
+    above = adjacent_cell(grid, axis, True).matrix
     return below.T @ above + above.T @ below

@@ -29,7 +29,7 @@ from sparsedp._utils.pytree import placed
 from sparsedp.advection.control_volumes import Component, components
 from sparsedp.autodiff.derivative import pullback, pushforward
 from sparsedp.autodiff.tape import isbox, linear, plain
-from sparsedp.kernels.fluxes import OWN
+from sparsedp.kernels.fluxes import INVERSE_LENGTH
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -92,7 +92,8 @@ class SparseReference:
                 beyond = np.where(is_open & (sides.wall >= 0), inflow, beyond)
                 slope = np.where(is_open & ~sides.at_wall, rows + sides.beyond, -1)
                 speed = component.speed.start + sides.speed
-                tables.append((points[None], beyond, slope, speed, is_open * lengths[OWN : OWN + 2], lengths[-2:]))
+                inverse_lengths = is_open * lengths[INVERSE_LENGTH : INVERSE_LENGTH + 2]
+                tables.append((points[None], beyond, slope, speed, inverse_lengths, lengths[-2:]))
                 rows += points.size
         return _SideTable(*(np.concatenate(parts, 1) for parts in zip(*tables, strict=True)))
 

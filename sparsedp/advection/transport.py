@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sparsedp._utils.base_classes import Frozen, Reconstructible
 from sparsedp._utils.calls import public
-from sparsedp._utils.reconstruction import Frozen, Reconstructible
 from sparsedp._utils.validation import check_choice
 from sparsedp.advection.arguments import check_step, flatten_array
 from sparsedp.advection.eulerian import Eulerian

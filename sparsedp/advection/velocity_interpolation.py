@@ -16,7 +16,7 @@ import scipy.sparse as sp
 from sparsedp.grid.boundary_conditions import neumann
 from sparsedp.grid.space import Space
 from sparsedp.operators.operator import Operator
-from sparsedp.operators.stencils import cell_beside, mean_of_faces, means, with_ends
+from sparsedp.operators.stencils import adjacent_cell, mean_of_faces, means, with_ends
 from sparsedp.operators.structure.factor import Factor
 from sparsedp.operators.structure.kronecker import Kronecker, Term
 
@@ -105,8 +105,8 @@ def _mean_of_cells(grid: Grid, axis: int) -> Factor:
 
 def _weighted_mean_of_cells(grid: Grid, axis: int) -> Factor:
     """Return the 1-D matrix from cells to faces that computes the mean weighted with the cell widths."""
-    below = cell_beside(grid, axis, False).matrix
-    above = cell_beside(grid, axis, True).matrix
+    below = adjacent_cell(grid, axis, False).matrix
+    above = adjacent_cell(grid, axis, True).matrix
     widths = (below + above) @ sp.diags_array(grid.widths[axis])
     return Factor(sp.diags_array(1.0 / np.maximum(widths.sum(axis=1), np.finfo(float).tiny)) @ widths)
 

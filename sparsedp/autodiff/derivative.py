@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import autograd.numpy as anp
 import numpy as np
 
+from sparsedp._utils.base_classes import ReconstructibleFunction
 from sparsedp._utils.calls import frames_inside, public
 from sparsedp._utils.counters import thread
 from sparsedp._utils.pytree import copied, described, flatten, keys, labels, leaves, mapped, paired
-from sparsedp._utils.reconstruction import ReconstructibleFunction
 from sparsedp._utils.validation import (
     advise,
     check_function,
@@ -505,11 +505,11 @@ def witnessed(see: Callable) -> Iterator[None]:
         ``see(node, function, value, arguments, options, numbers)``; `numbers` are the positions of the arguments that
         are differentiated.
     """
-    thread.witnesses.append(see)
+    thread.node_hooks.append(see)
     try:
         yield
     finally:
-        thread.witnesses.remove(see)
+        thread.node_hooks.remove(see)
 
 
 # ---- directional derivatives -----------------------------------------------------------------------------------------

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import autograd.numpy as anp
 import numpy as np
 
+from sparsedp._utils.base_classes import ReconstructibleFunction
 from sparsedp._utils.pytree import TreeStructure, copied, leaves
-from sparsedp._utils.reconstruction import ReconstructibleFunction
 from sparsedp._utils.validation import check_finite, check_leaves, check_native, check_shape
 from sparsedp.autodiff.tape import cast, is_variable, isbox
 from sparsedp.errors import DerivativeError

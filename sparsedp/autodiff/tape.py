@@ -25,9 +25,9 @@ from autograd.extend import VSpace, defjvp, defjvp_argnums, defvjp, defvjp_argnu
 from autograd.numpy.numpy_vjps import match_complex, replace_zero, unbroadcast_f
 from autograd.tracer import Node, box_types, getval, isbox, new_box, notrace_primitives, trace_stack
 
+from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.counters import active, count, note, thread, timed
 from sparsedp._utils.pytree import copied, is_branch, leaves
-from sparsedp._utils.reconstruction import Reconstructible
 from sparsedp.autodiff.backend import ARRAY_KINDS, BOX, match_value
 from sparsedp.autodiff.fast_derivatives import (
     ARRAY,
@@ -186,7 +186,7 @@ class Recorder:
     Parameters
     ----------
     *witnesses : callables
-        Callbacks ``see(node, function, value, arguments, options, numbers)``. They and those in `thread.witnesses` are
+        Callbacks ``see(node, function, value, arguments, options, numbers)``. They and those in `thread.node_hooks` are
         called for every node that is created.
 
     Attributes
@@ -202,7 +202,7 @@ class Recorder:
 
     def __init__(self, *witnesses: Callable):
         self.nodes: list[ReverseNode] = []
-        self.witnesses = (*thread.witnesses, *witnesses)
+        self.witnesses = (*thread.node_hooks, *witnesses)
         self.bytes: Any = None
         self.ended = False
 
@@ -872,7 +872,7 @@ class Rule(Reconstructible):
         self.vjp = vjp
         self.jvp = jvp
         self.keywords = keywords
-        self.made = made or (Rule, (name, forward, vjp, jvp, keywords))
+        self.constructor_call = made or (Rule, (name, forward, vjp, jvp, keywords))
 
     def __call__(self, *args: Any, **options: Any) -> Any:
         """Evaluate the rule, and record the call if an argument is traced."""

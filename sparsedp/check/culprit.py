@@ -127,10 +127,10 @@ class _Examination:
             reason += f"; its derivative is cut by truncate={truncate}"
         with recording() as calls:
             grad(_functional(node, _weights(node, None)))(node.values)
-        for actors in calls.actors.values():
-            for actor in actors.values():
-                if isinstance(actor, Operator):
-                    fault = self.fault_of_operator(actor)
+        for method_objects in calls.method_objects.values():
+            for method_object in method_objects.values():
+                if isinstance(method_object, Operator):
+                    fault = self.fault_of_operator(method_object)
                     if fault is not None:
                         return fault
         return node.name, reason

@@ -29,9 +29,9 @@ from sparsedp.check.evaluations import Line
 from sparsedp.check.summary import Result
 from sparsedp.check.thresholds import THRESHOLDS
 
-__all__ = ["PROVED", "DirectionEvidence", "DirectionResult", "pairwise_orders", "rms_of_both_sides", "weigh"]
+__all__ = ["CONFIRMING_WORDS", "DirectionEvidence", "DirectionResult", "pairwise_orders", "rms_of_both_sides", "weigh"]
 
-PROVED = ("agrees", "vanishes")  # results that confirm the gradient
+CONFIRMING_WORDS = ("agrees", "vanishes")  # results that confirm the gradient
 FLOAT_TINY = np.finfo(float).tiny
 FEW_EPS = 8.0  # assumed rounding error of x, in units of eps, in the error bar
 SINGLE_PRECISION_EPS = 300.0  # smallest detectable gap in units of the eps of x; matters in single precision

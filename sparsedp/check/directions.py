@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from sparsedp._utils.validation import place
 from sparsedp.check.direction_evidence import DirectionEvidence, weigh
-from sparsedp.check.evaluations import REFUSALS, Evaluations, Line
+from sparsedp.check.evaluations import EVALUATION_ERRORS, Evaluations, Line
 from sparsedp.check.loss_noise import measure_noise
 from sparsedp.check.overall_verdict import overall_verdict
 from sparsedp.check.point import Point, audit_generator
 from sparsedp.check.step_sizes import COARSER_STEPS, FINER_STEPS, RIPPLE_STEPS, STEPS_BETWEEN
 from sparsedp.check.thresholds import THRESHOLDS
 
-__all__ = ["RANDOM_DIRECTIONS", "examine_directions", "excuse_kinks"]
+__all__ = ["RANDOM_DIRECTIONS", "examine_directions", "reclassify_kinks"]
 
 RANDOM_DIRECTIONS = 3
 # A loss with kinks is examined again at a point at this distance from x (in units of x), in a random direction.
@@ -73,7 +73,7 @@ def examine_directions(
     if callable(evaluations.gradient):
         for direction in directions:
             if direction.word == "disagrees":
-                _excuse_hidden_ripple(direction)
+                _reclassify_hidden_ripple(direction)
     return directions, findings
 
 
@@ -163,7 +163,7 @@ def _note_ripple(evidence: DirectionEvidence, finer: DirectionEvidence) -> None:
 
 
 @np.errstate(all="ignore")
-def _excuse_hidden_ripple(evidence: DirectionEvidence) -> None:
+def _reclassify_hidden_ripple(evidence: DirectionEvidence) -> None:
     """Change the word to "ripple" if a ripple below the noise of the loss may explain a gap.
 
     This is the case if the gradient itself varies by about as much as the gap over a step that is so short that the gap
@@ -176,7 +176,7 @@ def _excuse_hidden_ripple(evidence: DirectionEvidence) -> None:
         step = multiple * (noise / evidence.size)
         if not step < THRESHOLDS.ripple_range * evidence.step:
             continue
-        with suppress(*REFUSALS):
+        with suppress(*EVALUATION_ERRORS):
             bend = _bend_of_gradient(line, step)
             if not bend > visible:
                 continue
@@ -202,7 +202,7 @@ def _bend_of_gradient(line: Line, step: float) -> float:
 # ------------------------------------------------------------ kinks
 
 
-def excuse_kinks(evaluations: Evaluations, directions: Sequence[DirectionEvidence]) -> None:
+def reclassify_kinks(evaluations: Evaluations, directions: Sequence[DirectionEvidence]) -> None:
     """Change the word of directions that disagree to "kink" if the gradient does not disagree at a nearby point.
 
     Where several kinks meet, a gradient may be outside the one-sided derivatives and still be acceptable. It is wrong
@@ -212,7 +212,7 @@ def excuse_kinks(evaluations: Evaluations, directions: Sequence[DirectionEvidenc
     if not callable(evaluations.gradient) or not _may_be_kinks(directions):
         return
     point = evaluations.point
-    with suppress(*REFUSALS):
+    with suppress(*EVALUATION_ERRORS):
         shift = SHIFT * point.random(audit_generator(SHIFT_SEED))
         beside = Point(point.unpack(point.vector + shift))
         evaluations_beside = Evaluations(evaluations.loss, beside, evaluations.gradient, tick=evaluations.tick)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sparsedp._utils.counters import recording
 from sparsedp.check.direction_evidence import DirectionEvidence
-from sparsedp.check.evaluations import REFUSALS, UNCHANGED, Evaluations, Line
+from sparsedp.check.evaluations import EVALUATION_ERRORS, UNCHANGED, Evaluations, Line
 from sparsedp.check.point import Point
 from sparsedp.grid.grid import node_axes
 
@@ -280,12 +280,12 @@ def gaps_along_entries(
 def spaces_of(function: Callable[[Any], Any], x: Any) -> list[Any]:
     """Return the grid spaces (domains and codomains) of all Operators that `function` applies at `x`."""
     spaces: dict[str, Any] = {}
-    with suppress(*REFUSALS), recording() as calls, np.errstate(all="ignore"):
+    with suppress(*EVALUATION_ERRORS), recording() as calls, np.errstate(all="ignore"):
         function(x)
-        for actors in calls.actors.values():
-            for actor in actors.values():
+        for method_objects in calls.method_objects.values():
+            for method_object in method_objects.values():
                 for name in ("domain", "codomain"):
-                    space: Any = getattr(actor, name, None)
+                    space: Any = getattr(method_object, name, None)
                     if getattr(space, "grid", None) is not None:
                         spaces.setdefault(str(space), space)
     return list(spaces.values())

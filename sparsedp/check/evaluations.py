@@ -21,9 +21,9 @@ from sparsedp.check.step_sizes import default_steps
 from sparsedp.check.summary import error_text
 from sparsedp.errors import SparsedpError
 
-__all__ = ["REFUSALS", "UNCHANGED", "Evaluations", "Level", "Line", "solvers_of"]
+__all__ = ["EVALUATION_ERRORS", "UNCHANGED", "Evaluations", "Level", "Line", "solvers_of"]
 
-REFUSALS = (SparsedpError, ValueError, ArithmeticError)  # exceptions that a loss may raise at a trial point
+EVALUATION_ERRORS = (SparsedpError, ValueError, ArithmeticError)  # exceptions that a loss may raise at a trial point
 UNCHANGED = "the loss does not change"
 LOST_SHARE = 0.1  # a step is unusable if the rounding of x changes the displacement by more than this share
 
@@ -138,7 +138,10 @@ class Evaluations:
 def solvers_of(calls: Any) -> list[tuple[str, Any]]:
     """Return the names and solvers of all recorded solves."""
     return [
-        (name, actor) for name, actors in calls.actors.items() for actor in actors.values() if hasattr(actor, "engine")
+        (name, method_object)
+        for name, method_objects in calls.method_objects.items()
+        for method_object in method_objects.values()
+        if hasattr(method_object, "engine")
     ]
 
 
@@ -224,7 +227,7 @@ class Line:
             return np.nan, change, "the step is lost in the rounding of x"
         try:
             value = self.evaluations.value(self.point.tree(arrays))
-        except REFUSALS as error:
+        except EVALUATION_ERRORS as error:
             return np.nan, change, error_text(error)
         return value, change, "" if np.isfinite(value) else "the loss overflows"
 

@@ -14,8 +14,8 @@ from sparsedp._utils.progress import bar
 from sparsedp._utils.validation import check_function, check_whole
 from sparsedp.autodiff.derivative import grad, unwarned
 from sparsedp.check.culprit import culprit_of
-from sparsedp.check.direction_evidence import PROVED, DirectionEvidence
-from sparsedp.check.directions import RANDOM_DIRECTIONS, examine_directions, excuse_kinks
+from sparsedp.check.direction_evidence import CONFIRMING_WORDS, DirectionEvidence
+from sparsedp.check.directions import RANDOM_DIRECTIONS, examine_directions, reclassify_kinks
 from sparsedp.check.entries import MOST_ENTRIES, gaps_along_entries, listed, spaces_of
 from sparsedp.check.evaluations import Evaluations
 from sparsedp.check.loss_noise import POINTS
@@ -159,13 +159,13 @@ def gradient(
         is_wanted = QUICK_DIRECTIONS.__contains__
     evaluations = Evaluations(loss, point, grad(loss) if gradient is None else gradient, chosen_steps)
     lines = len(point.directions(point.vector, count, audit_generator(0), is_wanted))
-    ticks = _announced(3 + POINTS * min(lines, 2) + 2 * len(evaluations.steps) * lines)
+    ticks = _progress_notice(3 + POINTS * min(lines, 2) + 2 * len(evaluations.steps) * lines)
     evaluations.tick = lambda: next(ticks, None)
     with unwarned(), closing(ticks):  # a gradient that is not finite affects the verdict and needs no warning
         return _Auditor(evaluations, gradient is None, count, audit_generator(rng), quick).audit()
 
 
-def _announced(total: int) -> Generator[Any, None, None]:
+def _progress_notice(total: int) -> Generator[Any, None, None]:
     """On a terminal, print how many evaluations are expected, and advance a progress bar at each `next`.
 
     Close the generator to remove the bar. Otherwise later progress bars of the caller would start one line below.
@@ -215,7 +215,7 @@ class _Auditor:
         self.notes = [note for word, note in self.findings if word == "note"]
         self.find_fault()
         if self.quick:
-            self.say_what_was_not_examined()
+            self.note_omissions()
         return self.result()
 
     def examine(self) -> None:
@@ -225,7 +225,7 @@ class _Auditor:
         else:
             is_wanted = None
         self.directions, self.findings = examine_directions(self.evaluations, self.count, self.rng, is_wanted)
-        excuse_kinks(self.evaluations, self.directions)
+        reclassify_kinks(self.evaluations, self.directions)
         random = self.directions[: self.count]
         if random and self.is_taped:
             modes = compare_modes(self.loss, random)
@@ -244,7 +244,7 @@ class _Auditor:
             note = check_complex_step(self.loss, self.point, first, self.evaluations.base)
             if note is not None:
                 self.findings.append(("note", note))
-        if self.is_taped and first.word in PROVED:
+        if self.is_taped and first.word in CONFIRMING_WORDS:
             self.hessian, note = check_hessian_product(self.loss, self.point, first)
             self.findings.append(("note", note))
 
@@ -284,7 +284,7 @@ class _Auditor:
             self.verdict = "inconclusive"
             self.reason += f"; no call is at fault, but solves stop at rtol {tolerance:g}: tighten them"
 
-    def say_what_was_not_examined(self) -> None:
+    def note_omissions(self) -> None:
         """Add a note with the directions that a quick audit examined, and with what it omitted."""
         names = " and ".join(direction.direction for direction in self.directions) or "no direction"
         note = f"quick: looked at along {names}; {NOT_EXAMINED}"
@@ -296,7 +296,7 @@ class _Auditor:
         """Return the result."""
         digits = None
         if self.verdict == "agrees":
-            digits = min(int(direction.digits) for direction in self.directions if direction.word in PROVED)
+            digits = min(int(direction.digits) for direction in self.directions if direction.word in CONFIRMING_WORDS)
         return Audit(
             verdict=self.verdict,
             reason=self.reason,

@@ -17,7 +17,7 @@ from sparsedp.autodiff.tape import called, isbox, through
 
 __all__ = ["Node", "bytes_held", "calls_seen", "in_order"]
 
-HOLDERS = (tuple, list, set, dict, MethodType, CellType, partial)
+CONTAINERS = (tuple, list, set, dict, MethodType, CellType, partial)
 DEEPEST = 36  # largest nesting of containers that is searched; a function with its closure has three levels
 
 
@@ -145,6 +145,6 @@ def _parts(thing: Any) -> Any:
         return (thing._value,)
     if isinstance(thing, FunctionType):  # without the globals of its module
         return (thing.__closure__, thing.__defaults__)
-    if isinstance(thing, HOLDERS):
+    if isinstance(thing, CONTAINERS):
         return gc.get_referents(thing)
     return ()

@@ -10,7 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sparsedp.autodiff.derivative import NO_JVP, hvp, pushforward
-from sparsedp.check.direction_evidence import PROVED, DirectionEvidence, pairwise_orders, rms_of_both_sides, weigh
+from sparsedp.check.direction_evidence import (
+    CONFIRMING_WORDS,
+    DirectionEvidence,
+    pairwise_orders,
+    rms_of_both_sides,
+    weigh,
+)
 from sparsedp.check.point import Point
 from sparsedp.check.thresholds import THRESHOLDS
 
@@ -87,7 +93,7 @@ def compare_modes(loss: Callable[[Any], Any], directions: Sequence[DirectionEvid
         largest_gap = float(np.maximum(largest_gap, gap))  # NaN stays NaN
         if not gap <= allowed:
             is_hidden = difference <= THRESHOLDS.bars_disagree * direction.bar
-            gaps_are_hidden.append(direction.word not in PROVED and is_hidden)
+            gaps_are_hidden.append(direction.word not in CONFIRMING_WORDS and is_hidden)
     return ModeComparison(largest_gap, allowed, all(gaps_are_hidden))
 
 

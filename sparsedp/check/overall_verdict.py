@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import inf
 
-from sparsedp.check.direction_evidence import PROVED, DirectionEvidence
+from sparsedp.check.direction_evidence import CONFIRMING_WORDS, DirectionEvidence
 from sparsedp.check.thresholds import THRESHOLDS
 
 __all__ = ["overall_verdict"]
@@ -45,7 +45,7 @@ def overall_verdict(directions: Sequence[DirectionEvidence], findings: Sequence[
         if members:
             reason, _ = max(members, key=lambda member: member[1])
             return verdict, reason
-    proved = {direction.word for direction in directions} & set(PROVED)
+    proved = {direction.word for direction in directions} & set(CONFIRMING_WORDS)
     if not proved:
         return "inconclusive", "the loss is constant to rounding"
     if "agrees" in proved:

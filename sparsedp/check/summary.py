@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sparsedp._utils.base_classes import Frozen
 from sparsedp._utils.calls import deprecated_attribute
 from sparsedp._utils.html import Markup, curves, folded, paragraphs
-from sparsedp._utils.reconstruction import Frozen
 from sparsedp._utils.validation import number_beside
 from sparsedp.check.table import Table, table_of
 

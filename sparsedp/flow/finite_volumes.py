@@ -34,9 +34,9 @@ from typing import TYPE_CHECKING, Any
 import autograd.numpy as anp
 import numpy as np
 
+from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.calls import public
 from sparsedp._utils.pytree import mapped
-from sparsedp._utils.reconstruction import Reconstructible
 from sparsedp._utils.validation import (
     check_choice,
     check_finite,

@@ -34,9 +34,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.calls import deprecated_attribute, public
 from sparsedp._utils.pytree import copied, mapped
-from sparsedp._utils.reconstruction import Reconstructible
 from sparsedp._utils.validation import (
     check_choice,
     check_finite,
@@ -54,7 +54,7 @@ from sparsedp.flow.diffusion import Diffusion, wave_growth
 from sparsedp.flow.momentum import convection, face_laplacian, free_faces
 from sparsedp.flow.moving_walls import moving_walls
 from sparsedp.flow.pressure_projection import projection
-from sparsedp.flow.projection_setup import faces_that
+from sparsedp.flow.projection_setup import mask_of_faces
 from sparsedp.flow.scalars import Scalar
 from sparsedp.flow.settings import FlowSettings
 from sparsedp.grid.boundary_conditions import inflow as inflow_side
@@ -337,8 +337,8 @@ class FlowStep(Reconstructible):
         if not any(condition == inflow_side for pair in sides for condition in pair or ()):
             raise ValueError("flow_step got inflow= without a side of dp.inflow in boundary=; give both or none")
         solid = self.settings.solid
-        inside = faces_that(self.grid, sides, solid, lambda condition: False)
-        inside_and_inflows = faces_that(self.grid, sides, solid, lambda condition: condition == inflow_side)
+        inside = mask_of_faces(self.grid, sides, solid, lambda condition: False)
+        inside_and_inflows = mask_of_faces(self.grid, sides, solid, lambda condition: condition == inflow_side)
         return mask(self.grid.faces, inside_and_inflows & ~inside)
 
     def start(self, v: Any, params: Any = None, s: dict[str, Any] | None = None) -> dict[str, Any]:

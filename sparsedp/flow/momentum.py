@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp._utils.base_classes import ReconstructibleFunction
 from sparsedp._utils.pytree import copied
-from sparsedp._utils.reconstruction import ReconstructibleFunction
 from sparsedp._utils.validation import check_on
-from sparsedp.flow.projection_setup import faces_that
+from sparsedp.flow.projection_setup import mask_of_faces
 from sparsedp.grid.boundary_conditions import dirichlet, free_slip, no_slip, outflow, resolve
 from sparsedp.grid.grid import Grid
 from sparsedp.grid.space import Space
@@ -375,7 +375,7 @@ def wall_stresses(grid: Grid, sides: tuple) -> Kronecker:
 
 def free_faces(grid: Grid, sides: tuple, solid: ArrayLike | None) -> NDArray[np.bool_]:
     """Return the mask of the faces whose velocity is unknown: all except those on walls, inflows and obstacles."""
-    return faces_that(grid, sides, solid, lambda condition: condition == outflow)
+    return mask_of_faces(grid, sides, solid, lambda condition: condition == outflow)
 
 
 # ---- 1-D factors -----------------------------------------------------------------------------------------------------

@@ -28,9 +28,9 @@ import autograd.numpy as anp
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp._utils.base_classes import Reconstructible, ReconstructibleFunction
 from sparsedp._utils.calls import public
 from sparsedp._utils.pytree import copied
-from sparsedp._utils.reconstruction import Reconstructible, ReconstructibleFunction
 from sparsedp._utils.validation import check_finite, check_kind, check_number, field_array
 from sparsedp.autodiff.tape import plain
 from sparsedp.flow.momentum import (

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sparsedp._utils.reconstruction import Frozen
+from sparsedp._utils.base_classes import Frozen
 from sparsedp.errors import ShapeError
 from sparsedp.flow.projection_setup import ProjectionSetup
 from sparsedp.grid.boundary_conditions import no_slip

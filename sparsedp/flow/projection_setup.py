@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sparsedp._utils.reconstruction import Reconstructible
+from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.validation import check_finite, place
 from sparsedp.errors import NonFiniteError
 from sparsedp.flow.projection_passes import CompiledPasses, OperatorPasses, compiled_passes
@@ -28,7 +28,7 @@ from sparsedp.grid.boundary_conditions import inflow, no_slip, resolve
 from sparsedp.grid.grid import Grid
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.operators.masks_and_lift import check_solid, solid_faces
-from sparsedp.operators.structure.base import Turning
+from sparsedp.operators.structure.base import Transposable
 from sparsedp.solvers.inverse import build
 from sparsedp.solvers.scaling import exponent_of, in_range, largest, shifted
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from sparsedp.operators.structure.base import Structure
     from sparsedp.solvers.choose_method import SolveSettings
 
-__all__ = ["ProjectionSetup", "faces_that", "pressure_conditions"]
+__all__ = ["ProjectionSetup", "mask_of_faces", "pressure_conditions"]
 
 FEW_CELLS = 1024  # on grids with fewer cells, transforms are tried first, where `inverse` would factor the matrix
 
@@ -85,7 +85,7 @@ class ProjectionSetup(Reconstructible):
             self.solid = check_solid(grid, solid).copy()
         self.settings = settings
         self.pressure_conditions = pressure_conditions(grid, self.sides)
-        self.open = faces_that(grid, self.sides, self.solid, lambda condition: not condition.closed)
+        self.open = mask_of_faces(grid, self.sides, self.solid, lambda condition: not condition.closed)
         self.exponent = exponent_of(max((float(h.max(initial=0.0)) for h in grid.widths), default=1.0))
         spacing = [np.ldexp(h, -self.exponent) for h in grid.widths]
         scaled_grid = grid.backend.place(Grid(grid.shape, spacing=spacing, periodic=grid.periodic))
@@ -242,7 +242,7 @@ class ProjectionSetup(Reconstructible):
                     raise ValueError(f"the inflow on the {name} enters a region without an outflow; open a side of it")
 
 
-class ProjectionStructure(Turning):
+class ProjectionStructure(Transposable):
     """P or P^T on flat face fields, for a `ProjectionSetup`; computed in float64 and rounded once to the dtype of x."""
 
     def act(self, x: NDArray, out: NDArray) -> None:
@@ -250,7 +250,7 @@ class ProjectionStructure(Turning):
         self.inner.split(x, out, self.transposed)
 
 
-class PressureStructure(Turning):
+class PressureStructure(Transposable):
     """The map from a face field v to the p with P v = v + G p, or its transpose.
 
     In a region where p is determined only up to a constant, its average is set to 0.
@@ -273,7 +273,7 @@ def pressure_conditions(grid: Grid, sides: tuple) -> dict[str, tuple]:
     return {axis: tuple(condition.pressure for condition in pair) for axis, pair in pairs if pair}
 
 
-def faces_that(
+def mask_of_faces(
     grid: Grid, sides: tuple, solid: ArrayLike | None, open_side: Callable[[Any], bool]
 ) -> NDArray[np.bool_]:
     """Return the flat mask of the faces in the interior and on the sides with a condition that `open_side` accepts.

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from typing import Any, NoReturn
 
-from sparsedp._utils.reconstruction import Value
+from sparsedp._utils.base_classes import Value
 from sparsedp._utils.validation import check_number, check_type
 from sparsedp.grid.grid import AXES, Grid
 

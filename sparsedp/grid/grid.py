@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sparsedp._utils.base_classes import Uncached, Value
 from sparsedp._utils.calls import public
 from sparsedp._utils.html import facts
-from sparsedp._utils.reconstruction import Uncached, Value
 from sparsedp._utils.validation import check_number, check_type
 from sparsedp.autodiff.backend import NUMPY, Backend
 from sparsedp.errors import ShapeError
@@ -101,7 +101,13 @@ class Grid(Value, Uncached):
     periodic: tuple[bool, ...]
     origin: tuple[float, ...]
     widths: tuple[np.ndarray, ...]
-    meant = {"dx": "grid.widths", "h": "grid.widths", "n": "grid.shape", "ndim": "grid.dim", "x": "grid.centres()[0]"}
+    attribute_suggestions = {
+        "dx": "grid.widths",
+        "h": "grid.widths",
+        "n": "grid.shape",
+        "ndim": "grid.dim",
+        "x": "grid.centres()[0]",
+    }
     backend: Backend = NUMPY  # where the fields are stored
 
     @public("dp.Grid", _what_to_write)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp._utils.reconstruction import Uncached, Value
+from sparsedp._utils.base_classes import Uncached, Value
 from sparsedp._utils.validation import check_finite, check_on, check_plain
 from sparsedp.autodiff.backend import NUMPY, Backend
 from sparsedp.autodiff.tape import dtype_of, isbox

@@ -59,7 +59,7 @@ from sparsedp.autodiff.tape_constants import constant
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
 from sparsedp.grid.space import Space
 from sparsedp.integrators.discontinuities import RateInspector
-from sparsedp.integrators.problem import combine, later, unsided, untraced
+from sparsedp.integrators.problem import combine, time_after, untraced, without_side
 from sparsedp.integrators.runge_kutta import Explicit, Scheme
 
 if TYPE_CHECKING:
@@ -69,20 +69,21 @@ if TYPE_CHECKING:
 
 __all__ = ["AcceptedStep", "Adaptive", "FlatDeviation", "inner_product", "relative_sizes"]
 
-FITTING = "; give one number, or a tree like the state"  # advice about a floor
+FLOOR_ADVICE = "; give one number, or a tree like the state"  # advice about a floor
 # Safety factor, least and largest ratio of successive step lengths.
 SAFETY = 0.9
 SMALLEST = 0.2
 LARGEST = 5.0
 # Lengths and times are fractions of the interval.
-QUIET = 1e-2  # smaller errors (in units of the tolerance) are replaced by this value to predict the next length
+LEAST_ERROR = 1e-2  # smaller errors (in units of the tolerance) are replaced by this value to predict the next length
 FLOOR = 0.1  # default floor of errors: this fraction of the largest entry of an array
 LEAST = 1e-15  # least length of a step relative to the time so far; a shorter step would be lost to rounding
 TINY = 1e-25  # least length of the first step
-CAREFUL = 1e-3  # longest first step if the rate depends on the time, as it may be small at the start only
-MOST = 100_000  # largest number of trials in one interval
+LONGEST_FIRST_STEP = 1e-3  # longest first step if the rate depends on the time, as it may be small at the start only
+MOST_TRIALS = 100_000  # largest number of trials in one interval
 WINDOW = 1000  # number of trials after which the progress is checked
-FAR = 10  # stop with an error if at the present progress the rest would need this many times MOST trials
+# Stop with an error if at the present progress the remainder would need this many times MOST_TRIALS trials.
+LARGEST_FORECAST = 10
 
 QUADRATURE = {  # nodes and weights by order
     1: ((0.5,), (1.0,)),
@@ -92,10 +93,11 @@ QUADRATURE = {  # nodes and weights by order
 }
 SLACK = 0.05  # relative change of the state in a half step for which the factor q of d is 1/2
 EPSILON = 1e-3  # reduction of the weight of the extrapolation in the first perturbed solution
-LESS = (0.0, EPSILON, 0.0)  # this reduction for the solution and for both perturbed solutions
-UNCERTAIN = 6.0  # with extrapolation: largest error of a derivative, in units of tolerance^(p / (p + 1))
+WEIGHT_REDUCTIONS = (0.0, EPSILON, 0.0)  # for the solution and for both perturbed solutions
+LARGEST_DERIVATIVE_ERROR = 6.0  # with extrapolation: largest error of a derivative, in units of tolerance^(p / (p + 1))
 TIMES = 10.0  # ratio of the largest error of a derivative to the relative perturbation of the input
-STEEP = 0.1  # relative uncertainty of the rate of change of an event above which its time has no derivative
+# The time of an event has no derivative above this relative uncertainty of the rate of change of the event.
+LARGEST_RATE_UNCERTAINTY = 0.1
 ROUNDING = 1e-12  # a second derivative below this fraction of the largest first derivative is rounding
 SHARE = 1e-4  # errors of derivatives smaller than this fraction of the input are relative to the fraction
 
@@ -299,7 +301,10 @@ class Adaptive(Scheme):
         """
         _, params, t, h = untraced(starts[0])
         slopes = self._length_slopes(path, params, t, h, event)
-        return [self._replayed(path, slopes, less, event, *start) for less, start in zip(LESS, starts, strict=True)]
+        return [
+            self._replayed(path, slopes, less, event, *start)
+            for less, start in zip(WEIGHT_REDUCTIONS, starts, strict=True)
+        ]
 
     def tree(self, u: Any) -> Any:
         """Convert a state of a step to the tree that the user passes and gets."""
@@ -316,7 +321,7 @@ class Adaptive(Scheme):
     def partial_step(self, step: AcceptedStep, arguments: tuple, length: float) -> AcceptedStep | None:
         """Repeat a step with another length (a fraction of the interval); return None if the trial fails."""
         _, params, t, h = arguments
-        middle, new, _ = self._trial(step.u, params, later(t, step.done * h), length, h)
+        middle, new, _ = self._trial(step.u, params, time_after(t, step.done * h), length, h)
         if new is None:
             return None
         return AcceptedStep(length, step.done, step.u, middle, new)
@@ -337,7 +342,7 @@ class Adaptive(Scheme):
             except ValueError:
                 raise ShapeError(
                     f"{place}: shape {np.shape(floor)} does not fit the state there, of shape {np.shape(plain(leaf))}"
-                    f"{FITTING}"
+                    f"{FLOOR_ADVICE}"
                 ) from None
         for leaf in filter(is_variable, leaves(u)):
             rounding = np.finfo(dtype_of(leaf)).eps
@@ -358,10 +363,10 @@ class Adaptive(Scheme):
         most = LARGEST
         power = -1 / (self.compared + 1)
         left_zero = None  # value of `done` at which a rejected step would have changed an array that is 0
-        for trial in range(1, MOST + 1):
+        for trial in range(1, MOST_TRIALS + 1):
             rest = 1.0 - done
             length = self._allowed(min(length, longest), rest)
-            middle, new, error = self._trial(u, params, later(t, done * h), length, h, inspector)
+            middle, new, error = self._trial(u, params, time_after(t, done * h), length, h, inspector)
             change = SAFETY * max(error, 1e-10) ** power
             is_accepted = error <= 1
             if is_accepted and inspector:
@@ -379,7 +384,7 @@ class Adaptive(Scheme):
                     done = done + length
                 else:
                     done = 1.0
-                error = max(error, QUIET)
+                error = max(error, LEAST_ERROR)
                 if done == 1.0:
                     return
                 if last is not None:  # assume that errors continue to grow at the same rate
@@ -399,7 +404,7 @@ class Adaptive(Scheme):
             if length < max(LEAST * done, TINY):
                 break
             if trial % self.window == 0:
-                if (1.0 - done) * self.window > FAR * MOST * (done - done_at_window):
+                if (1.0 - done) * self.window > LARGEST_FORECAST * MOST_TRIALS * (done - done_at_window):
                     break
                 done_at_window = done
         cure = "take a larger tolerance, a method for stiff problems, or an interval that ends before the solution does"
@@ -433,7 +438,7 @@ class Adaptive(Scheme):
             length = 0.01 * (size or 1.0) / (speed * float(h))
         else:
             length = 1.0
-        return min(max(1e3 * TINY, length), CAREFUL if self.problem.timed else 1.0)
+        return min(max(1e3 * TINY, length), LONGEST_FIRST_STEP if self.problem.timed else 1.0)
 
     def _allowed(self, length: float, rest: float) -> float:
         """Limit a length to the rest of the interval, and avoid a very short last step."""
@@ -451,7 +456,7 @@ class Adaptive(Scheme):
         """Return the state between two half steps, the new state, and the error in units of the tolerance."""
         half = 0.5 * length * h
         scheme = self.scheme
-        middle_time = later(t, half)
+        middle_time = time_after(t, half)
         try:
             with np.errstate(all="ignore"):  # overflow in a step that is too long leads to its rejection below
                 # The inspector also needs the rates at the start and in the middle, which explicit steps evaluate.
@@ -482,7 +487,7 @@ class Adaptive(Scheme):
 
     def _floors(self, u: Any) -> list:
         """Return the floor of each array of the state; a number or None may stand for a whole branch."""
-        return paired(self.floor, u, "floor", advice=FITTING, prefix=is_uniform)
+        return paired(self.floor, u, "floor", advice=FLOOR_ADVICE, prefix=is_uniform)
 
     def sizes(self, *states: Any) -> list:
         """Return for each array |u| + floor, the unit of errors, where |u| is the largest of several states."""
@@ -546,10 +551,10 @@ class Adaptive(Scheme):
         speeds = []
         for step in path[:-1] if event else path:
             half = 0.5 * step.length * h
-            start = later(t, step.done * h)
+            start = time_after(t, step.done * h)
             rates = leaves(self.problem(step.u, params, start))
             first, speed = self.section(step.u, rates, half)
-            rates = leaves(self.problem(step.middle, params, later(start, half)))
+            rates = leaves(self.problem(step.middle, params, time_after(start, half)))
             second, _ = self.section(step.middle, rates, half)
             rows.append((first, second))
             speeds.append(speed)
@@ -572,7 +577,7 @@ class Adaptive(Scheme):
         returned: Any = 0.0  # in the last steps: the amount subtracted per unit of time
         for step, row in zip(path, rows, strict=True):
             half = 0.5 * step.length * h
-            start = later(later(t, step.done * h), shift)
+            start = time_after(time_after(t, step.done * h), shift)
             if event and step is path[-1]:
                 return self._state_at_event(event, step, less, u, params, start, half)
             if row:
@@ -584,7 +589,7 @@ class Adaptive(Scheme):
                 second = _length_shift(middle, row[1])
             else:
                 second = -returned * plain(half)
-            fine = self.scheme(middle, params, later(later(start, half), first), half + second)
+            fine = self.scheme(middle, params, time_after(time_after(start, half), first), half + second)
             whole = self.scheme(u, params, start, half + first + (half + second))
             u = _with_values(self.extrapolated(fine, whole, self.weight - less), step.new)
             shift = shift + first + second
@@ -609,7 +614,7 @@ class Adaptive(Scheme):
 
         def value(point: tuple, change: Any) -> Any:
             new, time = advanced(point, change)
-            return event.value(new, unsided(point[1]), time)
+            return event.value(new, without_side(point[1]), time)
 
         point = u, params, t
         plain_point = untraced(point)
@@ -626,7 +631,7 @@ class Adaptive(Scheme):
         """Raise DerivativeError if the solution only touches the surface of an event, up to the tolerance."""
         _, params, t = start
         u = self.tree(step.u)
-        of_state, of_time = event.gradient(u, unsided(params), t)
+        of_state, of_time = event.gradient(u, without_side(params), t)
         before = of_time + inner_product(of_state, self.tree(self.rate(step.u, params, t)))
         self.check_steep(event, self.tree(step.new), params, t + length, slope, (slope - before) / length)
 
@@ -635,10 +640,10 @@ class Adaptive(Scheme):
 
         `slope` is the rate of change, and `curvature` its derivative with respect to time.
         """
-        of_state, _ = event.gradient(u, unsided(params), t)
+        of_state, _ = event.gradient(u, without_side(params), t)
         sizes = flatten(u)[1](Adaptive.sizes(self, u))
         uncertain = self.tolerance * inner_product(mapped(_magnitude, of_state), sizes)
-        if slope == 0 or abs(curvature) * uncertain > STEEP * slope**2:
+        if slope == 0 or abs(curvature) * uncertain > LARGEST_RATE_UNCERTAINTY * slope**2:
             raise DerivativeError(
                 f"{event.name} of {self.name} grazes its surface at t = {t:.9g}: its rate of change there, "
                 f"{slope:.3g}, is zero to the tolerance {self.tolerance:g}, so that its time has no derivative; "
@@ -653,7 +658,7 @@ class Adaptive(Scheme):
         """
         share = self.compared / (self.compared + 1)
         if self.weight:
-            limit = UNCERTAIN * self.tolerance**share
+            limit = LARGEST_DERIVATIVE_ERROR * self.tolerance**share
         else:
             limit = TIMES * self.tolerance
         unit = EPSILON * self.ratio

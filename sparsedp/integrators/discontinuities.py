@@ -31,26 +31,26 @@ if TYPE_CHECKING:
 __all__ = ["RateInspector"]
 
 # Fractions of a step, of the interval, or of a change of the rate are plain numbers between 0 and 1.
-UNEVEN = 3.0  # search the half of a step in which the rate changes more by this factor than in the other half
+LARGEST_HALF_RATIO = 3.0  # search a half of a step if the rate changes more by this factor than in the other half
 CONCENTRATED = 0.5  # continue the search if one of eight parts has at least this fraction of the change
 NEGLIGIBLE = 1e-6  # changes below this fraction of the rate are ignored
-PERSISTS = 0.5  # there may be a jump if a division leaves at least this fraction of the deviation
+JUMP_SHARE = 0.5  # there may be a jump if a division leaves at least this fraction of the deviation
 PARTS = 8  # number of parts in each division
 DIVISIONS = 9  # a change that persists after this number of divisions (8^-9 of a step) is regarded as a jump
-STEADY = 4  # number of successive divisions that do not reduce the deviation, in a search for small jumps
+UNREDUCED_DIVISIONS = 4  # number of successive divisions that do not reduce the deviation, in a search for small jumps
 RESOLVED = 4.0  # largest ratio of the length of a step to that of a layer in it
 GAP = 1 / 200  # largest fraction of the interval between two evaluations of a rate that depends on the time
-EFFORT = 2.0  # largest ratio of these evaluations to the evaluations that the steps need
+PROBE_RATIO = 2.0  # largest ratio of these evaluations to the evaluations that the steps need
 EVALUATIONS = 12  # approximate number of evaluations of the rate in a step
-MISSED = 0.3  # a step that missed a smooth pulse is shortened to this fraction of its length
-UNSEEN = 10.0  # reject a step that missed a smooth pulse if its error, in units of the tolerance, is larger
+PULSE_STEP_SHARE = 0.3  # a step that missed a smooth pulse is shortened to this fraction of its length
+LARGEST_PULSE_ERROR = 10.0  # reject a step that missed a smooth pulse if its error (in tolerances) is larger
 NEARBY = 1e-4  # fraction of a step for finite differences of the rate
 WINDOW = 7  # number of successive steps over which errors are compared with changes of the rate
 COARSE = 0.005  # the rate is not resolved if the relative error of its change by quadrature is larger
 ROUNDING = 1e-15  # relative perturbation of the state to estimate the effect of rounding on the rate
 NOISE = 30.0  # changes of the rate below this multiple of that effect may be rounding
-ROUGH = 0.02  # search more closely if fourth differences of the rate exceed this fraction of its change
-REFUSALS = UnstableStepError, NonFiniteError, ConvergenceError
+LARGEST_FOURTH_DIFFERENCE = 0.02  # search more closely if fourth differences exceed this fraction of the change
+EVALUATION_ERRORS = UnstableStepError, NonFiniteError, ConvergenceError
 
 
 class RateInspector:
@@ -111,13 +111,13 @@ class RateInspector:
                 if not np.isfinite(path.scale):
                     return None
                 return self._share_by_changes(path)
-        except REFUSALS:  # the straight path leaves the domain of the rate
+        except EVALUATION_ERRORS:  # the straight path leaves the domain of the rate
             return None
 
     def _share_by_changes(self, path: _StepPath) -> float | None:
         """Search the half of the step in which the rate changes more, then evaluate the rate at further times."""
         first, last = path.norms(path.changes)
-        if max(first, last) > UNEVEN * min(first, last) and max(first, last) > NEGLIGIBLE * path.scale:
+        if max(first, last) > LARGEST_HALF_RATIO * min(first, last) and max(first, last) > NEGLIGIBLE * path.scale:
             start, stop = (0.0, path.between) if first > last else (path.between, 1.0)
             share = self._share_by_search(path, start, stop)
             if share is not None:
@@ -128,7 +128,7 @@ class RateInspector:
         """Evaluate a rate that depends on the time at further times inside a step, to detect pulses."""
         if not self.scheme.takes_time:
             return None
-        count = int(min(np.ceil(path.length / GAP), EFFORT * self.evaluations - self.probes))
+        count = int(min(np.ceil(path.length / GAP), PROBE_RATIO * self.evaluations - self.probes))
         if count < 3:
             return None
         self.probes += count
@@ -136,7 +136,7 @@ class RateInspector:
         rates = path.rates(shares)
         steps = path.norms([np.diff(rate, axis=0) for rate in rates])
         scale = float(np.max(path.norms(rates)))
-        if not np.isfinite(scale) or np.sum(steps) <= UNEVEN * change + NEGLIGIBLE * scale:
+        if not np.isfinite(scale) or np.sum(steps) <= LARGEST_HALF_RATIO * change + NEGLIGIBLE * scale:
             return None
         place = int(np.argmax(steps))
         share = self._share_by_search(path, float(shares[place]), float(shares[place + 1]))
@@ -147,8 +147,8 @@ class RateInspector:
         for rate, moved in zip(rates, path.displacement(), strict=True):
             mean = np.tensordot(widths, 0.5 * (rate[1:] + rate[:-1]), 1)
             missed.append(path.length * self.h * mean - moved)
-        if path.norm(missed) > UNSEEN * self.scheme.tolerance:
-            return MISSED
+        if path.norm(missed) > LARGEST_PULSE_ERROR * self.scheme.tolerance:
+            return PULSE_STEP_SHARE
         return None
 
     def _share_by_search(self, path: _StepPath, start: float, stop: float) -> float | None:
@@ -181,7 +181,7 @@ class RateInspector:
             largest = max(largest, path.norm([a - b for a, b in zip(rate, path.rate(share), strict=True)]))
         return NOISE * largest
 
-    def _record_jump(self, path: _StepPath, change: _Change) -> None:
+    def _record_jump(self, path: _StepPath, change: _RateChange) -> None:
         """Record the time of a jump, and whether the rate also jumps in time if the state is constant."""
         start, stop = change.start, change.stop
         is_in_time = False
@@ -207,13 +207,13 @@ class RateInspector:
                 change = float(np.sum(path.norms([np.diff(rate, axis=0) for rate in rates])))
                 rough = float(np.max(path.norms([np.diff(rate, 4, axis=0) for rate in rates])))
                 self.resolution[-1] = 0.0, change
-                if rough <= max(ROUGH * change, NEGLIGIBLE * path.scale):
+                if rough <= max(LARGEST_FOURTH_DIFFERENCE * change, NEGLIGIBLE * path.scale):
                     return
                 jump = steepest_change(path, 0.0, 1.0, is_thorough=True)
                 if jump is not None and jump.size > self._rounding(path):
                     self._record_jump(path, jump)
                 self.resolution[-1] = self._quadrature_error(path)
-        except REFUSALS:
+        except EVALUATION_ERRORS:
             pass
 
     def _quadrature_error(self, path: _StepPath) -> tuple[float, float]:
@@ -335,7 +335,7 @@ class _StepPath:
         return [b - a for a, b in zip(self.states[0], self.states[-1], strict=True)]
 
 
-class _Change(NamedTuple):
+class _RateChange(NamedTuple):
     """A change of a rate: its size, its start and stop as fractions of the step, and whether it is a jump."""
 
     size: float
@@ -344,7 +344,7 @@ class _Change(NamedTuple):
     is_jump: bool
 
 
-def steepest_change(path: _StepPath, start: float, stop: float, is_thorough: bool = False) -> _Change | None:
+def steepest_change(path: _StepPath, start: float, stop: float, is_thorough: bool = False) -> _RateChange | None:
     """Locate the steepest change of a rate between two positions in a step (fractions of the step).
 
     Parameters
@@ -356,14 +356,14 @@ def steepest_change(path: _StepPath, start: float, stop: float, is_thorough: boo
 
     Returns
     -------
-    _Change or None
+    _RateChange or None
         A jump or a steep layer; None if the rate is smooth there.
     """
     last_size = 0.0
     steady = 0
     first = path.rate(start)
     last = path.rate(stop)
-    for division in range(DIVISIONS + STEADY):
+    for division in range(DIVISIONS + UNREDUCED_DIVISIONS):
         shares = np.linspace(start, stop, PARTS + 1)
         if not start < shares[1] < shares[-2] < stop:
             break
@@ -378,13 +378,13 @@ def steepest_change(path: _StepPath, start: float, stop: float, is_thorough: boo
             return None
         if division == 0 and not is_thorough and size < CONCENTRATED * np.sum(variation):
             return None
-        if division > 0 and size < PERSISTS * last_size:
+        if division > 0 and size < JUMP_SHARE * last_size:
             if not is_thorough and division == 1:
                 return None
             if not is_thorough or steady >= 2:
-                return _Change(last_size, start, stop, False)
+                return _RateChange(last_size, start, stop, False)
             steady = 0
-            if division >= DIVISIONS - STEADY:
+            if division >= DIVISIONS - UNREDUCED_DIVISIONS:
                 return None
         elif division > 0:
             steady += 1
@@ -393,11 +393,11 @@ def steepest_change(path: _StepPath, start: float, stop: float, is_thorough: boo
         stop = float(shares[place + 1])
         first = [rate[place] for rate in rates]
         last = [rate[place + 1] for rate in rates]
-        if division + 1 >= DIVISIONS and steady >= STEADY:
+        if division + 1 >= DIVISIONS and steady >= UNREDUCED_DIVISIONS:
             is_isolated = np.sum(variation) - variation[place] < 0.2 * size
             if is_isolated:
-                return _Change(size, start, stop, True)
+                return _RateChange(size, start, stop, True)
             return None
-    if steady >= STEADY:
-        return _Change(last_size, start, stop, True)
+    if steady >= UNREDUCED_DIVISIONS:
+        return _RateChange(last_size, start, stop, True)
     return None

@@ -38,7 +38,7 @@ from sparsedp._utils.pytree import mapped
 from sparsedp._utils.validation import check_finite
 from sparsedp.autodiff.backend import require_arrays
 from sparsedp.grid.space import Space
-from sparsedp.integrators.problem import combine, later
+from sparsedp.integrators.problem import combine, time_after
 from sparsedp.integrators.runge_kutta import Scheme, family
 from sparsedp.operators.masks_and_lift import identity
 from sparsedp.operators.operator import Operator
@@ -225,9 +225,9 @@ class Exponential(Scheme):
             return mapped(lambda leaf: leaf if leaf is None else h * leaf, rate)
 
         def n(v: Any, share: float) -> Any:
-            return scaled(self.problem.rate_value(v, params, later(t, share * h)))
+            return scaled(self.problem.rate_value(v, params, time_after(t, share * h)))
 
-        s = [scaled(self.problem.source_value(params, later(t, node * h))) for node in self.nodes]
+        s = [scaled(self.problem.source_value(params, time_after(t, node * h))) for node in self.nodes]
         whole, first, second = self.parts
         if self.problem.rate is None:
             return f((WHOLE, *whole), u, *s)

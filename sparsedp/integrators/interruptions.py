@@ -39,7 +39,7 @@ from sparsedp.errors import ConvergenceError, DerivativeError
 from sparsedp.integrators.adaptive import Adaptive, FlatDeviation, inner_product, relative_sizes
 from sparsedp.integrators.event_detection import EventDetector
 from sparsedp.integrators.events import Event, times_of
-from sparsedp.integrators.problem import Side, Sided, combine, unsided, untraced
+from sparsedp.integrators.problem import Side, SidedParams, combine, untraced, without_side
 from sparsedp.integrators.runge_kutta import Scheme
 
 if TYPE_CHECKING:
@@ -182,8 +182,8 @@ class Interrupted(Scheme):
         for segment, following in pairwise(segments):
             if segment.stop < 0 or segment.event or segment.end is None:
                 continue
-            before = self.problem(segment.end, Sided(params, segment.side), segment.time)
-            after = self.problem(segment.end, Sided(params, following.side), segment.time)
+            before = self.problem(segment.end, SidedParams(params, segment.side), segment.time)
+            after = self.problem(segment.end, SidedParams(params, following.side), segment.time)
             rows = zip(leaves(before), leaves(after), leaves(segment.end), strict=True)
             if all(leaf is None or _is_continuous(one, other, leaf / length) for one, other, leaf in rows):
                 continuous.add(segment.stop)
@@ -215,7 +215,7 @@ class Interrupted(Scheme):
                 length = segment.length
             else:
                 length = stop - t
-            starts.append((u, Sided(run_params, segment.side), t, length))
+            starts.append((u, SidedParams(run_params, segment.side), t, length))
         if not segment.path and event:
             return [self._event_at_start(event, *start[:3]) for start in starts]
         if not segment.path:
@@ -231,7 +231,7 @@ class Interrupted(Scheme):
 
         def value(point: tuple, length: Any) -> Any:
             u, params, t = point
-            return event.value(_short_step(self.problem, u, params, t, length), unsided(params), t + length)
+            return event.value(_short_step(self.problem, u, params, t, length), without_side(params), t + length)
 
         point = u, params, t
         plain_point = untraced(point)
@@ -247,7 +247,7 @@ class Interrupted(Scheme):
             length = length - (residual - plain(residual)) / change
         time = t + length
         new = _short_step(self.problem, u, params, t, length)
-        return event.state_after(new, unsided(params), time), time
+        return event.state_after(new, without_side(params), time), time
 
 
 def _is_continuous(before: Any, after: Any, slow: Any) -> bool:
@@ -337,7 +337,7 @@ class _IntervalRun:
     def _cross_segment(self, place: int, side: Side, stop: float) -> Event | None:
         """Integrate up to a stop or to the first event before it; return the event or None."""
         length = stop - self.t
-        start = self.u, Sided(self.params, side), self.t, length
+        start = self.u, SidedParams(self.params, side), self.t, length
         is_empty = not any(np.size(leaf) for leaf in leaves(self.u))
         if is_empty or length <= ROUNDING * max(abs(self.t), abs(self.t + length), self.h):
             self.u = _short_step(self.parent.problem, *start)

@@ -176,24 +176,24 @@ def _pulled(nodes: Sequence, g: Any, batched_calls: dict) -> Any:
         return act(g, [batched_calls[node][1] for node in nodes])
     # A call of one tape, one cotangent after the other.
     cotangents: Any = g
-    if type(g) is not Several:
+    if type(g) is not CotangentList:
         cotangents = np.ascontiguousarray(np.moveaxis(g[..., 0, :], -1, 0))
     columns = zip(*(node.vjp(one, *node.held) for one in cotangents), strict=True)
     return [_joined([added(None, back)[0] for back in column]) for column in columns]
 
 
-class Several(list):
+class CotangentList(list):
     """List of the cotangents of a call with several results, which cannot be stacked to one array."""
 
-    def __add__(self, other: Any) -> Several:
+    def __add__(self, other: Any) -> CotangentList:
         """Return the elementwise sum."""
-        return Several(added((one, False), two)[0] for one, two in zip(self, other, strict=True))
+        return CotangentList(added((one, False), two)[0] for one, two in zip(self, other, strict=True))
 
 
 def _joined(column: list) -> Any:
     """Stack the cotangents of one tape along the batch axes."""
     if isinstance(column[0], (tuple, list)):
-        return Several(column)
+        return CotangentList(column)
     return np.stack(column, -1)[..., None, :]
 
 

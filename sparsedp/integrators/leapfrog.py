@@ -56,7 +56,7 @@ __all__ = ["Leapfrog", "sponge"]
 
 # Number of products and tolerance of Arnoldi's method. The error of (h w)^2 is 0.4 % on 300^2 cells, at most 2 %.
 PRODUCTS = 20
-ROUGH = 0.1
+EIGENVALUE_TOLERANCE = 0.1
 SLACK = 1e-3  # relative excess of (h w)^2 over the stability limit above which an error is raised
 SAFE = 0.98  # fraction of the largest stable dt that the error message recommends
 POWER = 2  # the rate in a sponge grows with this power of the depth; of 1 to 4 it had the least echo for echo=1e-3
@@ -126,7 +126,9 @@ class Leapfrog(Scheme):
             start = np.random.default_rng(0).standard_normal(n)  # a fixed seed, so that every run gives the same bits
             operator = LinearOperator((n, n), product, dtype=float)
             try:
-                values = eigs(operator, 1, which="LR", v0=start, ncv=PRODUCTS, tol=ROUGH, return_eigenvectors=False)
+                values = eigs(
+                    operator, 1, which="LR", v0=start, ncv=PRODUCTS, tol=EIGENVALUE_TOLERANCE, return_eigenvectors=False
+                )
             except ArpackError:  # raised if the map is 0
                 return 0.0
         return float(np.max(values.real, initial=0.0))

@@ -4,10 +4,11 @@ A problem is u' = c L u + rate(u, params, t) + source(params, t). A state is an 
 each field has its own coefficient c and operator L, or no such term.
 
 If a rate jumps, at a time or on a surface of the state, it has two values there. A step that ends at the jump needs the
-value before it, a step that begins there the value after it. So the stepper passes the params as `Sided`, and `Problem`
-evaluates the rate at a time inside the interval, shifted by a rounding error, and at a state on the side of the surface
-where the step began. The shifts are constants without a derivative. So if a Runge-Kutta stage lies beyond a surface,
-its derivative is the derivative of the smooth continuation of the rate, up to an error of the size of the shift.
+value before it, a step that begins there the value after it. So the stepper passes the params as `SidedParams`, and
+`Problem` evaluates the rate at a time inside the interval, shifted by a rounding error, and at a state on the side of
+the surface where the step began. The shifts are constants without a derivative. So if a Runge-Kutta stage lies beyond
+a surface, its derivative is the derivative of the smooth continuation of the rate, up to an error of the size of the
+shift.
 """
 
 from __future__ import annotations
@@ -31,15 +32,15 @@ if TYPE_CHECKING:
 __all__ = [
     "Problem",
     "Side",
-    "Sided",
+    "SidedParams",
     "check_pair",
     "combine",
     "field_leaves",
-    "later",
+    "time_after",
     "like",
     "real_number",
     "takes_arguments",
-    "unsided",
+    "without_side",
     "untraced",
 ]
 
@@ -98,7 +99,7 @@ def _rounded(leaf: Any, old: Any) -> Any:
     return cast(leaf, dtype)
 
 
-def later(t: Any, h: Any) -> Any:
+def time_after(t: Any, h: Any) -> Any:
     """Return the time t + h, or None if t is None because nothing depends on the time."""
     if t is None:
         return t
@@ -183,16 +184,16 @@ class Side:
         return u, t
 
 
-class Sided(NamedTuple):
+class SidedParams(NamedTuple):
     """Params of a rate, and the side of breaks and event surfaces on which it is evaluated."""
 
     params: Any
     side: Side
 
 
-def unsided(params: Any) -> Any:
+def without_side(params: Any) -> Any:
     """Return the params as the user passed them."""
-    if type(params) is Sided:
+    if type(params) is SidedParams:
         return params.params
     return params
 
@@ -227,7 +228,7 @@ class StiffTerm:
         """Return the number c >= 0, traced or not."""
         value = self._coefficient
         if callable(value):
-            value = value(unsided(params))
+            value = value(without_side(params))
         return real_number(value, self.name, ">= 0", "; write a number >= 0, the sign belongs to the operator")
 
 
@@ -335,7 +336,7 @@ class Problem:
         """Return a copy of the value of the user's rate, which may reuse its result array; None without a rate."""
         if self.rate is None:
             return None
-        if type(params) is Sided:
+        if type(params) is SidedParams:
             u, t = params.side.inside(u, params.params, t)
             params = params.params
         if self.rate_takes_time:
@@ -346,7 +347,7 @@ class Problem:
         """Return a copy of the value of the source; None without a source."""
         if self.source is None:
             return None
-        if type(params) is Sided:
+        if type(params) is SidedParams:
             t = params.side.time(t)
             params = params.params
         return copied(self.source(params, t) if self.source_takes_time else self.source(params))

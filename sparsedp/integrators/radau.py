@@ -49,10 +49,17 @@ from sparsedp.autodiff.backend import require_arrays
 from sparsedp.autodiff.tape import cast, dtype_of, is_variable, isbox, linear, plain, traces_of
 from sparsedp.autodiff.tape_constants import constant
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
-from sparsedp.integrators.adaptive import LESS, WINDOW, AcceptedStep, Adaptive, FlatDeviation, relative_sizes
+from sparsedp.integrators.adaptive import (
+    WEIGHT_REDUCTIONS,
+    WINDOW,
+    AcceptedStep,
+    Adaptive,
+    FlatDeviation,
+    relative_sizes,
+)
 from sparsedp.integrators.discontinuities import RateInspector
 from sparsedp.integrators.jacobians import jacobians_of
-from sparsedp.integrators.problem import Sided, combine, like, unsided, untraced
+from sparsedp.integrators.problem import SidedParams, combine, like, untraced, without_side
 from sparsedp.integrators.runge_kutta import Scheme, as_matrix
 from sparsedp.solvers.direct import dense_lu
 from sparsedp.solvers.newton import Unknowns
@@ -87,8 +94,8 @@ NEWTON = 1e-3  # error of Newton's method in units of the tolerance; 0.03 made H
 ROUNDING = 1e-15  # smallest tolerance of the relative correction in Newton's method
 STALLED = 1e-11  # a relative correction below this that does not decrease any more is regarded as rounding
 ITERATIONS = 10  # largest number of iterations of Newton's method in a step with error control
-REFUSALS = UnstableStepError, NonFiniteError, ConvergenceError  # exceptions of a rate outside its domain
-TOGETHER = 32  # largest number of steps whose derivatives are computed in one batch
+EVALUATION_ERRORS = UnstableStepError, NonFiniteError, ConvergenceError  # exceptions of a rate outside its domain
+BATCH_STEPS = 32  # largest number of steps whose derivatives are computed in one batch
 ENTRIES = 2**20  # largest number of entries of an array in such a batch
 FAST = 0.03  # keep the Jacobian for the next step if the ratio of successive corrections is below this
 
@@ -334,7 +341,7 @@ class Radau(Adaptive):
             if is_second_trial and norm(error / units) > 1:
                 try:
                     error = self.real(self.problem(v + error, params, t) + e, False)
-                except REFUSALS:
+                except EVALUATION_ERRORS:
                     pass  # the step is too long
             ratio = norm(error / units)
         return z, v + z[2], ratio if np.isfinite(ratio) else np.inf
@@ -368,7 +375,7 @@ class Radau(Adaptive):
                 self.factored_length = None
                 self.J = self.jacobian(v, t)
                 z = self._newton(v, t, h)
-        except REFUSALS:
+        except EVALUATION_ERRORS:
             return None
         if z is not None:
             self.guess = v, h, CUBIC @ np.vstack([v, v + z])
@@ -380,9 +387,9 @@ class Radau(Adaptive):
         if self.user_jacobian is None:
             return self.problem.rows([(v, t)], self.params, [False] * len(self.moving))[1][0, :, :n]
         u = self.problem.state(v)
-        if type(self.params) is Sided:
+        if type(self.params) is SidedParams:
             u, t = self.params.side.inside(u, self.params.params, t)
-        arguments = (u, unsided(self.params), t)
+        arguments = (u, without_side(self.params), t)
         J = as_matrix(self.user_jacobian(*arguments[: 2 + self.problem.timed])).toarray()
         check_shape(f"the jacobian of {self.name}", J, (n, n))
         return J
@@ -456,10 +463,10 @@ class Radau(Adaptive):
         """
         *_, t, h = arguments
         n = self.problem.size
-        less = np.array(LESS[: len(entered)])
+        less = np.array(WEIGHT_REDUCTIONS[: len(entered)])
         end_units = np.concatenate([*map(np.ravel, end.units)])
         start_units = np.concatenate([*map(np.ravel, start.units)])
-        n_together = int(np.clip(ENTRIES / (9 * n * start_units.size), 1, TOGETHER))
+        n_together = int(np.clip(ENTRIES / (9 * n * start_units.size), 1, BATCH_STEPS))
         groups = [path[first : first + n_together] for first in range(0, len(path), n_together)]
 
         def tangent(x: np.ndarray) -> np.ndarray:
@@ -509,8 +516,9 @@ class Radau(Adaptive):
         Returns
         -------
         array, shape (number of steps, 2, n + 1, k)
-            For each step the Jacobian (index 0) and, for the first perturbed solution, its change per unit of `LESS`
-            (index 1), with respect to the k entries of (u, sum of all d, moving params, t, h) before the step.
+            For each step the Jacobian (index 0) and, for the first perturbed solution, its change per unit of
+            `WEIGHT_REDUCTIONS` (index 1), with respect to the k entries of (u, sum of all d, moving params, t, h)
+            before the step.
         """
         n = self.problem.size
         m = len(steps)
@@ -574,10 +582,10 @@ class Radau(Adaptive):
             d = -(g_u M x + g_p p + g_t (S + t)) / (g_u stretch + g_t).
         """
         n = self.problem.size
-        params = unsided(self.params)
+        params = without_side(self.params)
         point = self.problem.state(step.new), params, t + length
         moving = [*[True] * len(self.problem.unknowns.shapes), *self.moving[: len(leaves(params))], True]
-        _, rows = jacobians_of(lambda point: event.value(point[0], unsided(point[1]), point[2]), [point], moving)
+        _, rows = jacobians_of(lambda point: event.value(point[0], without_side(point[1]), point[2]), [point], moving)
         of_state, of_params, of_time = np.split(rows[0, 0], [n, rows.shape[2] - 1])
         change = float(of_state @ stretch[0] + of_time[0])
         self._check_transversal(event, step, (None, self.params, t), change, length)

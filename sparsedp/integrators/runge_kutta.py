@@ -54,7 +54,7 @@ from sparsedp._utils.counters import note
 from sparsedp.autodiff.derivative import of_argument
 from sparsedp.autodiff.tape import Rule
 from sparsedp.errors import ConvergenceError, UnstableStepError
-from sparsedp.integrators.problem import Sided, combine, later, unsided, untraced
+from sparsedp.integrators.problem import SidedParams, combine, time_after, untraced, without_side
 from sparsedp.operators.given import from_matrix
 from sparsedp.operators.operator import Operator
 from sparsedp.solvers.adjoint import solve_rule
@@ -147,7 +147,7 @@ class Explicit(Scheme):
         """Return the state after a step; `first` is the rate at its start, if the caller has evaluated it."""
         rates = [self.problem(u, params, t) if first is None else first]
         for row in self.table.stages:
-            rates.append(self.problem(_advanced(u, h, row, rates), params, later(t, sum(row) * h)))
+            rates.append(self.problem(_advanced(u, h, row, rates), params, time_after(t, sum(row) * h)))
         return _advanced(u, h, self.table.weights, rates)
 
 
@@ -355,7 +355,7 @@ E = 1 - 1 / (2 * D)
 
 def backward_euler(stages: Stages, u: Any, params: Any, t: Any, h: Any) -> Any:
     """Order 1, L-stable."""
-    return stages.solve(u, u, params, later(t, h), h)
+    return stages.solve(u, u, params, time_after(t, h), h)
 
 
 def crank_nicolson(stages: Stages, u: Any, params: Any, t: Any, h: Any) -> Any:
@@ -366,7 +366,7 @@ def crank_nicolson(stages: Stages, u: Any, params: Any, t: Any, h: Any) -> Any:
 def tr_bdf2(stages: Stages, u: Any, params: Any, t: Any, h: Any) -> Any:
     """Order 2, L-stable."""
     y = stages.trapezium(u, params, t, G * h)
-    return stages.solve(y, combine(u, (C, combine(y, (-1.0, u)))), params, later(t, h), D * h)
+    return stages.solve(y, combine(u, (C, combine(y, (-1.0, u)))), params, time_after(t, h), D * h)
 
 
 def imex(stages: Stages, u: Any, params: Any, t: Any, h: Any) -> Any:
@@ -378,11 +378,11 @@ def imex(stages: Stages, u: Any, params: Any, t: Any, h: Any) -> Any:
 
     first = stages.problem.rate_value(u, params, t)
     b = advanced((D * h, first))
-    x = stages.solve(u, b, params, later(t, D * h), D * h)
-    second = stages.problem.rate_value(x, params, later(t, D * h))
+    x = stages.solve(u, b, params, time_after(t, D * h), D * h)
+    second = stages.problem.rate_value(x, params, time_after(t, D * h))
     moved = combine(x, (-1.0, b))  # d (z L x + h s)
     b = advanced((E * h, first), ((1 - E) * h, second), ((1 - D) / D, moved))
-    return stages.solve(x, b, params, later(t, h), D * h)
+    return stages.solve(x, b, params, time_after(t, h), D * h)
 
 
 IMPLICIT = {
@@ -448,7 +448,7 @@ class Linear(Stages):
 
     def trapezium(self, u: Any, params: Any, t: Any, h: Any) -> Any:
         """Return x of x = u + h/2 (f(u, t) + f(x, t + h))."""
-        w = self._resolved(0.5 * h, params, u, *((0.25 * h, at) for at in (t, later(t, h))))
+        w = self._resolved(0.5 * h, params, u, *((0.25 * h, at) for at in (t, time_after(t, h))))
         return combine(w, (1.0, w), (-1.0, u))
 
 
@@ -498,19 +498,19 @@ class Nonlinear(Stages):
     def trapezium(self, u: Any, params: Any, t: Any, h: Any) -> Any:
         """Return x of x = u + h/2 (f(u, t) + f(x, t + h))."""
         b = combine(u, (0.5 * h, self.problem(u, params, t)))
-        return self.solve(u, b, params, later(t, h), 0.5 * h)
+        return self.solve(u, b, params, time_after(t, h), 0.5 * h)
 
 
 def residual_jacobian(jacobian: Callable, timed: bool) -> Callable:
     """Return a function for the Jacobian 1 - h df/du of the residual of a stage, given the user's df/du."""
 
     def of_residual(x: Any, b: Any, h: Any, params: Any, t: Any) -> Any:
-        if type(params) is Sided:
+        if type(params) is SidedParams:
             x, t = params.side.inside(x, params.params, t)
         if timed:
-            J = as_matrix(jacobian(x, unsided(params), t))
+            J = as_matrix(jacobian(x, without_side(params), t))
         else:
-            J = as_matrix(jacobian(x, unsided(params)))
+            J = as_matrix(jacobian(x, without_side(params)))
         return sp.eye_array(J.shape[0]) - h * J
 
     return of_residual

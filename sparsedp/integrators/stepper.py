@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.sparse.linalg import ArpackError, eigsh
 
+from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.calls import advice_near, public
 from sparsedp._utils.pytree import copied, labels, leaves
-from sparsedp._utils.reconstruction import Reconstructible
 from sparsedp._utils.validation import (
     advise,
     check_choice,
@@ -323,7 +323,7 @@ def _is_floor(leaf: Any) -> bool:
     return value.dtype.kind in "fiu" and bool(np.all((value >= 0) & (value < np.inf)))
 
 
-def _rebuilt(arguments: dict) -> Step:
+def _reconstruct_step(arguments: dict) -> Step:
     """Construct a step again from the arguments of `stepper`, for copies and pickles."""
     named = {word: value for word, value in arguments.items() if word != "options"}
     return stepper(**named, **arguments["options"])
@@ -427,7 +427,7 @@ class Step(Reconstructible):
         self.order: int = scheme.order
         self.info = scheme.info
         self.is_interrupted = arguments["breaks"] is not None or arguments["events"] is not None
-        self.made = _rebuilt, (arguments,)
+        self.constructor_call = _reconstruct_step, (arguments,)
 
     @property
     def taken(self) -> list[float]:

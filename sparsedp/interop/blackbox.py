@@ -14,10 +14,10 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.calls import public
 from sparsedp._utils.counters import count
 from sparsedp._utils.pytree import norm
-from sparsedp._utils.reconstruction import Reconstructible
 from sparsedp._utils.validation import EPS, check_choice, check_finite, check_function, check_precision, check_shape
 from sparsedp.autodiff.tape import Rule, isbox, plain
 from sparsedp.errors import DerivativeError, ShapeError

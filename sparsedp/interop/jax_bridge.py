@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
+from sparsedp._utils.base_classes import ReconstructibleFunction
 from sparsedp._utils.pytree import placed
-from sparsedp._utils.reconstruction import ReconstructibleFunction
 from sparsedp._utils.validation import check_function, check_precision
 from sparsedp.autodiff.tape import Rule, dtype_of, plain
 from sparsedp.errors import DerivativeError, ShapeError

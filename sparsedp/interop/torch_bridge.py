@@ -15,8 +15,8 @@ import autograd.numpy as anp
 import numpy as np
 import torch
 
+from sparsedp._utils.base_classes import ReconstructibleFunction
 from sparsedp._utils.pytree import flatten, leaves, paired, placed
-from sparsedp._utils.reconstruction import ReconstructibleFunction
 from sparsedp._utils.validation import check_function, check_leaves
 from sparsedp.autodiff.tape import Rule, dtype_of, is_variable, isbox
 from sparsedp.autodiff.tape_constants import constant, frozen
@@ -25,7 +25,7 @@ from sparsedp.interop.recording import owned, parts, recorded
 
 __all__ = ["TorchFunction", "from_torch", "to_torch"]
 
-SAME = "; return the same entries each time"
+STRUCTURE_ADVICE = "; return the same entries each time"
 
 
 # ---- functions of this library for torch -----------------------------------------------------------------------------
@@ -134,7 +134,7 @@ class _TorchNode(torch.autograd.Function):
         form = rebuild(range(len(values)))  # a second run may return the keys of a dict in another order
 
         def rerun(arrays):
-            return paired(fun(arrays), form, "result of to_torch", advice=SAME)
+            return paired(fun(arrays), form, "result of to_torch", advice=STRUCTURE_ADVICE)
 
         ctx.kept = rerun, moving, gradients, places, len(values)
         ctx.save_for_backward(*tensors, *outputs)  # torch raises an error if one of them is modified in place

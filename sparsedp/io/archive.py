@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from sparsedp._utils.validation import check_finite
 from sparsedp.grid.grid import Grid, check_grid
 from sparsedp.io.atomic_files import load_tree, save_tree
-from sparsedp.io.file_format import KIND, OTHERS, REAL, check_fields
+from sparsedp.io.file_format import EXTRA_TYPE_CODES, KIND, REAL, check_fields
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -25,7 +25,7 @@ NEEDS: dict[str, tuple[str, ...]] = {  # libraries of the extra `files`, by suff
     ".zarr": ("xarray", "zarr"),
     **dict.fromkeys(PARAVIEW, ("pyevtk",)),
 }
-DTYPES = {".npz": None, **dict.fromkeys(LABELLED, REAL + OTHERS), **dict.fromkeys(PARAVIEW, REAL)}
+DTYPES = {".npz": None, **dict.fromkeys(LABELLED, REAL + EXTRA_TYPE_CODES), **dict.fromkeys(PARAVIEW, REAL)}
 
 
 def save(

@@ -10,11 +10,11 @@ from sparsedp._utils.validation import check_plain
 from sparsedp.errors import ShapeError
 from sparsedp.grid.grid import Grid
 
-__all__ = ["KIND", "OTHERS", "REAL", "check_fields", "check_names"]
+__all__ = ["KIND", "EXTRA_TYPE_CODES", "REAL", "check_fields", "check_names"]
 
 KIND = "sparsedp fields 1"
 REAL = "bBhHiIlLqQfd"  # type codes of the dtypes that all formats store
-OTHERS = "?FD"  # type codes of the dtypes that .nc and .zarr files also store
+EXTRA_TYPE_CODES = "?FD"  # type codes of the dtypes that .nc and .zarr files also store
 
 
 def check_fields(

@@ -60,17 +60,17 @@ STRIDE = 1  # offset between neighbours in the flat field
 ON_SIDES = 2  # whether the velocity is given on sides, not in cells
 SPEED = 3  # start of the velocities of this axis
 EXTRA = 4  # by how many the velocities outnumber the cells, in a block of the cells along this axis and the later ones
-WALL = 5  # starts of the inflow values of the lower and of the upper wall (two columns), or ITSELF or ROUND
+WALL = 5  # starts of the inflow values of the lower and of the upper wall (two columns), or SAME_AS_CELL or ROUND
 COLUMN = 7  # first column of the axis in `table`
-VARIES = 8  # whether `table` has a column for each position along the axis
-UNEVEN = 9  # whether lengths differ, or sides are closed, anywhere in the component
+HAS_COLUMNS = 8  # whether `table` has a column for each position along the axis
+IS_UNEVEN = 9  # whether lengths differ, or sides are closed, anywhere in the component
 PROPERTIES = 10
-ITSELF = -1  # the ghost cell beyond the wall has the value of the cell itself
+SAME_AS_CELL = -1  # the ghost cell beyond the wall has the value of the cell itself
 ROUND = -2  # the axis is periodic
 
 # Rows of `table`; int64, so that `weigh` is compiled for one type.
-OWN = int64(0)  # 1 / length for the lower and for the upper side (two rows), with the length of the cell itself
-THEIRS = int64(2)  # 1 / length for these sides, with the length of the cell beyond (two rows)
+INVERSE_LENGTH = int64(0)  # of the cell itself, for its lower and for its upper side (two rows)
+INVERSE_LENGTH_BEYOND = int64(2)  # of the cells beyond these sides (two rows)
 DISTANCE = int64(4)  # c and e of the limiter (two rows)
 
 
@@ -213,7 +213,7 @@ def side_of(axes: NDArray, a: int, piece: int, upper: Any, tile: tuple[Any, ...]
         to_next_side = step
     speed = axes[a, SPEED] + first + block * axes[a, EXTRA] + upper * axes[a, ON_SIDES] * to_next_side
     wall_value = wall + (block - line) * stride + first - begin
-    column = axes[a, COLUMN] + axes[a, VARIES] * position
+    column = axes[a, COLUMN] + axes[a, HAS_COLUMNS] * position
     shown = 1.0 - (closed and wall >= 0)
     return Side(
         uint64(begin),
@@ -252,7 +252,7 @@ def weigh(
     b = side.begin
     e = side.end
     at = side.column
-    if a == len(axes) - 1 and axes[a, VARIES]:
+    if a == len(axes) - 1 and axes[a, HAS_COLUMNS]:
         for j in range(b, e):
             lines[line + j] = x[start + j] * table[row, at + j]
     else:
@@ -382,7 +382,7 @@ def stage(
     lines = np.empty(2 * LINE)
     leaves = memory[0]
     enters = memory[1]
-    uneven = axes[0, UNEVEN]
+    uneven = axes[0, IS_UNEVEN]
     if uneven:
         speed = lines
     else:
@@ -398,7 +398,7 @@ def stage(
             if uneven:
                 ratio = dt
             else:
-                ratio = dt * table[OWN, axes[a, COLUMN]]
+                ratio = dt * table[INVERSE_LENGTH, axes[a, COLUMN]]
             pieces = 1
             if a == len(axes) - 1:
                 pieces = 3
@@ -414,8 +414,8 @@ def stage(
                 if b == e:
                     continue
                 if uneven:
-                    weigh(lines, NONE, w, m, table, OWN, axes, a, below, free, c)
-                    weigh(lines, ONE, w, h, table, OWN + 1, axes, a, above, free, c)
+                    weigh(lines, NONE, w, m, table, INVERSE_LENGTH, axes, a, below, free, c)
+                    weigh(lines, ONE, w, h, table, INVERSE_LENGTH + 1, axes, a, above, free, c)
                     m = NONE
                     h = ONE
                 for j in range(b, e):
@@ -486,7 +486,7 @@ def vjp(
     lines = np.empty(4 * LINE)
     field = memory[0]
     of_slopes = memory[1:]
-    uneven = axes[0, UNEVEN]
+    uneven = axes[0, IS_UNEVEN]
     if uneven:
         given = lines
     else:
@@ -503,7 +503,7 @@ def vjp(
             if uneven:
                 ratio = dt
             else:
-                ratio = dt * table[OWN, axes[a, COLUMN]]
+                ratio = dt * table[INVERSE_LENGTH, axes[a, COLUMN]]
             pieces = 1
             if a == len(axes) - 1:
                 pieces = 3
@@ -530,10 +530,10 @@ def vjp(
                     o = cells + i
                     p = cells + k
                 if uneven:
-                    weigh(lines, NONE, g, c, table, OWN, axes, a, below, free, c)
-                    weigh(lines, ONE, g, c, table, OWN + 1, axes, a, above, free, c)
-                    weigh(lines, TWO, g, i, table, THEIRS, axes, a, below, free, c)
-                    weigh(lines, THREE, g, k, table, THEIRS + 1, axes, a, above, free, c)
+                    weigh(lines, NONE, g, c, table, INVERSE_LENGTH, axes, a, below, free, c)
+                    weigh(lines, ONE, g, c, table, INVERSE_LENGTH + 1, axes, a, above, free, c)
+                    weigh(lines, TWO, g, i, table, INVERSE_LENGTH_BEYOND, axes, a, below, free, c)
+                    weigh(lines, THREE, g, k, table, INVERSE_LENGTH_BEYOND + 1, axes, a, above, free, c)
                     x = NONE
                     y = ONE
                     i = TWO

@@ -41,7 +41,7 @@ _type_creation = RLock()
 
 
 @contextlib.contextmanager
-def _announced() -> Iterator[None]:
+def _compilation_notice() -> Iterator[None]:
     """Print NOTICE on stderr when a function is compiled in this context, once in a process."""
     from numba.core import event
 
@@ -222,7 +222,7 @@ class Kernel:
             names[name] = njit(forceinline=True, **options)(function)
         loop = FunctionType(self.loop.__code__, names, self.name)
         loop.__qualname__ = self.name  # numba uses it as the key of its cache
-        with _announced():
+        with _compilation_notice():
             try:
                 return njit([signature], cache=use_cache, **options)(loop)
             except (OSError, RuntimeError):  # no directory for the cache is writable

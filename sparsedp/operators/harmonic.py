@@ -16,13 +16,13 @@ from collections.abc import Callable
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp._utils.reconstruction import ReconstructibleFunction
+from sparsedp._utils.base_classes import ReconstructibleFunction
 from sparsedp._utils.validation import check_finite, check_kind, check_native, check_on
 from sparsedp.autodiff.backend import as_field
 from sparsedp.autodiff.derivative import entrywise
 from sparsedp.autodiff.tape import plain
 from sparsedp.grid.grid import Grid, check_grid
-from sparsedp.operators.stencils import cell_beside, to_faces
+from sparsedp.operators.stencils import adjacent_cell, to_faces
 
 __all__ = ["harmonic_average"]
 
@@ -63,8 +63,8 @@ def harmonic_average(grid: Grid) -> Callable:
     """
     check_grid("harmonic_average", grid)
     axes = range(grid.dim)
-    below = to_faces("cell below", grid, [cell_beside(grid, axis, False) for axis in axes])
-    above = to_faces("cell above", grid, [cell_beside(grid, axis, True) for axis in axes])
+    below = to_faces("cell below", grid, [adjacent_cell(grid, axis, False) for axis in axes])
+    above = to_faces("cell above", grid, [adjacent_cell(grid, axis, True) for axis in axes])
     pair = _pair_rule(grid.join(*(_lower_share(grid, axis) for axis in range(grid.dim))))
 
     def average(k):
@@ -82,8 +82,8 @@ def harmonic_average(grid: Grid) -> Callable:
 
 def _lower_share(grid, axis):
     """Return w_l (see the module docstring) on the faces perpendicular to an axis, broadcastable to their shape."""
-    low = cell_beside(grid, axis, False).matrix @ grid.widths[axis]
-    high = cell_beside(grid, axis, True).matrix @ grid.widths[axis]
+    low = adjacent_cell(grid, axis, False).matrix @ grid.widths[axis]
+    high = adjacent_cell(grid, axis, True).matrix @ grid.widths[axis]
     shape = [1] * grid.dim
     shape[axis] = -1
     return (low / (low + high)).reshape(shape)

@@ -13,10 +13,10 @@ from scipy.sparse import issparse
 
 from sparsedp import kernels
 from sparsedp._utils import buffers
+from sparsedp._utils.base_classes import Frozen, Reconstructible
 from sparsedp._utils.calls import shortened
 from sparsedp._utils.counters import active
 from sparsedp._utils.html import facts, spy
-from sparsedp._utils.reconstruction import Frozen, Reconstructible
 from sparsedp._utils.validation import check_finite, check_native, check_out, check_shape, field_array
 from sparsedp.autodiff.backend import NUMPY, Backend
 from sparsedp.autodiff.tape import apply_operator, isbox
@@ -79,7 +79,7 @@ class Operator(Frozen, Reconstructible):
     name: str
     form: str
     backend: Backend  # where the fields are stored
-    meant = {
+    attribute_suggestions = {
         "dot": "op(u), or A @ B",
         "toarray": "op.matrix.toarray()",
         "todense": "op.matrix.toarray()",

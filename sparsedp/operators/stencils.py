@@ -16,7 +16,7 @@ from sparsedp.operators.structure.kronecker import Kronecker, Term
 
 __all__ = [
     "along",
-    "cell_beside",
+    "adjacent_cell",
     "differences",
     "kronecker_operator",
     "mean_of_faces",
@@ -131,7 +131,7 @@ def with_ends(matrix: sp.csr_array) -> Factor:
     return Factor(sp.vstack([ends[[0]], matrix, ends[[-1]]], format="csr"))
 
 
-def cell_beside(grid: Grid, axis: int, upper: bool) -> Factor:
+def adjacent_cell(grid: Grid, axis: int, upper: bool) -> Factor:
     """Return the factor from cells to faces that takes the value of the upper (or lower) cell of each face.
 
     A wall face has only one cell, whose value is taken in both cases.

@@ -64,7 +64,7 @@ def corners(grid: Grid, closed: NDArray) -> tuple[Operator, Operator, Callable]:
     """
     dim = grid.dim
     volumes = grid.volumes.reshape(-1)
-    beside = [[_face_beside(grid, axis, upper) for upper in (0, 1)] for axis in range(dim)]
+    beside = [[_adjacent_face(grid, axis, upper) for upper in (0, 1)] for axis in range(dim)]
     sides = list(product((0, 1), repeat=dim))
     at_faces = sum(face.T @ volumes for faces in beside for face in faces)
     shares = 2.0 ** (1 - dim) / np.where(at_faces > 0, at_faces, 1.0)  # 1 / (total volume of the corners at a face)
@@ -82,7 +82,7 @@ def corners(grid: Grid, closed: NDArray) -> tuple[Operator, Operator, Callable]:
     return S, Q, at_corners
 
 
-def _face_beside(grid, axis, upper):
+def _adjacent_face(grid, axis, upper):
     """Return the matrix from faces to cells that takes the upper (or lower) face of each cell along an axis."""
     blocks = {(0, axis): along(axis, grid.dim, pick(grid, axis, upper))}
     return Kronecker(grid.cells.parts, grid.faces.parts, blocks).explicit()

@@ -94,7 +94,7 @@ def physical_gradient(
         return pull
 
     rule = differentiable(name, physics, vjp)
-    rule.made = physical_gradient, (physics, inverse, rate, name)
+    rule.constructor_call = physical_gradient, (physics, inverse, rate, name)
     return rule
 
 

@@ -9,8 +9,8 @@ import autograd.numpy as anp
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp._utils.base_classes import ReconstructibleFunction
 from sparsedp._utils.pytree import power_of_two
-from sparsedp._utils.reconstruction import ReconstructibleFunction
 from sparsedp._utils.validation import check_finite, check_kind, check_native, is_number
 from sparsedp.autodiff.tape import dtype_of, plain
 from sparsedp.autodiff.tape_constants import constant

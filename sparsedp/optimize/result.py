@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from sparsedp._utils.base_classes import Frozen
 from sparsedp._utils.html import curves, facts
-from sparsedp._utils.reconstruction import Frozen
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -132,7 +132,7 @@ class Minimum(Frozen):
     evaluations: int
     resumed: str = ""
     _covariance: Any = NO_RESIDUALS  # the array, or a sentence that says why it is not available
-    meant = {
+    attribute_suggestions = {
         "fun": "best.value",
         "point": "best.x",
         "nit": "best.history[-1].iteration",

@@ -35,9 +35,10 @@ from sparsedp.autodiff.tape import plain
 
 __all__ = ["Agreement", "end_all", "end_all_after_error", "state"]
 
-ROOM = 24  # bytes of data in a message, in addition to the mark
+DATA_BYTES = 24  # bytes of data in a message, in addition to the mark
 FAILED = (-1).to_bytes(8, "little", signed=True)  # the mark of a rank that raised an exception
-PATIENCE = 15.0  # seconds after which a failed rank aborts the program if others, perhaps inside PETSc, do not answer
+# A failed rank aborts the program after this number of seconds if others, perhaps inside PETSc, do not answer.
+ABORT_AFTER = 15.0
 
 
 @dataclass
@@ -81,8 +82,8 @@ class Agreement:
         state.last = self
         self._mark = 0
         self._log: deque = deque(maxlen=100)  # (label, mark) of each call of `record` since the last message
-        self._mine = np.zeros(8 + ROOM, np.uint8)
-        self._all = np.zeros((comm.size, 8 + ROOM), np.uint8)
+        self._mine = np.zeros(8 + DATA_BYTES, np.uint8)
+        self._all = np.zeros((comm.size, 8 + DATA_BYTES), np.uint8)
 
     # ------------------------------------------------------------ checks that ranks agree
 
@@ -167,7 +168,7 @@ class Agreement:
         number = np.asarray(number)
         content = number.tobytes()
         label = f"{act.__name__} of shape {number.shape}, {number.dtype}"
-        if len(content) <= ROOM:
+        if len(content) <= DATA_BYTES:
             contents = self.synchronize(label, content)
         else:
             contents = b"".join(self.gather(content, label))
@@ -204,7 +205,7 @@ class Agreement:
         """Raise the exception of the lowest failed rank on all ranks, with the number of the rank in its message."""
         if hasattr(error, "on_all_ranks"):
             raise error
-        watch = Timer(PATIENCE, end_all, (type(error), error, error.__traceback__))
+        watch = Timer(ABORT_AFTER, end_all, (type(error), error, error.__traceback__))
         watch.daemon = True
         watch.start()
         self._send(FAILED, b"")

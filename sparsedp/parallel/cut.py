@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from sparsedp.grid.space import Space, components
 from sparsedp.kernels.reference import Rows as RowRecord
 from sparsedp.kernels.reference import Tridiagonal
-from sparsedp.operators.structure.base import Matrix, Structure, Turning, rows_of
+from sparsedp.operators.structure.base import Matrix, Structure, Transposable, rows_of
 from sparsedp.operators.structure.factor import Factor
 from sparsedp.operators.structure.kronecker import Kronecker, Term
 from sparsedp.operators.structure.lazy import Chain, Diagonal, Mask, Sum
@@ -224,7 +224,7 @@ def reading(entries: NDArray[np.integer], layout: Partition, parts: Shapes) -> t
     return Exchange(layout, parts, entries.size, np.arange(entries.size), entries), places.reshape(-1)
 
 
-class OwnRows(Turning):
+class OwnRows(Transposable):
     """A square matrix of which each rank holds only the rows of its own block.
 
     Attributes

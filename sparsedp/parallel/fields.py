@@ -365,7 +365,7 @@ def formulas(fun: Callable, value: Any, args: Sequence[Any], nums: Sequence[int]
     Numbers and whole arrays are first converted to distributed fields, by differentiable functions whose transposes add
     the cotangents over all ranks. Then autograd's own derivatives of elementwise functions can be used, to any order.
     """
-    if fun not in KNOWN:
+    if fun not in AUTOGRAD_FUNCTIONS:
         return None
     space = next(plain(arg).space for arg in args if isinstance(plain(arg), DistributedField))
     if not isinstance(plain(value), DistributedField):
@@ -438,7 +438,7 @@ REDUCTIONS = {
     anp.amin: _slope_of_extreme,
     anp.linalg.norm: _slope_of_norm,
 }
-KNOWN = {*REDUCTIONS, *filter(callable, vars(anp).values())}
+AUTOGRAD_FUNCTIONS = {*REDUCTIONS, *filter(callable, vars(anp).values())}
 
 
 class DistributedVSpace(VSpace):

@@ -11,7 +11,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from sparsedp._utils.reconstruction import Frozen
+from sparsedp._utils.base_classes import Frozen
 from sparsedp._utils.validation import field_array
 from sparsedp.advection.method import TransportMethod
 from sparsedp.advection.settings import TransportSettings

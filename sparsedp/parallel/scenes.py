@@ -16,10 +16,10 @@ import autograd.numpy as anp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.calls import public
 from sparsedp._utils.progress import shown_steps
 from sparsedp._utils.pytree import copied, flatten, leaves, mapped, placed
-from sparsedp._utils.reconstruction import Reconstructible
 from sparsedp._utils.validation import check_finite, check_function, check_leaves, check_shape, check_whole, is_whole
 from sparsedp.autodiff.derivative import check_loss, grad, jvp, unwarned, value_and_grad, zero_like
 from sparsedp.autodiff.tape import Rule, isbox
@@ -146,7 +146,7 @@ class Ensemble(Reconstructible):
         check_shape("weights of ensemble", weights, (self.count,), "; give one number for each scene")
         check_finite("weights", weights)
         self._weights = weights.tolist()
-        self.made = ensemble, (loss, scenes, executor, self._weights, chunk, progress)
+        self.constructor_call = ensemble, (loss, scenes, executor, self._weights, chunk, progress)
         self._chunk = int(chunk or 1)
         self._executor = executor
         self._progress = progress

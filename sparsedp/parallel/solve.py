@@ -44,8 +44,8 @@ LU = {"ksp_type": "gmres", "pc_type": "lu", "pc_factor_mat_solver_type": "mumps"
 SPARE = 14, 200  # MUMPS option ICNTL(14): 200 % more memory than estimated, because saddle points need more pivots
 # On the coarsest level BoomerAMG uses Gaussian elimination, which may find a pivot of 0 in a singular matrix.
 HYPRE_SINGULAR = {"pc_hypre_boomeramg_relax_type_coarse": "symmetric-SOR/Jacobi"}
-MOST = 500  # maximum number of iterations of one call of PETSc
-TIGHT = 1e-14  # smallest relative tolerance given to PETSc; iterative refinement reaches smaller ones
+MAX_ITERATIONS = 500  # maximum number of iterations of one call of PETSc
+LEAST_RTOL = 1e-14  # smallest relative tolerance given to PETSc; iterative refinement reaches smaller ones
 
 
 # ---- matrices ----
@@ -262,8 +262,8 @@ class PetscEngine(Engine):
     def solve(self, b: NDArray, goal: float, transposed: bool) -> tuple[NDArray, int, str]:
         """See `Engine.solve`."""
         system = self.system
-        rtol = max(0.5 * goal / (system.size_of(b) or 1.0), TIGHT)
-        self.ksp.setTolerances(rtol=rtol, atol=0.0, divtol=1e8, max_it=system.maxiter or MOST)
+        rtol = max(0.5 * goal / (system.size_of(b) or 1.0), LEAST_RTOL)
+        self.ksp.setTolerances(rtol=rtol, atol=0.0, divtol=1e8, max_it=system.maxiter or MAX_ITERATIONS)
         x = np.zeros(b.size)
         solve = self.ksp.solve
         if transposed and system.weights is None:

@@ -209,17 +209,17 @@ def _rows(calls: Calls) -> list[dict[str, Any]]:
 def _form_or_method(calls: Calls, name: str) -> str:
     """Return the form of an operator, or the method of a solver and why it was chosen."""
     words = list(calls.notes.get((name, "method"), ()))
-    for actor in calls.actors.get(name, {}).values():
-        if hasattr(actor, "engine"):
-            words.append(f"{actor.engine.method}: {actor.reason}")
-        elif _is_applied(actor):
-            words.append(actor.form)
+    for method_object in calls.method_objects.get(name, {}).values():
+        if hasattr(method_object, "engine"):
+            words.append(f"{method_object.engine.method}: {method_object.reason}")
+        elif _is_applied(method_object):
+            words.append(method_object.form)
     return "; ".join(dict.fromkeys(words)) or "rule"
 
 
-def _is_applied(actor: Any) -> bool:
+def _is_applied(method_object: Any) -> bool:
     """Return whether an object that was called is an operator, but not an inverse."""
-    return isinstance(actor, Operator) and not hasattr(actor, "solver")
+    return isinstance(method_object, Operator) and not hasattr(method_object, "solver")
 
 
 # ---------------------------------------------------------------- skipped work, in sentences
@@ -246,12 +246,12 @@ def _skipped_work(calls: Calls, forward_calls: Calls, gradient: bool) -> Iterato
         yield from _skipped_pullbacks(calls, forward_calls)
         if not total(calls, "jvp"):
             yield "JVPs: forward mode was not asked"
-    for name, actors in calls.actors.items():
-        for actor in actors.values():
-            if hasattr(actor, "engine"):
-                yield from _skipped_by_solver(calls, name, actor)
-            elif _is_applied(actor):
-                yield from _skipped_by_operator(calls, name, actor)
+    for name, method_objects in calls.method_objects.items():
+        for method_object in method_objects.values():
+            if hasattr(method_object, "engine"):
+                yield from _skipped_by_solver(calls, name, method_object)
+            elif _is_applied(method_object):
+                yield from _skipped_by_operator(calls, name, method_object)
     if not solvers_of(calls):
         yield "solves: none, so no hierarchy, no factors, no set-up"
     for (name, kind), count in calls.items():

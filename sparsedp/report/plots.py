@@ -32,7 +32,7 @@ __all__ = [
     "plot",
     "sample_data",
     "stability_chart",
-    "unbeaten",
+    "pareto_front",
     "v_curve",
     "write_picture",
     "write_result",
@@ -242,14 +242,14 @@ def _middle_slices(grid: Grid, u: NDArray[Any], kind: str, ax: Any) -> Iterator[
 # ---------------------------------------------------------------- charts
 
 
-def unbeaten(points: Sequence[Any]) -> list[Any]:
+def pareto_front(points: Sequence[Any]) -> list[Any]:
     """Return the Pareto set of tuples whose first two entries are costs, sorted by the first cost.
 
     A tuple is in the Pareto set if no other tuple is better in both costs.
 
     Examples
     --------
-    >>> unbeaten([(3, 1), (1, 5), (2, 6), (2, 2)])
+    >>> pareto_front([(3, 1), (1, 5), (2, 6), (2, 2)])
     [(1, 5), (2, 2), (3, 1)]
     """
     best: list[Any] = []
@@ -273,7 +273,7 @@ def curves(lines: Mapping[str, Any], ax: Any, xlabel: str, ylabel: str) -> Any:
     -------
     matplotlib Axes
     """
-    best = unbeaten([point for points in lines.values() for point in points if point[1] > 0])
+    best = pareto_front([point for points in lines.values() for point in points if point[1] > 0])
     ax.plot(*np.reshape(best, (-1, 2)).T, color="0.8", linewidth=6, solid_capstyle="round", label="best so far")
     return _labelled_curves(lines, ax, xlabel, ylabel)
 

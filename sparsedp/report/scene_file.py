@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, NoReturn
 
 from sparsedp._utils.calls import warn_deprecated
 
-__all__ = ["SceneFile", "claim_folder", "free_folder", "guarded", "load_scene"]
+__all__ = ["SceneFile", "claim_folder", "free_folder", "errors_as_value_error", "load_scene"]
 
 POINT_NAMES = ("start", "x")  # names of the point; the first one that the file defines is used
 OPTIONS = ("work_precision", "stress")  # the file may define their arguments as a dict NAME_options
@@ -112,7 +112,7 @@ def _run(file: Path) -> dict[str, Any]:
     sys.argv = [str(file)]
     sys.path = [str(file.resolve().parent), *path]
     try:
-        with guarded(file=str(file)):
+        with errors_as_value_error(file=str(file)):
             return runpy.run_path(str(file), run_name=file.stem)
     finally:
         sys.argv = arguments
@@ -123,7 +123,7 @@ def _run(file: Path) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def guarded(name: str = "", file: str = "") -> Iterator[None]:
+def errors_as_value_error(name: str = "", file: str = "") -> Iterator[None]:
     """Run user code in a `with` block: its output goes to stderr, and all exceptions and exits become ValueError.
 
     Parameters

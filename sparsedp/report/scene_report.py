@@ -18,7 +18,7 @@ from sparsedp.report import plots
 from sparsedp.report.certificate import certify
 from sparsedp.report.explain import explain
 from sparsedp.report.html_page import page, section
-from sparsedp.report.scene_file import SceneFile, claim_folder, guarded
+from sparsedp.report.scene_file import SceneFile, claim_folder, errors_as_value_error
 from sparsedp.report.stress_table import stress
 from sparsedp.report.work_precision import work_precision
 
@@ -57,7 +57,7 @@ def write_report(scene: SceneFile, folder: Path, force: bool = False) -> tuple[s
         If a file cannot be written.
     """
     claim_folder(folder, PAGES, force)
-    with guarded(scene.name):
+    with errors_as_value_error(scene.name):
         results = [_attempt(chapter, scene) for chapter in CHAPTERS]
     verdict = _verdict_of(results)
     meaning = MEANINGS[verdict]

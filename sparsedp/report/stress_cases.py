@@ -19,7 +19,7 @@ from sparsedp._utils.counters import thread
 from sparsedp._utils.pytree import copied, leaves, norm
 from sparsedp._utils.validation import EPS
 from sparsedp.autodiff.derivative import value_and_grad
-from sparsedp.check.directions import examine_directions, excuse_kinks
+from sparsedp.check.directions import examine_directions, reclassify_kinks
 from sparsedp.check.evaluations import Evaluations, Line
 from sparsedp.check.operators import layouts
 from sparsedp.check.overall_verdict import overall_verdict
@@ -123,7 +123,7 @@ class Scene:
         low, high = self.ranges.get(name, (-inf, inf))
         return bool(np.all((low <= value) & (value <= high)))
 
-    def word_for_fault(self, changed: Values) -> str:
+    def grade_of_fault(self, changed: Values) -> str:
         """Return the grade of a wrong result: FAILED at x, within given ranges, and for viscosity 0, else DEGRADED."""
         is_stated = all(name in self.ranges and self.is_legal(name, value) for name, value in changed.items())
         is_inviscid = self.viscosity is not None and not np.any(changed.get(self.viscosity, 1.0))
@@ -193,15 +193,15 @@ def grade_soundness(scene: Scene, changed: Values, outcome: Outcome) -> Grade:
             word = FAILED
         return word, figure, note
     if not isfinite(outcome.value):
-        return scene.word_for_fault(changed), nan, f"value {outcome.value:g}, and no error"
+        return scene.grade_of_fault(changed), nan, f"value {outcome.value:g}, and no error"
     if not isfinite(norm(outcome.gradient)):
-        return scene.word_for_fault(changed), nan, "the gradient is not finite, and no error"
+        return scene.grade_of_fault(changed), nan, "the gradient is not finite, and no error"
     grade = _compare_with_differences(scene, changed, outcome)
     if changed and scene.growth and grade[0] == PASSED:
         growth = scene.growth_at(changed)
         if growth and growth.factor > LARGEST_STEADY_GROWTH and growth.flips:
             note = "growth factor of a step: unstable, and no error"
-            return scene.word_for_fault(changed), growth.factor, note
+            return scene.grade_of_fault(changed), growth.factor, note
     return grade
 
 
@@ -300,7 +300,7 @@ def _compare_with_differences(scene: Scene, changed: Values, outcome: Outcome) -
     evaluations = Evaluations(scene.value_or_nan, point, lambda tree: value_and_grad(scene.loss)(tree)[1])
     try:
         directions, findings = examine_directions(evaluations, 1, audit_generator(SEED), None)
-        excuse_kinks(evaluations, directions)
+        reclassify_kinks(evaluations, directions)
     except Exception as error:  # a scene may raise any exception near the point
         return DEGRADED, gap, f"the gradient cannot be compared with differences: {error_text(error)}"
     verdict, reason = overall_verdict(directions, findings)

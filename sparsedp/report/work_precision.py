@@ -502,7 +502,7 @@ class Rows(Result):
 
     def pareto(self, error: str = "gradient_error") -> list[dict[str, Any]]:
         """Return the rows for which no other row has both less time and a smaller error, the fastest first."""
-        return [row for *_, row in plots.unbeaten(self._points(error))]
+        return [row for *_, row in plots.pareto_front(self._points(error))]
 
     def best(self, error: float, which: str = "gradient_error") -> dict[str, Any] | None:
         """Return the fastest row whose error is at most `error`, or None."""

@@ -15,7 +15,7 @@ from sparsedp.errors import ConvergenceError
 from sparsedp.solvers.algebraic_multigrid import check_multigrid_options, multigrid_engine
 from sparsedp.solvers.direct import check_precision, direct_engine
 from sparsedp.solvers.engine import EmptySystem
-from sparsedp.solvers.preconditioners import Near, krylov_engine
+from sparsedp.solvers.preconditioners import NearbyFactorization, krylov_engine
 from sparsedp.solvers.records import failure
 from sparsedp.solvers.separable import find_eigenbasis, separable_engine, transform_engine
 from sparsedp.solvers.structured_multigrid.engine import structured_engine, structured_if_suited
@@ -208,7 +208,7 @@ def _engine(system: System, choice: Choice, options: dict[str, Any], near: Engin
         OPTION_CHECKS[method](**options)
         return BlockTriangular(system, None)
     if near is not None and method == "direct":
-        return Near(system, getattr(near, "lu", near))
+        return NearbyFactorization(system, getattr(near, "lu", near))
     if choice.engine is not None and not options:
         return choice.engine
     build: Any = system.engine_builder or METHODS[method]

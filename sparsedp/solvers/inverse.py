@@ -187,8 +187,8 @@ def build(
         check_unknowns(system)
     engine = engine_of(system, choice, settings.options, near)
     name = name or f"inverse({op.name})"
-    made = build, (op, settings, name, None, solves, None, all_rows)
-    solver = Solver(system, engine, settings.nullspace, log or SolveLog(), name, made, choice.reason)
+    constructor_call = build, (op, settings, name, None, solves, None, all_rows)
+    solver = Solver(system, engine, settings.nullspace, log or SolveLog(), name, constructor_call, choice.reason)
     _record_set_up(solver, start_time)
     return Inverse(Solution(solver))
 

@@ -578,7 +578,9 @@ def find_fields(equation: Any, x: NDArray[Any], leaves: Sequence[Any]) -> tuple[
     """
     with recording() as calls, np.errstate(all="ignore"):
         equation(x, *leaves)
-    operators = [op for actors in calls.actors.values() for op in actors.values() if isinstance(op, Operator)]
+    operators = []
+    for method_objects in calls.method_objects.values():
+        operators += [op for op in method_objects.values() if isinstance(op, Operator)]
     space_of_shape = {}
     for op in reversed(operators):
         if op.domain.grid is not None:

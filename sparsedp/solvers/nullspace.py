@@ -15,7 +15,7 @@ from scipy.sparse import eye_array
 from scipy.sparse.linalg import splu
 
 from sparsedp._utils.validation import EPS
-from sparsedp.operators.structure.base import Turning
+from sparsedp.operators.structure.base import Transposable
 from sparsedp.solvers.scaling import dot, norm
 
 if TYPE_CHECKING:
@@ -162,7 +162,7 @@ class NullSpace:
         return anchors[labels[anchors] >= 0]
 
 
-class Projector(Turning):
+class Projector(Transposable):
     """The projection of `NullSpace.project` as a linear map; `inner` is the NullSpace."""
 
     def act(self, x: np.ndarray, out: np.ndarray) -> None:

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.calls import public
-from sparsedp._utils.reconstruction import Reconstructible
 from sparsedp._utils.validation import check_finite, check_kind, check_plain, check_shape, check_type
 from sparsedp.autodiff.backend import as_field, gathered
 from sparsedp.autodiff.derivative import of_argument
@@ -245,7 +245,7 @@ class EllipticSolver(ParametricSolver):
     name = "elliptic_solver"
 
     def recipe(self) -> tuple[type[EllipticSolver], tuple[Any, ...]]:
-        """Return the call that reconstructs this object, without its set-ups: see _utils/reconstruction.py."""
+        """Return the call that reconstructs this object, without its set-ups: see _utils/base_classes.py."""
         return EllipticSolver, (self.D, self.G, self._settings)
 
     @public("dp.elliptic_solver(D, G)")
@@ -622,7 +622,7 @@ class MatrixSolver(ParametricSolver):
         super().__init__(self._picking(self.rows, -1.0).T, self._picking(self.columns, 1.0), settings)
 
     def recipe(self) -> tuple[type[MatrixSolver], tuple[Any, ...]]:
-        """Return the call that reconstructs this object, without its set-ups: see _utils/reconstruction.py."""
+        """Return the call that reconstructs this object, without its set-ups: see _utils/base_classes.py."""
         return MatrixSolver, (self._pattern, self.domain, self._settings, self.assembly)
 
     def _picking(self, place, factor):

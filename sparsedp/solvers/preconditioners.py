@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     Precondition = Callable[[np.ndarray, bool], np.ndarray]  # precondition(r, transposed)
 
-__all__ = ["Near", "krylov_engine", "shifted_laplace"]
+__all__ = ["NearbyFactorization", "krylov_engine", "shifted_laplace"]
 
 # The d above. Erlangga and others (2004) take 0.5, for sweeps on every level; here they end where waves are of few
 # cells, and less damping is enough. Measured at 10 cells a wavelength, 512^2, to 1e-10: 206 iterations with 0.5, 134
@@ -43,7 +43,7 @@ LARGEST_RATIO = 0.4
 MOST_ITERATIONS = 12
 
 
-class Near(Engine):
+class NearbyFactorization(Engine):
     """The engine that preconditions with kept LU factors of a matrix nearby, and factors its own matrix if that fails.
 
     Parameters

@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.calls import public
 from sparsedp._utils.counters import note, thread
 from sparsedp._utils.pytree import mapped, power_of_two
-from sparsedp._utils.reconstruction import Reconstructible
 from sparsedp._utils.validation import check_function, check_takes, check_whole
 from sparsedp.autodiff.backend import NUMPY, collectively
 from sparsedp.autodiff.derivative import pullback, push
@@ -262,7 +262,7 @@ class Root(Reconstructible):
         self._solution = Rule(self.name, self._forward, self._vjp, self._jvp)
 
     def recipe(self) -> tuple[type[Root], tuple[Any, ...]]:
-        """Return the call that reconstructs this object: see _utils/reconstruction.py."""
+        """Return the call that reconstructs this object: see _utils/base_classes.py."""
         jacobians = self._default_jacobians
         return Root, (self.residual, jacobians.user_jacobian, jacobians.sparsity, self.maxiter, self._settings)
 

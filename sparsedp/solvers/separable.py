@@ -39,7 +39,7 @@ import scipy.linalg
 from sparsedp import kernels
 from sparsedp._utils.validation import EPS, check_type
 from sparsedp.operators.operator import Operator
-from sparsedp.operators.structure.base import Turning
+from sparsedp.operators.structure.base import Transposable
 from sparsedp.operators.structure.kronecker import Kronecker
 from sparsedp.operators.structure.lazy import Chain, Diagonal, Sum
 from sparsedp.solvers.engine import Engine
@@ -563,7 +563,7 @@ class Eigenbasis(NamedTuple):
     eigenvalues: NDArray[Any]
 
 
-class SpectralFunction(Turning):
+class SpectralFunction(Transposable):
     """The structure of a function f(A) of a Kronecker sum A: one pair of transforms.
 
     Parameters

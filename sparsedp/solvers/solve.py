@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Any
 import autograd.numpy as anp
 import numpy as np
 
+from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.counters import active, count, thread, timed
-from sparsedp._utils.reconstruction import Reconstructible
 from sparsedp._utils.validation import EPS, check_finite, number_beside, place
 from sparsedp.autodiff.tape import plain
 from sparsedp.errors import ConvergenceError, IncompatibleError, NonFiniteError
@@ -129,7 +129,7 @@ class Solver(Reconstructible):
     nullspace : "raise" or "project"
     log : SolveLog
     name : str
-    made : (function, arguments)
+    constructor_call : (function, arguments)
         A call that sets up the same inverse again. A pickle holds this call, and no factors or hierarchies.
     reason : str
         Why this method was chosen.
@@ -142,7 +142,7 @@ class Solver(Reconstructible):
         nullspace: str,
         log: SolveLog,
         name: str,
-        made: tuple | None,
+        constructor_call: tuple | None,
         reason: str = "",
     ) -> None:
         self.system = system
@@ -150,7 +150,7 @@ class Solver(Reconstructible):
         self.nullspace = nullspace
         self.log = log
         self.name = name
-        self.made = (_remade, made)
+        self.constructor_call = (_reconstruct_solver, constructor_call)
         self.reason = reason
         self.reused = not thread.calls  # for the counters: whether the next solve reuses the set-up
 
@@ -487,6 +487,6 @@ class Solver(Reconstructible):
         )
 
 
-def _remade(build: Callable, arguments: tuple) -> Solver:
+def _reconstruct_solver(build: Callable, arguments: tuple) -> Solver:
     """Reconstruct a Solver by the call that sets up its inverse."""
     return build(*arguments).solver

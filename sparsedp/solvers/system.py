@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 __all__ = ["System"]
 
 SYMMETRIC = 1e-13  # two products that should be equal may differ by this share of their sizes
-FAINT = 1e-3  # share of the size of the data, below which those of a component are scaled up before they are solved for
+# The data of a component are scaled up before the solve if they are below this share of the size of all data.
+SMALL_DATA_SHARE = 1e-3
 LARGEST_EXPONENT = 200  # an operator whose norm has a larger binary exponent is scaled: squares must not overflow
 LARGEST_SCALING = 1000  # binary exponent by which an operator is scaled at most
 
@@ -274,7 +275,7 @@ class System:
         if labels is None:
             return None
         sizes = self.counts(labels, np.abs(b), count)
-        faint = (sizes > 0) & (sizes < FAINT * size)
+        faint = (sizes > 0) & (sizes < SMALL_DATA_SHARE * size)
         if not np.any(faint):
             return None
         return np.where(faint, np.frexp(size / np.where(faint, sizes, 1.0))[1], 0)[labels]

@@ -283,7 +283,7 @@ def test_what_the_loss_raises_passes_through():
         dp.explain(lambda u: 1 / 0, U)
     from sparsedp._utils.counters import active, thread
 
-    assert not active and not thread.calls and not thread.witnesses
+    assert not active and not thread.calls and not thread.node_hooks
 
 
 def test_held_arrays_are_found_in_any_container():

@@ -86,7 +86,7 @@ def told(found):
 
 def left_over():
     mine = counters.thread
-    kept = len(mine.calls), len(mine.solve_hooks), len(mine.loop_hooks), len(mine.inner), len(mine.witnesses)
+    kept = len(mine.calls), len(mine.solve_hooks), len(mine.loop_hooks), len(mine.inner), len(mine.node_hooks)
     return len(counters.active), *kept, set(tape.untraced)
 
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp._utils.base_classes import Uncached
 from sparsedp._utils.counters import count
-from sparsedp._utils.reconstruction import Uncached
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -20,7 +20,7 @@ __all__ = [
     "INT32_LIMIT",
     "Matrix",
     "Structure",
-    "Turning",
+    "Transposable",
     "assembled",
     "compact",
     "probes",
@@ -169,7 +169,7 @@ class Matrix(Structure):
         return Matrix(self.matrix * factor)
 
 
-class Turning(Structure):
+class Transposable(Structure):
     """A map or its transpose, both computed by the same object `inner`; `transposed` selects one of them.
 
     Parameters

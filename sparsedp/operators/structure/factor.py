@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp._utils.reconstruction import Uncached
+from sparsedp._utils.base_classes import Uncached
 from sparsedp._utils.validation import check_finite
 from sparsedp.errors import NonFiniteError
 from sparsedp.kernels.reference import Rows, Tridiagonal

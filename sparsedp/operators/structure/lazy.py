@@ -13,7 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp import kernels
-from sparsedp._utils.reconstruction import Reconstructible
+from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.validation import check_shape
 from sparsedp.autodiff.tape_constants import frozen
 from sparsedp.errors import DerivativeError
@@ -205,7 +205,7 @@ class Functions(Reconstructible, Structure):
         self.dtype = np.dtype(dtype)
 
     def recipe(self) -> tuple:
-        """Return the call that builds an equal object: see _utils/reconstruction.py."""
+        """Return the call that builds an equal object: see _utils/base_classes.py."""
         return Functions, (self.forward, self.backward, self.domain, self.codomain, self.dtype)
 
     def apply(self, x: NDArray, out: NDArray) -> None:

@@ -23,7 +23,7 @@ from sparsedp.report.demo.terrain import Terrain, hidden_ground, remap
 from sparsedp.report.explain import total
 from sparsedp.report.scene_file import claim_folder
 
-__all__ = ["FILES", "Study", "grids_for", "prepare", "tell"]
+__all__ = ["FILES", "Study", "grids_for", "prepare", "run"]
 
 SMALLEST = 12  # smallest and largest number of cells along the longest side
 LARGEST = 512
@@ -34,7 +34,7 @@ ARRAYS = ("table.csv", "convergence.csv", "recovered.npy")
 PICTURES = ("truth.png", "recovery.png", "convergence.png")
 FILES = (*ARRAYS, *PICTURES)
 COUNTED = {"solves_forward": "solve", "solves_adjoint": "adjoint", "setups": "setup"}
-SHOWN = ("grid", "unknowns", "gradient", "iterations", *COUNTED, "seconds", "misfit", "error")
+TABLE_COLUMNS = ("grid", "unknowns", "gradient", "iterations", *COUNTED, "seconds", "misfit", "error")
 
 
 class Study(NamedTuple):
@@ -165,7 +165,7 @@ class _Progress:
 # ---------------------------------------------------------------- what the reader sees
 
 
-def tell(study: Study, folder: Path, force: bool) -> bool:
+def run(study: Study, folder: Path, force: bool) -> bool:
     """Run the demo, print the progress, and write the files.
 
     Parameters
@@ -195,7 +195,7 @@ def tell(study: Study, folder: Path, force: bool) -> bool:
         rows.append(row)
         runs.append(run)
     print("Error against run time. Misfit/noise 1: the readings are met to the noise. Error 1: the flat start.")
-    print(table_of(rows, SHOWN), end="\n\n")
+    print(table_of(rows, TABLE_COLUMNS), end="\n\n")
     claim_folder(folder, FILES, force)  # check again: files may have been created during the run
     write_file(folder / "table.csv", table_of(rows).csv())
     write_file(folder / "convergence.csv", table_of([iteration for run in runs for iteration in run]).csv())
@@ -206,7 +206,7 @@ def tell(study: Study, folder: Path, force: bool) -> bool:
         plots.write_picture(folder / "convergence.png", partial(_convergence, runs))
     except ImportError as error:
         print(f"No pictures: {error}")
-    print(f"Written to {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}", NEXT, sep="\n")
+    print(f"Written to {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}", NEXT_COMMANDS, sep="\n")
     return all(row["gradient"] == "agrees" for row in rows)
 
 
@@ -217,7 +217,7 @@ The law      -div(k grad p) = b, rivers at both ends in x, no flow through the o
 The task     find log k in every cell from the readings: L-BFGS through the adjoint, from a flat start
 """
 
-NEXT = """
+NEXT_COMMANDS = """
 To try next:
   python -m sparsedp demo --input FIELD.npy --out MINE    a field of your own, as .npy, .npz or .png
   python -m sparsedp check FILE.py                        is the gradient of the loss in a file right?

@@ -22,7 +22,7 @@ __all__ = ["Terrain", "hidden_ground", "load", "read_field", "remap"]
 SAMPLE = "jacksboro_fault_dem.npz"
 FINEST = 8  # largest number of points along an axis that are averaged to one cell
 STEEPEST = 3.5  # bound on |log k|, so that conductivities differ by a factor of at most 1000
-MOST = 10**8  # largest number of values in a file
+MOST_VALUES = 10**8  # largest number of values in a file
 LEAST = 4  # smallest number of values along an axis
 
 
@@ -170,8 +170,8 @@ def read_field(path: Path) -> np.ndarray:
         raise ValueError(f"{path} cannot be read ({reason}); save the field with numpy.save") from error
     if field.ndim != 2 or min(field.shape) < LEAST:
         raise ValueError(f"{path} needs a 2-D array, {LEAST} values or more along each axis, got shape {field.shape}")
-    if field.size > MOST:
-        raise ValueError(f"{path} holds {field.size} values, at most {MOST} are taken; thin it out first")
+    if field.size > MOST_VALUES:
+        raise ValueError(f"{path} holds {field.size} values, at most {MOST_VALUES} are taken; thin it out first")
     if field.dtype.kind not in "biuf":
         raise ValueError(f"{path} needs real numbers, got dtype {str(field.dtype)[:40]}; save it as floats")
     with np.errstate(over="ignore"):

@@ -1,4 +1,4 @@
-"""Pickling and copying of objects as the call that constructs them again, without their caches."""
+"""Base classes of objects that are pickled and copied as the call that constructs them, or that are immutable."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ class Reconstructible:
 
     Attributes
     ----------
-    made : (callable, tuple)
-        The call, unless the class overrides `recipe`.
+    constructor_call : (callable, tuple)
+        The function and its arguments, unless the class overrides `recipe`.
     """
 
     __slots__ = ()
-    made: Any
+    constructor_call: Any
 
     def recipe(self) -> tuple[Callable, tuple]:
         """Return the function and the arguments that construct the object again."""
-        return self.made
+        return self.constructor_call
 
     def __reduce__(self) -> Any:
         build, arguments = self.recipe()
@@ -102,7 +102,7 @@ class ReconstructibleFunction(Reconstructible):
     def __init__(self, function: Callable, build: Callable, *arguments: Any):
         update_wrapper(self, function)
         self.name = build.__name__
-        self.made = build, arguments
+        self.constructor_call = build, arguments
         self._function = function
 
     def __call__(self, *args: Any, **options: Any) -> Any:
@@ -131,11 +131,11 @@ class Frozen:
 
     Attributes
     ----------
-    meant : dict
+    attribute_suggestions : dict
         Maps attribute names of other libraries to the expression that the error message proposes instead.
     """
 
-    meant: Any = {}
+    attribute_suggestions: Any = {}
 
     def __init__(self, **values: Any):
         self.__dict__.update(values)
@@ -143,8 +143,10 @@ class Frozen:
     if not TYPE_CHECKING:  # a type checker reports an attribute that does not exist
 
         def __getattr__(self, name: str) -> Any:
-            if name in self.meant:
-                raise AttributeError(f"{type(self).__name__} has no attribute {name!r}; write {self.meant[name]}")
+            if name in self.attribute_suggestions:
+                raise AttributeError(
+                    f"{type(self).__name__} has no attribute {name!r}; write {self.attribute_suggestions[name]}"
+                )
             return object.__getattribute__(self, name)  # raises Python's own error
 
     def __setattr__(self, name: str, value: Any) -> None:
