@@ -5,6 +5,7 @@ Each function `check_*` raises an error if a value is invalid. Its argument `nam
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from decimal import ROUND_FLOOR, Context
@@ -30,6 +31,7 @@ __all__ = [
     "check_choice",
     "check_finite",
     "check_function",
+    "check_integer",
     "check_kind",
     "check_leaves",
     "check_native",
@@ -410,6 +412,17 @@ def check_whole(name: str, value: Any, least: int, advice: str = "") -> int:
     if not is_whole(value, least):
         raise ValueError(f"{name} must be a whole number >= {least}, got {_shown(value)}{advice}")
     return int(value)
+
+
+def check_integer(name: str, value: Any, least: int, advice: str = "") -> int:
+    """Return an integer >= `least` as an int; unlike `check_whole`, raise TypeError for floats such as 2.0."""
+    try:
+        number = operator.index(value)
+    except TypeError:
+        raise TypeError(f"{name} must be an integer, got {_shown(value)}{advice}") from None
+    if isinstance(value, bool) or number < least:
+        raise ValueError(f"{name} must be an integer >= {least}, got {value!r}{advice}")
+    return number
 
 
 def is_number(value: Any) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 from sparsedp._utils.calls import frames_inside
 from sparsedp._utils.counters import thread
 from sparsedp._utils.pytree import leaves
-from sparsedp._utils.validation import check_function, check_takes, check_whole
+from sparsedp._utils.validation import check_function, check_integer, check_takes, check_whole
 from sparsedp.autodiff.backend import collectively
 from sparsedp.autodiff.tape import dtype_of, innermost, is_variable, isbox, plain, through
 from sparsedp.autodiff.tape_constants import constant_args
@@ -61,7 +61,7 @@ def rollout(
         have no derivative.
     params : array, number, tree of these, or None
     n : int
-        Number of steps.
+        Number of steps. For steps of length dt up to the time T, write ``round(T / dt)``.
     inputs : array or tree of arrays, optional
         Values that change from step to step: step i gets entry i along the first axis of every array.
     memory : None, number of bytes, text such as "200 MB", or "reverse"
@@ -95,6 +95,8 @@ def rollout(
 
     Raises
     ------
+    TypeError
+        If n is not an integer; a float such as 3.0 is not one.
     ValueError
         If n, memory, keep or truncate is out of range, or if the step changes one of its arguments.
     ShapeError
@@ -155,7 +157,7 @@ def rollout(
     check_function("rollout", step, "lambda state, params: ...")
     if isbox(n):
         raise DerivativeError("rollout needs n as a plain whole number, got a traced value; it has no derivative")
-    n = check_whole("n of rollout", n, 0, "; give the number of steps")
+    n = check_integer("n of rollout", n, 0, "; for a time T write round(T / dt)")
     trees = {"state": state, "params": params}
     if inputs is not None:
         trees["inputs"] = inputs

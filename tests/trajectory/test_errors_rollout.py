@@ -15,6 +15,7 @@ U = np.array([1.0, 2.0, 3.0])
 Pair = namedtuple("Pair", "ink wind")
 SHAPE = ShapeError
 VALUE = ValueError
+TYPE = TypeError
 FINITE = NonFiniteError
 NONE = DerivativeError
 
@@ -120,9 +121,31 @@ def grad(loss):
 
 TABLE = [
     # what is given
-    (roll(n=-1), VALUE, "n of rollout must be a whole number >= 0, got -1; give the number of steps"),
-    (roll(n=2.5), VALUE, "n of rollout must be a whole number >= 0, got 2.5; give the number of steps"),
-    (roll(n=True), VALUE, "n of rollout must be a whole number >= 0, got True; give the number of steps"),
+    (
+        roll(n=-1),
+        VALUE,
+        "n of rollout must be an integer >= 0, got -1; for a time T write round(T / dt)",
+    ),
+    (
+        roll(n=True),
+        VALUE,
+        "n of rollout must be an integer >= 0, got True; for a time T write round(T / dt)",
+    ),
+    (
+        roll(n=0.3 / 0.1),
+        TYPE,
+        "n of rollout must be an integer, got 2.9999999999999996; for a time T write round(T / dt)",
+    ),
+    (
+        roll(params=3, n=1.0),
+        TYPE,
+        "n of rollout must be an integer, got 1.0; for a time T write round(T / dt)",
+    ),  # exchanged arguments
+    (
+        roll(n=np.ones(3)),
+        TYPE,
+        "n of rollout must be an integer, got an array of shape (3,); for a time T write round(T / dt)",
+    ),
     (
         grad(traced_number),
         NONE,
