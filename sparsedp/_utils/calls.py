@@ -172,7 +172,9 @@ def _misfit(form, written, advice, args, options):
     takes_any_keyword = any(parameter.kind is Parameter.VAR_KEYWORD for parameter in parameters.values())
     for name in options:
         if name not in parameters and not takes_any_keyword:
-            return TypeError(f"{written} has no argument {name!r}; write {_instead(name, parameters) or example}")
+            return TypeError(
+                f"{written} has no argument {name!r}; write {_suggested_argument(name, parameters) or example}"
+            )
     by_position = Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD
     positional = [parameter for parameter in parameters.values() if parameter.kind in by_position]
     if len(given) > len(positional):
@@ -203,7 +205,7 @@ def foreign_keyword_advice(name: str, parameters: Container[str]) -> str | None:
     return None
 
 
-def _instead(name, parameters):
+def _suggested_argument(name, parameters):
     """Return the argument to write in place of an unknown keyword argument, or None."""
     advice = foreign_keyword_advice(name, parameters)
     if advice:

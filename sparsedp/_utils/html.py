@@ -15,7 +15,7 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-__all__ = ["Markup", "cell", "curves", "facts", "folded", "paragraphs", "spy", "table", "text_of"]
+__all__ = ["Markup", "cell", "curves", "facts", "folded_list", "paragraphs", "spy", "table", "text_of"]
 
 # Palette of Okabe and Ito, which colour-blind readers can distinguish.
 COLOURS = "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#999999"
@@ -82,7 +82,7 @@ def paragraphs(lines: Iterable, tag: str = "p") -> Markup:
     return Markup("\n".join(f"<{tag}>{cell(line)}</{tag}>" for line in lines))
 
 
-def folded(title: str, lines: Sequence) -> Markup:
+def folded_list(title: str, lines: Sequence) -> Markup:
     """Return a list of lines that is hidden until the user clicks on the title; an empty string without lines."""
     if not lines:
         return Markup("")

@@ -80,7 +80,7 @@ class DirectionEvidence:
     is_resolved, is_close, is_wrong, is_zero, is_flat : bool
         True if, in this order: the error bar is small; gap and error bar are small; the gap is significant; slope and
         error bar are negligible relative to the curvature; the first-order term is too small to measure order 1.
-    left_by_solves, left_by_steps : float
+    solve_remainder, step_remainder : float
         Largest gaps that may be due to the tolerance of solves and of time steps.
     digits : float
         Number of digits in which gradient and difference agree.
@@ -126,8 +126,8 @@ class DirectionEvidence:
     is_wrong: bool = False
     is_zero: bool = False
     is_flat: bool = False
-    left_by_solves: float = nan
-    left_by_steps: float = nan
+    solve_remainder: float = nan
+    step_remainder: float = nan
     digits: float = 0.0
     first_levels: int = 0
     first_order: float = nan
@@ -397,8 +397,8 @@ def _compare_gap_and_bar(evidence: DirectionEvidence) -> None:
     close = min(THRESHOLDS.bars_agree * bar, THRESHOLDS.resolved_share * scale - bar)
     evidence.is_close = bool(evidence.is_resolved and size <= max(close, agreement * scale))
     by_tolerance = THRESHOLDS.solve_remainder_tolerances * evaluations.tolerance * max(base, scale)
-    evidence.left_by_solves = max(THRESHOLDS.solve_remainder_share * base, by_tolerance) * evaluations.solved
-    evidence.left_by_steps = THRESHOLDS.step_remainder_tolerances * evaluations.step_tolerance * scale
+    evidence.solve_remainder = max(THRESHOLDS.solve_remainder_share * base, by_tolerance) * evaluations.solved
+    evidence.step_remainder = THRESHOLDS.step_remainder_tolerances * evaluations.step_tolerance * scale
     if evidence.is_zero:
         reference = evidence.curvature
     else:
@@ -513,9 +513,9 @@ def _without_any_change(evidence: DirectionEvidence) -> tuple[str, str]:
 def _with_a_significant_gap(evidence: DirectionEvidence) -> tuple[str, str]:
     """Return word and reason if the gap is larger than its error bar."""
     off = f"off by {evidence.share:.1e}"
-    if evidence.size <= evidence.left_by_solves:
+    if evidence.size <= evidence.solve_remainder:
         return "noise", f"{off}: solves may leave this in such a loss, tighten their rtol"
-    if evidence.size <= evidence.left_by_steps:
+    if evidence.size <= evidence.step_remainder:
         tolerance = evidence.line.evaluations.step_tolerance
         return "loose steps", f"{off}: the steps' tolerance of {tolerance:g} leaves this, tighten it"
     # If the noise is larger than the difference itself, the loss may be chaotic and the gradient correct.
@@ -530,8 +530,8 @@ def _with_a_small_gap(evidence: DirectionEvidence) -> tuple[str, str]:
     fewest = THRESHOLDS.fewest_orders
     is_noisy = evidence.jitter > THRESHOLDS.rounding_noise
     if evidence.is_close and is_noisy and evidence.bar > THRESHOLDS.noisy_agreement_share * evidence.scale:
-        loudness = evidence.jitter * evidence.line.evaluations.eps
-        return "masked", f"noise of {loudness:.0e} of the loss leaves {evidence.digits:.1f} digits, 6 are needed"
+        relative_noise = evidence.jitter * evidence.line.evaluations.eps
+        return "masked", f"noise of {relative_noise:.0e} of the loss leaves {evidence.digits:.1f} digits, 6 are needed"
     orders = (evidence.first_levels, evidence.first_order), (evidence.second_levels, evidence.second_order)
     if any(levels >= fewest and np.isnan(order) for levels, order in orders):
         return "few", f"no two usable steps are a factor {THRESHOLDS.pair_ratio:g} apart: orders cannot be read"

@@ -69,7 +69,7 @@ def examine_directions(
         noise, deviation = measure_noise(line)
         evaluations.noise = max(evaluations.noise, noise)
         evaluations.deviation = max(evaluations.deviation, deviation)
-    directions = [_examine_line(line, seek_ripples=line is lines[0]) for line in lines]
+    directions = [_examine_line(line, search_ripples=line is lines[0]) for line in lines]
     if callable(evaluations.gradient):
         for direction in directions:
             if direction.word == "disagrees":
@@ -108,13 +108,13 @@ def _first_non_finite(values: NDArray[Any]) -> str:
     return f", the first at {place(int(np.argmin(is_finite)), is_finite.shape)}"
 
 
-def _examine_line(line: Line, seek_ripples: bool) -> DirectionEvidence:
+def _examine_line(line: Line, search_ripples: bool) -> DirectionEvidence:
     """Evaluate the loss along a line and return the evidence. Add more steps if there is no decision.
 
     Parameters
     ----------
     line : Line
-    seek_ripples : bool
+    search_ripples : bool
         If True, and the loss has noise, also try steps far below the plateau when gradient and differences agree.
     """
     line.sweep(line.evaluations.steps)
@@ -132,7 +132,7 @@ def _examine_line(line: Line, seek_ripples: bool) -> DirectionEvidence:
         extended = weigh(line)
         if not evidence.resolution < extended.resolution:
             evidence = extended
-    if seek_ripples and evidence.is_close and evidence.jitter > THRESHOLDS.smooth_noise:
+    if search_ripples and evidence.is_close and evidence.jitter > THRESHOLDS.smooth_noise:
         line.sweep(RIPPLE_STEPS)
         _note_ripple(evidence, weigh(line))
     return evidence
@@ -248,7 +248,7 @@ def _is_not_additive(evidence: DirectionEvidence) -> bool:
     difference = 0.0
     bar = evidence.bar
     for part in (first, line.direction - first):
-        part_evidence = _examine_line(Line(line.name, part, line.evaluations), seek_ripples=False)
+        part_evidence = _examine_line(Line(line.name, part, line.evaluations), search_ripples=False)
         difference += part_evidence.difference
         bar += part_evidence.bar
     gap = evidence.difference - difference

@@ -9,7 +9,7 @@ import numpy as np
 
 from sparsedp._utils.base_classes import Frozen
 from sparsedp._utils.calls import deprecated_attribute
-from sparsedp._utils.html import Markup, curves, folded, paragraphs
+from sparsedp._utils.html import Markup, curves, folded_list, paragraphs
 from sparsedp._utils.validation import number_beside
 from sparsedp.check.table import Table, table_of
 
@@ -77,7 +77,7 @@ class Result(Frozen):
                 blocks.append(part.html())
             elif part not in omissions:
                 blocks.append(paragraphs([part]))
-        return Markup("\n".join([*blocks, folded("What was skipped", self.skipped)]))
+        return Markup("\n".join([*blocks, folded_list("What was skipped", self.skipped)]))
 
     def curves(self) -> tuple[dict[str, Any], str, str]:
         """Return curves to plot on logarithmic axes. The default is no curves; subclasses may override it.

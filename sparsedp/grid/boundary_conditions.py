@@ -461,12 +461,12 @@ def _sides(axis, entry, kind):
     sides = entry
     if not (isinstance(sides, (tuple, list)) and len(sides) == 2 and all(isinstance(s, kind) for s in sides)):
         raise TypeError(
-            f"boundary on {axis} needs {kind.choices} or a pair of them, got {entry!r}{_instead(sides, kind)}"
+            f"boundary on {axis} needs {kind.choices} or a pair of them, got {entry!r}{_advice(sides, kind)}"
         )
     return tuple(sides)
 
 
-def _instead(sides, kind):
+def _advice(sides, kind):
     """Return advice for an entry that is not a condition of type `kind`; an empty string if there is none."""
     first = sides
     if isinstance(sides, (tuple, list)) and sides:

@@ -302,7 +302,7 @@ class BlackBox(Reconstructible):
     # ------------------------------------------------------------ one Jacobian
 
     def _steps(self, x):
-        return DIFFERENCE_STEP * np.maximum(np.abs(x), typical(x))
+        return DIFFERENCE_STEP * np.maximum(np.abs(x), typical_size(x))
 
     def _product(self, x, way):
         """Return the product of the Jacobian at x with a vector, as a function of the vector."""
@@ -360,14 +360,14 @@ class BlackBox(Reconstructible):
             except MemoryError:
                 raise
             except Exception as error:  # f does not accept complex numbers, or a point this far from x
-                trouble = error
+                failure = error
                 continue
             probed = True
             if not wrong.any():
                 self.way = self.way or way[0]
                 break
         if not probed:
-            raise trouble
+            raise failure
         return matrix, wrong
 
     def _disagreeing_rows(self, matrix, x, way, share):
@@ -394,16 +394,16 @@ def _with_rows(matrix, other, rows):
 
 def _wrong_rows(matrix, v, along, way):
     """Return a mask of the rows in which ``matrix @ v`` differs too much from the derivative ``along(v)``."""
-    lacks = along(v) - matrix @ v
+    missing = along(v) - matrix @ v
     size = abs(matrix) @ np.abs(v)
     share, floor = TOLERANCES[way]
-    wrong = ~(np.abs(lacks) <= share * size + floor * np.max(size, initial=0.0))
-    doubtful = ~wrong & (np.abs(lacks) > LARGEST_ROUNDING * size)
+    wrong = ~(np.abs(missing) <= share * size + floor * np.max(size, initial=0.0))
+    doubtful = ~wrong & (np.abs(missing) > LARGEST_ROUNDING * size)
     if way == DIFFERENCES and doubtful.any():
         # The error of a missing entry is proportional to the step, however small the entry is; rounding errors are
         # not. This test also finds errors in rows far below the largest row, such as rows with other units.
-        gaps = [along(times * v) - times * (matrix @ v + lacks) for times in STEP_MULTIPLES]
-        wrong |= doubtful & (lacks != 0) & ~np.any(np.abs(gaps) > 0.1 * np.abs(lacks), axis=0)
+        gaps = [along(times * v) - times * (matrix @ v + missing) for times in STEP_MULTIPLES]
+        wrong |= doubtful & (missing != 0) & ~np.any(np.abs(gaps) > 0.1 * np.abs(missing), axis=0)
     return wrong
 
 
@@ -415,12 +415,12 @@ def change(run: Callable, x: NDArray, y: NDArray, v: NDArray) -> NDArray:
     """
     for share in MOVE_SHARES:
         with suppress(*EVALUATION_ERRORS):
-            moved = run(x + 0.1 * share * typical(x) * v)
+            moved = run(x + 0.1 * share * typical_size(x) * v)
             if np.all(np.isfinite(moved)):
                 return moved - y
     return np.zeros_like(y)
 
 
-def typical(x: NDArray) -> float:
+def typical_size(x: NDArray) -> float:
     """Return the root mean square of an array, or 1 if that is 0 or the array is empty."""
     return norm(x) / np.sqrt(max(x.size, 1)) or 1.0

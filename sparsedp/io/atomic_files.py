@@ -154,7 +154,7 @@ def save_tree(path: str | os.PathLike, tree: Any, kind: str) -> None:
     The structure is stored as JSON in the same file. `kind` names the format; `load_tree` checks it.
     """
     arrays: list = []
-    text = json.dumps({"format": kind, "tree": _words(tree, arrays)})
+    text = json.dumps({"format": kind, "tree": _to_json(tree, arrays)})
 
     def write(stream):
         np.savez(stream, np.frombuffer(text.encode(), np.uint8), *arrays)
@@ -186,15 +186,15 @@ def load_tree(path: str | os.PathLike, kind: str) -> tuple[Any] | None:
             return None
 
 
-def _words(tree, arrays):
+def _to_json(tree, arrays):
     """Return a tree as plain data for JSON. Arrays are appended to the list `arrays` and replaced by their number."""
     if isinstance(tree, dict):
         if not all(isinstance(key, str) for key in tree):
             raise TypeError("save needs dicts with strings as keys; write str(key)")
-        return {"dict": [[key, _words(branch, arrays)] for key, branch in tree.items()]}
+        return {"dict": [[key, _to_json(branch, arrays)] for key, branch in tree.items()]}
     for kind, sequence in SEQUENCES.items():
         if isinstance(tree, sequence):
-            return {kind: [_words(branch, arrays) for branch in tree]}
+            return {kind: [_to_json(branch, arrays) for branch in tree]}
     if isinstance(tree, (np.ndarray, np.generic)) and tree.dtype.kind in "biufc":
         arrays.append(np.asarray(tree))
         return {"array": len(arrays)}

@@ -82,8 +82,8 @@ class Agreement:
         state.last = self
         self._mark = 0
         self._log: deque = deque(maxlen=100)  # (label, mark) of each call of `record` since the last message
-        self._mine = np.zeros(8 + DATA_BYTES, np.uint8)
-        self._all = np.zeros((comm.size, 8 + DATA_BYTES), np.uint8)
+        self._sent = np.zeros(8 + DATA_BYTES, np.uint8)
+        self._received = np.zeros((comm.size, 8 + DATA_BYTES), np.uint8)
 
     # ------------------------------------------------------------ checks that ranks agree
 
@@ -122,15 +122,15 @@ class Agreement:
             self._raise_together()
         else:
             self._refuse()
-        return self._all[:, 8 : 8 + len(content)].tobytes()
+        return self._received[:, 8 : 8 + len(content)].tobytes()
 
     def _send(self, head: bytes, content: bytes) -> bytes:
         """Send a mark and some bytes to all ranks; return the marks of all ranks."""
         state.messages += 1
         state.last = self
-        self._mine[: 8 + len(content)] = np.frombuffer(head + content, np.uint8)
-        self.comm.Allgather(self._mine, self._all)
-        return self._all[:, :8].tobytes()
+        self._sent[: 8 + len(content)] = np.frombuffer(head + content, np.uint8)
+        self.comm.Allgather(self._sent, self._received)
+        return self._received[:, :8].tobytes()
 
     def _refuse(self):
         """Raise ValueError, with the first difference between the logs of the ranks in its message."""

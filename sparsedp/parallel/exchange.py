@@ -87,15 +87,15 @@ class Exchange:
         ranks, places = layout.owners(parts, entries)
         counts = np.array([leaves.size, np.count_nonzero(ranks != layout.comm.rank)])
         self.agreement = layout.agreement
-        self.busy, self.crossing = map(int, layout.sum(counts))  # sums over all ranks
+        self.entry_count, self.sent_count = map(int, layout.sum(counts))  # sums over all ranks
         self.read = Windows(size, shapes, windows)
         self.block = Windows(layout.size(parts), layout.shapes(parts), block_windows)
-        if self.busy:
+        if self.entry_count:
             PETSc.garbage_cleanup(layout.comm)  # frees PETSc objects without references, a collective operation
-            self._forest = PETSc.SF().create(layout.comm)
+            self._star_forest = PETSc.SF().create(layout.comm)
             remote = np.stack([ranks, places], axis=1).astype(PETSc.IntType)
-            self._forest.setGraph(self.block.size, leaves.astype(PETSc.IntType), remote)
-            self._forest.setUp()
+            self._star_forest.setGraph(self.block.size, leaves.astype(PETSc.IntType), remote)
+            self._star_forest.setUp()
 
     def forward(self, flat: NDArray) -> NDArray:
         """Return the needed entries as a flat array, given the flat block of this rank."""
@@ -115,15 +115,15 @@ class Exchange:
 
     def _exchange(self, operation: str, combine: Any, values: NDArray, out: NDArray) -> NDArray:
         """Communicate entries by an operation of PetscSF, and combine them with the entries of `out`."""
-        if self.busy:
+        if self.entry_count:
             self.agreement.synchronize("exchange")
             if np.may_share_memory(out, values):
                 out = out.copy()
             for stage in ("Begin", "End"):
-                getattr(self._forest, operation + stage)(KINDS[values.dtype.char], values, out, combine)
-        if self.crossing:
+                getattr(self._star_forest, operation + stage)(KINDS[values.dtype.char], values, out, combine)
+        if self.sent_count:
             count("ranks", "exchange")
-            count("ranks", "sent", self.crossing * values.itemsize)
+            count("ranks", "sent", self.sent_count * values.itemsize)
         return out
 
 

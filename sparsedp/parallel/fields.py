@@ -25,7 +25,7 @@ from sparsedp.errors import ShapeError
 from sparsedp.grid.space import Space
 from sparsedp.parallel.agreement import Agreement, state
 
-__all__ = ["DistributedField", "alike", "block", "everywhere", "total"]
+__all__ = ["DistributedField", "converted_like", "block", "everywhere", "total"]
 
 
 class DistributedField(np.lib.mixins.NDArrayOperatorsMixin):
@@ -342,7 +342,7 @@ def everywhere(x: Any, space: Space) -> Any:
     return _spread(np.shape(value), space)[0](x)
 
 
-def alike(derivative: Any, value: Any) -> Any:
+def converted_like(derivative: Any, value: Any) -> Any:
     """Convert a cotangent or tangent to the kind of its value: a number, a whole array, or a distributed field."""
     plain_value = plain(value)
     if isinstance(plain_value, DistributedField):
@@ -356,7 +356,7 @@ def alike(derivative: Any, value: Any) -> Any:
 
 def total(x: Any) -> Any:
     """Return the sum of all entries. Differentiable."""
-    return alike(x, 0.0)
+    return converted_like(x, 0.0)
 
 
 def formulas(fun: Callable, value: Any, args: Sequence[Any], nums: Sequence[int]) -> tuple | None:
@@ -382,7 +382,7 @@ def formulas(fun: Callable, value: Any, args: Sequence[Any], nums: Sequence[int]
 
         def pull(g):
             derivatives = pull_fields(everywhere(g, space))
-            return [alike(derivative, args[num]) for num, derivative in zip(nums, derivatives, strict=True)]
+            return [converted_like(derivative, args[num]) for num, derivative in zip(nums, derivatives, strict=True)]
 
         return pull, ()
 
@@ -513,8 +513,8 @@ class DistributedKind(ArrayKind):
         return formulas(fun, value, args, nums)
 
     def match(self, derivative: Any, value: Any) -> Any:
-        """See `alike`."""
-        return alike(derivative, value)
+        """See `converted_like`."""
+        return converted_like(derivative, value)
 
     def collectively(self, what: str, arguments: Any, act: Callable, *args: Any) -> Any:
         """See `together`."""

@@ -242,7 +242,7 @@ class Ensemble(Reconstructible):
                 futures += map(self._submitted, chunks)
             for number in shown_steps(self._progress, range(len(chunks)), "scenes"):
                 if futures:
-                    parts = self._answer(chunks[number], futures[number])
+                    parts = self._result_of_task(chunks[number], futures[number])
                 else:
                     parts = _sum(*chunks[number])
                 total = _added(total, parts)
@@ -263,12 +263,12 @@ class Ensemble(Reconstructible):
         keys = [(n, weight, pickled[0]) for n, weight, pickled in scenes]
         return self._executor.submit(_run_pickled, [*pickles], data_of_key, task, loss[0], point, keys, count)
 
-    def _answer(self, chunk, future):
+    def _result_of_task(self, chunk, future):
         """Return the result of a task. If its worker's cache lacks an object, submit the task again with the object."""
         keys, worker, parts = future.result()
         if parts is None:
             self._held_keys[worker] = set()
-            return self._answer(chunk, self._submitted(chunk))
+            return self._result_of_task(chunk, self._submitted(chunk))
         self._held_keys.setdefault(worker, set()).update(keys)
         return parts
 

@@ -86,7 +86,7 @@ class RecordedSolve(NamedTuple):
     iterative: bool
 
 
-def _always(key: SolveKey) -> bool:
+def _every_solve(key: SolveKey) -> bool:
     """Correct each solve."""
     return True
 
@@ -116,7 +116,7 @@ class RecordedSolves(dict[SolveKey, RecordedSolve]):
     def __init__(
         self,
         earlier: dict[SolveKey, RecordedSolve] | None = None,
-        correct: Callable[[SolveKey], bool] | None = _always,
+        correct: Callable[[SolveKey], bool] | None = _every_solve,
         share: float = SHARE,
     ) -> None:
         super().__init__()

@@ -6,7 +6,7 @@ import base64
 from collections.abc import Sequence
 from pathlib import Path
 
-from sparsedp._utils.html import cell, curves, folded
+from sparsedp._utils.html import cell, curves, folded_list
 from sparsedp.check.summary import Result
 
 __all__ = ["page", "section"]
@@ -95,7 +95,7 @@ def page(title: str, verdict: str, meaning: str, sections: Sequence[str], skippe
 <h1>{cell(title)}</h1>
 <p class="verdict {verdict}"><strong>{verdict}</strong>. {cell(meaning)}</p>
 {"".join(sections)}
-{folded("What this report skipped", skipped)}
+{folded_list("What this report skipped", skipped)}
 <script>{SORTING}</script>
 </body>
 </html>

@@ -485,9 +485,9 @@ def not_finite(scene: Scene, name: str, x: NDArray[Any]) -> Iterator[Case]:
     if not np.max(slope, initial=0.0) > 0:
         return
     for bad in (nan, inf):
-        spoilt = np.array(x)
-        spoilt.flat[np.argmax(slope)] = bad
-        yield f"one {bad}", spoilt, partial(grade_refusal, located=True)
+        with_bad_entry = np.array(x)
+        with_bad_entry.flat[np.argmax(slope)] = bad
+        yield f"one {bad}", with_bad_entry, partial(grade_refusal, located=True)
 
 
 def kinds_of_arrays(scene: Scene, name: str, x: NDArray[Any]) -> Iterator[Case]:

@@ -291,7 +291,7 @@ class Solver(Reconstructible):
         residual = data
         length = 0.0  # norm of x
         status = ""
-        trouble = ""
+        failure = ""
         if start is not None:
             r, residual, length = system.residual(start, b, transposed)
             if singular:
@@ -305,7 +305,7 @@ class Solver(Reconstructible):
             accuracy = goal
             if x is not None:
                 accuracy = max(goal, system.rounding(x, data, transposed))
-            trial, iterations, trouble = engine.solve(r, accuracy, transposed)
+            trial, iterations, failure = engine.solve(r, accuracy, transposed)
             run.iterations += iterations
             if system.active is not None:
                 trial = system.masked(trial)
@@ -316,11 +316,11 @@ class Solver(Reconstructible):
             trial_r, trial_residual, trial_length = system.residual(trial, b, transposed)
             reduced = trial_residual <= engine.reduction * residual
             if not np.isfinite(trial_residual):
-                trouble = "nonfinite_output"
+                failure = "nonfinite_output"
             elif trial_residual <= residual or x is None:
                 x, r, residual, length = trial, trial_r, trial_residual, trial_length
                 status = run.assess(residual, goal, data, size_of_matrix * length + data, LARGEST_AT_ROUNDOFF * data)
-            if trouble or not reduced or not engine.refines or status == "converged":
+            if failure or not reduced or not engine.refines or status == "converged":
                 break
             # If rows differ in size, more accuracy is attainable than the bound with |A| tells: refine further.
             if status and x is not None and residual <= 2 * system.rounding(x, data, transposed):
@@ -329,7 +329,7 @@ class Solver(Reconstructible):
             x = np.zeros_like(b)
             run.residual = 1.0
             run.backward_error = 1.0
-        run.status = status or trouble or "stagnated"
+        run.status = status or failure or "stagnated"
         return x
 
     def solve_once(
@@ -384,18 +384,18 @@ class Solver(Reconstructible):
         data = np.array(plain(b), dtype=float).reshape(-1)
         size = norm(data)
         goal = run.rtol * size
-        x, run.iterations, trouble = self.engine.unroll(anp.reshape(r, (-1,)), goal, transposed)
+        x, run.iterations, failure = self.engine.unroll(anp.reshape(r, (-1,)), goal, transposed)
         x = anp.reshape(x, op.domain.shape)
         if start is not None:
             x = x + start
         solution = shifted(np.array(plain(x)).reshape(-1), system.exponent)
         _, residual, length = system.residual(solution, data, transposed)
-        run.status = trouble
-        if trouble == "" or not residual:
+        run.status = failure
+        if failure == "" or not residual:
             run.status = "converged" if data.any() else "exact_zero_rhs"
         run.assess(residual, goal, size, system.norms[transposed] * length + size)
         self.log.note(run.info(), transposed)
-        if run.status == trouble and self.engine.refines:
+        if run.status == failure and self.engine.refines:
             raise self._not_converged(run, plain(x), "unrolled ")
         return x
 
