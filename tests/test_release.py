@@ -10,6 +10,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.version import Version
 from pages import tomllib
 from sources import ROOT
 
@@ -72,11 +73,26 @@ def test_the_checklist_names_every_line_with_the_version():
 
 def test_the_checklist_says_what_the_next_version_is():
     [following] = re.findall(r"the next release is (\d+\.\d+\.\d+)\.", CHECKLIST)
-    assert numbers(following) > numbers(PROJECT["version"])
+    assert Version(following) > Version(PROJECT["version"])
 
 
-def numbers(version):
-    return tuple(map(int, version.split(".")))
+@pytest.mark.parametrize("version", [PROJECT["version"], "0.2.0", "0.3.0rc1", "0.3.0", "1.0.0rc12"])
+def test_versions_are_written_as_the_index_writes_them(version):
+    """The version is the name of the files, the tag, and the heading in CHANGELOG.md."""
+    assert re.fullmatch(r"\d+\.\d+\.\d+(rc[1-9]\d*)?", version) and str(Version(version)) == version
+
+
+def is_overdue(removal, version):
+    """Whether a name that is removed in `removal` may not be in `version`; a candidate counts as its release."""
+    return Version(version).release[:2] >= Version(removal).release
+
+
+@pytest.mark.parametrize(
+    ("version", "overdue"),
+    [("0.4.9", False), ("0.5.0rc1", True), ("0.5.0", True), ("0.10.0", True), ("1.0.0rc1", True)],
+)
+def test_a_removal_is_due_from_its_first_candidate(version, overdue):
+    assert is_overdue("0.5", version) == overdue
 
 
 def removals():
@@ -91,7 +107,7 @@ def removals():
 def test_no_deprecated_name_is_overdue():
     found = list(removals())
     assert len(found) > len(sparsedp._DEPRECATED)
-    assert not [place for place, removal in found if numbers(PROJECT["version"])[:2] >= numbers(removal)]
+    assert not [place for place, removal in found if is_overdue(removal, PROJECT["version"])]
 
 
 def test_the_recipe_asks_for_what_the_project_asks_for():
@@ -131,6 +147,12 @@ def test_the_workflow_runs_on_every_system_and_python_that_is_promised():
     assert matrix["python"] == promised == [f"3.{minor}" for minor in range(10, 15)]
     assert [system.removesuffix("-latest") for system in matrix["os"]] == ["ubuntu", "macos", "windows"]
     assert "3.10" in workflow()["oldest"]["strategy"]["matrix"]["python"]
+
+
+def test_the_workflow_runs_on_the_tags_of_the_checklist():
+    tags = re.findall(r"git tag -a (\S+) ", CHECKLIST)
+    assert tags == ["vX.Y.Z"]
+    assert read(".github/workflows/ci.yml")[True]["push"] == {"branches": ["main"], "tags": ["v*"]}  # YAML: on is true
 
 
 def test_ci_run_goes_through_its_jobs():
