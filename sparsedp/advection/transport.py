@@ -16,7 +16,7 @@ from sparsedp.advection.method import Identity, TransportMethod
 from sparsedp.advection.rule import rule_of
 from sparsedp.advection.semi_lagrangian import SemiLagrangian
 from sparsedp.advection.settings import TransportSettings
-from sparsedp.autodiff.tape import isbox
+from sparsedp.autodiff.tape import isbox, plain
 from sparsedp.errors import DerivativeError
 from sparsedp.grid.boundary_conditions import dirichlet, neumann, resolve
 from sparsedp.grid.grid import check_grid
@@ -117,13 +117,13 @@ def transport(
     Transport
         ``move(u, v, dt, inflow=0.0)`` returns the field after the step. u [unit], v [length / time], dt [time]; inflow
         [unit] is a number, or an array with one value for each point of ``move.walls`` (x-lower, x-upper, y-lower, ...,
-        for each component in turn).
+        for each component in turn). Values at sides that are not dirichlet are not used.
 
     Raises
     ------
     ValueError
         If an option has another value than those above or is not used by the scheme, or if a condition is neither
-        dirichlet nor neumann. On use, if dt <= 0.
+        dirichlet nor neumann. On use, if dt <= 0, or if inflow is traced or not 0 although no side is dirichlet.
     UnstableStepError
         On use, if dt is too large for the stability of the scheme.
     NonFiniteError, ShapeError, TypeError
@@ -258,7 +258,20 @@ class Transport(Frozen, Reconstructible):
     @public("dp.transport(grid)")
     def __call__(self, u: Any, v: Any, dt: Any, inflow: Any = 0.0) -> Any:
         """Return the field after one step, a new array; differentiable in every argument."""
+        if not (type(inflow) is float and inflow == 0):
+            self._check_inflow(inflow)
         return self._rule(u, v, dt, inflow)
+
+    def _check_inflow(self, inflow: Any) -> None:
+        """Raise ValueError if no side uses the inflow values. Constant zeros and empty arrays are accepted."""
+        if any(condition == dirichlet for pair in self.settings.sides for condition in pair or ()):
+            return
+        values = plain(inflow)
+        if np.any(values) or (isbox(inflow) and np.size(values)):
+            raise ValueError(
+                f"{self.method.name} uses inflow values at sides of dp.dirichlet only, and boundary= has none; write "
+                "boundary=dp.dirichlet, or leave the inflow out"
+            )
 
     @property
     def space(self) -> Space:

@@ -152,8 +152,9 @@ def flow_step(
     ------
     ValueError
         If dt or the viscosity is out of range, a scalar has an entry other than those four, a friction is given with
-        implicit viscosity, `inflow` is given without an inflow boundary, or an array as `walls` does not determine the
-        tangential velocity at an inflow boundary. On use, if a friction is < 0 or complex.
+        implicit viscosity, `inflow` is given without an inflow boundary, an array as `walls` without a side that has a
+        tangential velocity, or it does not determine the tangential velocity at an inflow boundary. On use, if a
+        friction is < 0 or complex.
     ShapeError
         If `walls` is an array of another shape than the faces. On use, if the state does not have the entries that
         ``step.start`` returns, or a force, friction, source, inflow or wall velocity has the wrong shape.

@@ -41,11 +41,21 @@ def moving_walls(settings: FlowSettings, sides: tuple) -> WallsAtRest:
     settings : FlowSettings
     sides : tuple
         The flow conditions as `resolve` returns them.
+
+    Raises
+    ------
+    ValueError
+        If a nonzero array is given and no wall has a tangential velocity.
     """
     if settings.walls is None:
         return WallsAtRest()
     if callable(settings.walls):
         return ChangingWalls(settings)
+    if not wall_velocities(settings.grid, sides).size and np.any(gathered(plain(settings.walls))):
+        raise ValueError(
+            "flow_step takes velocities along sides of dp.no_slip and dp.inflow as walls=, and boundary= has no such "
+            "side; leave walls out, or write boundary=dp.no_slip"
+        )
     return ConstantWalls(settings, sides)
 
 

@@ -83,7 +83,11 @@ CASES = [
         "transport upwind: dt = 0.12 is too large at 4 of 4 points, most at 0; "
         "the largest stable dt is 0.111111, or write unstable='allow'",
     ),
-    (call(inflow=np.ones(3)), ShapeError, "transport upwind takes inflow of shape (10,), got an array of shape (3,)"),
+    (
+        call(inflow=np.ones(3), boundary=dp.dirichlet),
+        ShapeError,
+        "transport upwind takes inflow of shape (10,), got an array of shape (3,)",
+    ),
     (
         call(u=1j * U),
         TypeError,
@@ -103,6 +107,18 @@ CASES = [
         call(v=bad(V, slice(5, 7), np.inf)),
         NonFiniteError,
         "transport upwind needs a finite velocity, got 2 that are NaN or infinite, the first at 5",
+    ),
+    (
+        call(inflow=2.0),
+        ValueError,
+        "transport upwind uses inflow values at sides of dp.dirichlet only, and boundary= has none; write "
+        "boundary=dp.dirichlet, or leave the inflow out",
+    ),
+    (
+        lambda: value_and_grad(lambda x: dp.transport(GRID, "semi_lagrangian")(U, V, 0.1, x).sum())(np.zeros(10)),
+        ValueError,
+        "transport semi_lagrangian uses inflow values at sides of dp.dirichlet only, and boundary= has none; write "
+        "boundary=dp.dirichlet, or leave the inflow out",
     ),
     (
         call(inflow=bad(np.zeros(10), 3), boundary=dp.dirichlet),

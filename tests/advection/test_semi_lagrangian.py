@@ -65,8 +65,11 @@ def test_compiled_against_numpy(monkeypatch, shape, interpolation, scheme, form)
         for compiled in (True, False):
             with monkeypatch.context() as patch:
                 patch.setattr(kernels, "compiled", lambda compiled=compiled: compiled)
-                value, pull = pullback(lambda x: move(*x), point)
-                results.append((value, *pull(np.cos(value)), pushforward(lambda x: move(*x), point, along)[1]))
+                step = move._rule  # move itself refuses an inflow that no side uses
+                value, pull = pullback(lambda x, step=step: step(*x), point)
+                results.append(
+                    (value, *pull(np.cos(value)), pushforward(lambda x, step=step: step(*x), point, along)[1])
+                )
         for one, other in zip(*results):
             assert one == pytest.approx(other, rel=1e-13, abs=1e-13)
 
@@ -194,7 +197,7 @@ def test_bits_do_not_depend_on_threads(monkeypatch, scheme, shape):
     found = []
     for threads in (1, 2, 3):
         monkeypatch.setattr(kernels, "threads", lambda threads=threads: threads)
-        value, pull = pullback(lambda x: move(*x), point)
+        value, pull = pullback(lambda x: move._rule(*x), point)  # move itself refuses an inflow that no side uses
         found.append([np.asarray(x).tobytes() for x in (value, *pull(np.cos(value)))])
     assert found[0] == found[1] == found[2]
 

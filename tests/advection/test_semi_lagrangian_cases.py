@@ -137,7 +137,8 @@ def test_departure_points_far_outside(boundary, interpolation):
     move = dp.transport(dp.Grid(3), "semi_lagrangian", boundary, "cells", interpolation=interpolation)
     u = np.array([1.0, 5.0, 7.0])
     v = np.array([1e3, 1e300, -1e6])
-    value, pull = pullback(lambda x: move(u, x[0], 1.0, x[1]), (v, np.array([2.0, 3.0])))
+    step = move._rule  # move itself refuses an inflow that no side uses
+    value, pull = pullback(lambda x: step(u, x[0], 1.0, x[1]), (v, np.array([2.0, 3.0])))
     assert value == pytest.approx([1, 1, 7] if boundary is dp.neumann else [2, 2, 3])
     of_v, of_inflow = pull(np.ones(3))
     assert not of_v.any()

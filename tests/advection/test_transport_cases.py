@@ -177,6 +177,15 @@ def test_order_of_van_leer(form, velocity, stretched):
     assert np.log2(errors[1] / errors[2]) >= 1.8, errors
 
 
+def test_an_unused_inflow_may_be_zero():
+    grid = dp.Grid((3, 2), periodic=(True, False))
+    u = np.arange(6.0).reshape(3, 2)
+    for move in (dp.transport(grid), dp.transport(dp.Grid((3, 2), periodic=True))):
+        v = np.ones(move.settings.grid.faces.size)
+        for zero in (0, 0.0, np.zeros(move.walls.size)):
+            assert np.array_equal(move(u, v, 0.1, zero), move(u, v, 0.1))
+
+
 def test_inflow_through_a_wall():
     """A wave that enters through the lower wall: order 1 and order 2, up to the wall."""
     found = {}

@@ -457,6 +457,12 @@ REFUSED = [
         r"write walls=lambda params: values, with values on face_lift\(grid, boundary\).domain",
     ),
     Case(
+        act=lambda: dp.flow_step(SQUARE, 0.1, 0.1, boundary=dp.free_slip, walls=ONES),
+        error=ValueError,
+        match="flow_step takes velocities along sides of dp.no_slip and dp.inflow as walls=, and boundary= has no such "
+        "side; leave walls out, or write boundary=dp.no_slip",
+    ),
+    Case(
         act=lambda: dp.flow_step(SQUARE, 0.1, inflow=ONES),
         error=ValueError,
         match="flow_step got inflow= without a side of dp.inflow in boundary=; give both or none",

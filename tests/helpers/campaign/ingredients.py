@@ -518,8 +518,8 @@ class Transport(Ingredient):
         return {"v": v, "dt": 0.02, "inflow": numbers(self.seed + 1, move.walls.size)}
 
     def library(self, box):
-        move = self._move(box)
-        return lambda u, p: move(u, p["v"], p["dt"], p["inflow"])
+        step = self._move(box)._rule  # the object itself refuses an inflow that no side uses
+        return lambda u, p: step(u, p["v"], p["dt"], p["inflow"])
 
     def twin(self, box):
         move = transport_twin(box.grid(), self.scheme, self._boundary(box), self.velocity, self.of, self.form)

@@ -72,7 +72,8 @@ class Lagrangian(Ingredient):
 
     def library(self, box):
         move = self._move(box)
-        return lambda u, p: move(u, p["v"], p["dt"], p["inflow"])
+        step = move._rule  # move itself refuses an inflow that no side uses
+        return lambda u, p: step(u, p["v"], p["dt"], p["inflow"])
 
     def twin(self, box):
         move = self._move(box)
