@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
-from sparsedp.errors import ShapeError
+from sparsedp.errors import DerivativeError, ShapeError
 
 GRID = dp.Grid((3, 2))
 SIDES = {"x": dp.dirichlet, "y": dp.robin(1.0, 0.5)}
@@ -133,8 +133,25 @@ WRONG = [
     (
         lambda: dp.inverse(dp.laplacian(GRID), tol=1e-3),
         TypeError,
-        "method auto takes the options precision, cycle, strength, sweeps, levels, preconditioner, diff, iterations, "
-        "got 'tol'; write 'rtol'",
+        "method auto takes the options rtol, maxiter, nullspace, precision, cycle, strength, sweeps, levels, "
+        "preconditioner, diff, iterations, got 'tol'; write 'rtol'",
+    ),
+    (
+        lambda: dp.stepper("tr_bdf2", lambda u, p: -u, 0.1, nullspace="project"),
+        TypeError,
+        "method auto takes the options rtol, maxiter, sparsity, precision, cycle, strength, sweeps, levels, "
+        "preconditioner, diff, iterations, got 'nullspace'",
+    ),
+    (
+        lambda: dp.grad(lambda p: p["a"] ** 2)({"a": 1}),
+        DerivativeError,
+        "a gradient needs floating values, got int; write 1.0 instead of 1",
+    ),
+    (
+        lambda: dp.stepper("tr_bdf2", dp.laplacian(GRID), 0.1)(np.ones(GRID.shape), {"nu": 1.0}),
+        TypeError,
+        "the coefficient of laplacian must be one real number, got {'nu': 1.0}; write linear=(op, lambda params: ...) "
+        "with a function that returns the number",
     ),
     (
         lambda: dp.value_and_grad(lambda x: anp.sum(x**2), np.ones(2)),
@@ -163,6 +180,7 @@ WRONG = [
 ]
 
 NO_PARAMS = "; write rollout(step, start, params, n): the params given are None"
+NO_KEY = "; write params[key]: the params given are a dict with the keys 'nu', 'k'"
 NO_ARRAY = "; write np.asarray(x) for an array: a list is a tree of numbers"
 
 
@@ -172,6 +190,8 @@ NO_ARRAY = "; write np.asarray(x) for an array: a list is a tree of numbers"
         (lambda: dp.rollout(lambda u, p: u * p, np.ones(2), None, 3), NO_PARAMS),
         (lambda: dp.rollout(lambda u, p: u * p["k"], np.ones(2), None, 3), NO_PARAMS),
         (lambda: dp.grad(lambda u: anp.sum(dp.rollout(lambda u, p: u * p[0], u, None, 3)))(np.ones(2)), NO_PARAMS),
+        (lambda: dp.rollout(lambda u, p: u * p, np.ones(2), {"nu": 1.0, "k": 2.0}, 3), NO_KEY),
+        (lambda: dp.stepper("rk4", lambda u, p: -p * u, 0.1)(np.ones(2), {"nu": 1.0, "k": 2.0}), NO_KEY),
         (lambda: dp.rollout(lambda u, p: u * 0.5, [1.0, 2.0], None, 3), NO_ARRAY),
         (lambda: dp.grad(lambda x: anp.sum(x**2))([1.0, 2.0]), NO_ARRAY),
         (lambda: dp.minimize(lambda x: anp.sum(x**2), [1.0, 2.0]), NO_ARRAY),

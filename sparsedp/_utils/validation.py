@@ -352,13 +352,16 @@ def check_choice(name: str, word: Any, choices: Iterable, advice: str = "") -> N
 
 
 def advise(error: Exception, params: Any = (), example: str = "rollout(step, start, params, n)") -> None:
-    """Add advice to the message of an error that arithmetic with a list, or with params that are None, has raised."""
+    """Add advice to the message of an error of arithmetic with a list, or with params that are None or a dict."""
     text = str(error)
     if isinstance(error, TypeError) and "; write" not in text:
         if "'list'" in text or "multiply sequence" in text:
             error.args = (f"{text}; write np.asarray(x) for an array: a list is a tree of numbers",)
         elif params is None and "NoneType" in text:
             error.args = (f"{text}; write {example}: the params given are None",)
+        elif isinstance(params, dict) and "'dict'" in text:
+            keys = ", ".join(map(repr, params))
+            error.args = (f"{text}; write params[key]: the params given are a dict with the keys {keys}",)
 
 
 def check_takes(name: str, fun: Any, count: int, example: str) -> None:

@@ -332,9 +332,10 @@ def pullback(fun: Callable, x: Any) -> tuple[Any, Callable]:
             entries[place] = _apart_from_caller(leaf)
     if True not in moving:
         kinds = sorted({str(getattr(leaf, "dtype", type(leaf).__name__)) for leaf in entries})
-        raise DerivativeError(
-            f"a gradient needs floating values, got {', '.join(kinds) or 'nothing'}; write np.asarray(x, float)"
-        )
+        advice = "np.asarray(x, float)"
+        if kinds == ["int"]:
+            advice = "1.0 instead of 1"
+        raise DerivativeError(f"a gradient needs floating values, got {', '.join(kinds) or 'nothing'}; write {advice}")
     tape = taped(fun, rebuild(entries), moving)
     value = tape.rebuild(tape.values)
     if not is_field(plain(value)):

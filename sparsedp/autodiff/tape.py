@@ -28,6 +28,7 @@ from autograd.tracer import Node, box_types, getval, isbox, new_box, notrace_pri
 from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.counters import active, count, note, thread, timed
 from sparsedp._utils.pytree import copied, is_branch, leaves
+from sparsedp._utils.validation import check_takes
 from sparsedp.autodiff.backend import ARRAY_KINDS, BOX, match_value
 from sparsedp.autodiff.fast_derivatives import (
     ARRAY,
@@ -806,9 +807,12 @@ def differentiable(
     """
     keywords = tuple(keywords)
     made = differentiable, (name, forward, vjp, jvp, keywords)
-    isolated_vjp = None if vjp is None else _isolated_vjp(vjp)
-    isolated_jvp = None if jvp is None else _isolated_jvp(jvp)
+    isolated_vjp = None if vjp is None else _isolated_vjp(name, vjp)
+    isolated_jvp = None if jvp is None else _isolated_jvp(name, jvp)
     return Rule(name, _isolated(forward), isolated_vjp, isolated_jvp, keywords, made)
+
+
+VJP_FORM = "vjp=lambda nums, ans, *args: lambda g: (...,)"
 
 
 def _isolated(function):
@@ -816,19 +820,24 @@ def _isolated(function):
     return wraps(function)(lambda *args: copied(function(*map(frozen, args))))
 
 
-def _isolated_vjp(vjp):
+def _isolated_vjp(name, vjp):
     """Wrap a user's `vjp`: its arguments are read-only, and its pullback is wrapped by `_isolated`."""
 
-    def isolated(*args):
-        return _isolated(vjp(*map(frozen, args)))
+    def isolated(nums, ans, *args):
+        check_takes(f"differentiable({name!r})", vjp, 2 + len(args), VJP_FORM)
+        pull = vjp(nums, frozen(ans), *map(frozen, args))
+        if not callable(pull):
+            raise TypeError(f"the vjp of {name} must return a function, got {type(pull).__name__}; write {VJP_FORM}")
+        return _isolated(pull)
 
     return isolated
 
 
-def _isolated_jvp(jvp):
+def _isolated_jvp(name, jvp):
     """Wrap a user's `jvp`: its arguments and tangents are read-only, and its results are copied."""
 
     def on_frozen_tangents(nums, tangents, *args):
+        check_takes(f"differentiable({name!r})", jvp, 2 + len(args), "jvp=lambda nums, tangents, ans, *args: ...")
         return jvp(nums, [frozen(tangent) for tangent in tangents], *args)
 
     return _isolated(on_frozen_tangents)

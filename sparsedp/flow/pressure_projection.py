@@ -106,7 +106,7 @@ def projection(
             f"the second argument of projection is solid, a boolean array on {grid.cells}, got an array on "
             f"{grid.faces}; write dp.projection(grid)(v) for a velocity v"
         )
-    settings = check_settings(method, rtol, maxiter, "project", options)
+    settings = check_settings(method, rtol, maxiter, "project", options, common=("rtol", "maxiter"))
     set_up = grid.backend.implementation(ProjectionSetup)
     return Projection(set_up(grid, solid, boundary, settings))
 

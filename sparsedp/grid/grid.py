@@ -44,7 +44,7 @@ def _what_to_write(*shape, **options):
     """Return the correct form of a wrong call of `Grid`, such as Grid(64, 64) or Grid((64, 64), dx=0.1)."""
     lengths = [n for n in shape if isinstance(n, (int, np.integer))]
     if len(lengths) == len(shape) > 1:
-        return f"dp.Grid({tuple(map(int, lengths))})"
+        return f"dp.Grid({tuple(map(int, lengths))}) for cells of width 1, or add size=1.0"
     if len(shape) == 2:
         return f"dp.Grid({shape[0]!r}, size={shape[1]!r})"
     for name in options:
@@ -65,9 +65,11 @@ class Grid(Value, Uncached):
     shape : int or tuple of int
         Number of cells along each axis.
     size : float or sequence of float, optional
-        Extent of the grid along each axis [length]. Give `size` or `spacing`, not both. Default: cells of width 1.
+        Extent of the grid along each axis [length]. Give `size` or `spacing`, not both. Default: cells of width 1, so
+        that ``Grid((64, 64))`` has the extent 64 x 64.
     spacing : float, sequence or array, optional
-        Cell width along each axis [length]. For a stretched axis the entry is an array with the width of each cell.
+        Cell width along each axis [length]. Default: 1. For a stretched axis the entry is an array with the width of
+        each cell.
     origin : float or sequence of float
         Coordinate of the lower corner [length].
     periodic : bool or sequence of bool

@@ -121,12 +121,12 @@ def check_pair(name: str, value: Any, example: str) -> Any:
     return value
 
 
-def real_number(value: Any, name: str, sign: str = "", advice: str = "") -> Any:
+def real_number(value: Any, name: str, sign: str = "", advice: str = "", kind: str = "") -> Any:
     """Check that a value is one finite real number; return it if traced, else as a Python float.
 
-    A Python float does not widen a float32 state to float64.
+    A Python float does not widen a float32 state to float64. For the last three arguments see `check_number`.
     """
-    check_number(name, plain(value), sign, advice)
+    check_number(name, plain(value), sign, advice, kind)
     if isbox(value):
         return value
     return float(value)
@@ -229,7 +229,9 @@ class StiffTerm:
         value = self._coefficient
         if callable(value):
             value = value(without_side(params))
-        return real_number(value, self.name, ">= 0", "; write a number >= 0, the sign belongs to the operator")
+        sign_advice = "; write a number >= 0, the sign belongs to the operator"
+        kind_advice = "; write linear=(op, lambda params: ...) with a function that returns the number"
+        return real_number(value, self.name, ">= 0", sign_advice, kind_advice)
 
 
 def _stiff_terms(linear: Any, place: str) -> Any:

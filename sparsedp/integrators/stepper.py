@@ -299,7 +299,8 @@ def stepper(
 def _solver_settings(solver: str, rtol: float, maxiter: int | None, options: dict) -> SolveSettings:
     """Return the checked settings of solves; the option `sparsity` is not checked here but by `implicit`."""
     checked = {word: value for word, value in options.items() if word != "sparsity"}
-    return replace(check_settings(solver, rtol, maxiter, "raise", checked), options=options)
+    settings = check_settings(solver, rtol, maxiter, "raise", checked, common=("rtol", "maxiter", "sparsity"))
+    return replace(settings, options=options)
 
 
 def _check_interruptions(arguments: dict) -> None:

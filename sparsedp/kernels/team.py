@@ -32,7 +32,7 @@ INNER = {"error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper":
 
 loops: list[Kernel] = []  # all loops that are defined in modules imported so far
 
-NOTICE = "sparsedp: compiling loops for this machine, once; `python -m sparsedp compile` does all of them\n"
+NOTICE = "sparsedp: compiling loops and storing them for later runs; `python -m sparsedp compile` compiles all loops\n"
 _noticed: list[bool] = []
 
 # If two threads create the same type at the same time, numba assigns two type codes to it and then does not find the

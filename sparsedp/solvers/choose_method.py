@@ -22,6 +22,8 @@ from sparsedp.solvers.structured_multigrid.engine import structured_engine, stru
 from sparsedp.solvers.substitution import BlockTriangular, largest_block
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from sparsedp.solvers.engine import Engine
     from sparsedp.solvers.substitution import Splitting
     from sparsedp.solvers.system import System
@@ -107,6 +109,9 @@ class Choice(NamedTuple):
 # ---- settings ----
 
 
+COMMON_OPTIONS = ("rtol", "maxiter", "nullspace")  # options of every method
+
+
 @dataclass(frozen=True, eq=False)
 class SolveSettings:
     """The checked settings of a solve; see `inverse`."""
@@ -119,15 +124,20 @@ class SolveSettings:
 
 
 def check_settings(
-    method: str, rtol: float, maxiter: int | None, nullspace: str, options: dict[str, Any]
+    method: str,
+    rtol: float,
+    maxiter: int | None,
+    nullspace: str,
+    options: dict[str, Any],
+    common: Sequence[str] = COMMON_OPTIONS,
 ) -> SolveSettings:
-    """Check the settings of a solve."""
+    """Check the settings of a solve; `common` are the names of the options that do not depend on the method."""
     check_choice("method", method, ("auto", *METHODS), _method_advice(method))
     rtol = check_number("rtol", rtol, "between 0 and 1", "; the default is 1e-10")
     if maxiter is not None:
         maxiter = check_whole("maxiter", maxiter, 1, "; None leaves it to the method")
     check_choice("nullspace", nullspace, ("raise", "project"))
-    check_options(method, options)
+    check_options(method, options, common)
     return SolveSettings(method, rtol, maxiter, nullspace, copied(options))
 
 
@@ -140,15 +150,16 @@ def _method_advice(method: Any) -> str:
     return ""
 
 
-def check_options(method: str, options: dict[str, Any]) -> None:
+def check_options(method: str, options: dict[str, Any], common: Sequence[str] = COMMON_OPTIONS) -> None:
     """Raise TypeError for an option that the method does not take; for "auto", that no method takes."""
     builders = METHODS.values() if method == "auto" else [METHODS[method]]
     parameters = [parameter for build in builders for parameter in inspect.signature(build).parameters.values()]
     names = list(dict.fromkeys(parameter.name for parameter in parameters if parameter.kind == parameter.KEYWORD_ONLY))
     for name in options:
         if name not in names:
-            advice = advice_near(name, [*names, "rtol", "maxiter", "method", "nullspace"])
-            raise TypeError(f"method {method} takes the options {', '.join(names) or '(none)'}, got {name!r}{advice}")
+            advice = advice_near(name, [*common, *names, "method"])
+            listed = ", ".join([*common, *names])
+            raise TypeError(f"method {method} takes the options {listed}, got {name!r}{advice}")
 
 
 def check_unknowns(system: System) -> None:

@@ -33,7 +33,11 @@ NEEDS = "boundary on x needs dirichlet, neumann, robin(a, b) or a pair of them"
 PARAMS = "dp.rollout(step, start, params, n), with params=None if the step has none"
 TABLE = [
     # dp.Grid
-    (lambda: dp.Grid(64, 64), TypeError, "dp.Grid takes 1 argument by position, got 2; write dp.Grid((64, 64))"),
+    (
+        lambda: dp.Grid(64, 64),
+        TypeError,
+        "dp.Grid takes 1 argument by position, got 2; write dp.Grid((64, 64)) for cells of width 1, or add size=1.0",
+    ),
     (
         lambda: dp.Grid((8, 8), 1.0),
         TypeError,

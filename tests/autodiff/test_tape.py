@@ -96,6 +96,35 @@ def test_missing_derivatives_and_hidden_boxes_are_named():
         value_and_grad(lambda x: first((x, 1.0)))(1.0)
 
 
+def test_a_vjp_of_another_form():
+    """Such as that of JAX."""
+    cube = dp.differentiable("cube", lambda x: x**3, lambda g, x: (3 * x**2 * g,))
+    assert cube(2.0) == 8.0
+    with pytest.raises(
+        TypeError,
+        match=r"^differentiable\('cube'\) calls a function with 3 arguments, got one that takes 2; "
+        r"write vjp=lambda nums, ans, \*args: lambda g: \(\.\.\.,\)$",
+    ):
+        dp.value_and_grad(cube)(2.0)
+    cube = dp.differentiable("cube", lambda x: x**3, lambda nums, ans, x: (3 * x**2,))
+    with pytest.raises(
+        TypeError,
+        match=r"^the vjp of cube must return a function, got tuple; "
+        r"write vjp=lambda nums, ans, \*args: lambda g: \(\.\.\.,\)$",
+    ):
+        dp.value_and_grad(cube)(2.0)
+
+
+def test_a_jvp_of_another_form():
+    cube = dp.differentiable("cube", lambda x: x**3, jvp=lambda primals, tangents: (primals[0] ** 3, tangents[0]))
+    with pytest.raises(
+        TypeError,
+        match=r"^differentiable\('cube'\) calls a function with 4 arguments, got one that takes 2; "
+        r"write jvp=lambda nums, tangents, ans, \*args: \.\.\.$",
+    ):
+        dp.jvp(cube, 2.0, 1.0)
+
+
 def test_keywords_are_traced():
     power = dp.differentiable(
         "scale",

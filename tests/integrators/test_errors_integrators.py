@@ -364,7 +364,10 @@ def test_a_stage_without_a_root_says_what_to_change():
         (lambda: dp.stepper("euler", lambda u, p: -u, 0.5, cycle="V"), "euler does not use cycle; leave it out"),
         (lambda: dp.implicit(lambda x: x, foo=1), "method auto takes the options .*, got 'foo'"),
         (lambda: dp.elliptic_solver(dp.divergence(dp.Grid(4)), dp.gradient(dp.Grid(4)), foo=1), "got 'foo'"),
-        (lambda: dp.matrix_solver(np.eye(2), "direct", foo=1), "method direct takes the options precision, got 'foo'"),
+        (
+            lambda: dp.matrix_solver(np.eye(2), "direct", foo=1),
+            "method direct takes the options rtol, maxiter, nullspace, precision, got 'foo'",
+        ),
         (lambda: dp.projection(dp.Grid(4), foo=1), "got 'foo'"),
     ],
 )

@@ -10,7 +10,7 @@ from sources import PACKAGE
 
 from sparsedp import __main__, kernels
 
-NOTICE = "compiling loops for this machine, once; `python -m sparsedp compile` does all of them"
+NOTICE = "compiling loops and storing them for later runs; `python -m sparsedp compile` compiles all loops"
 APPLY = """
 import numpy as np, sparsedp as dp
 op = dp.laplacian(dp.Grid((300, 400))).matrix_free()

@@ -184,7 +184,11 @@ SETTINGS = [
         ValueError,
         match="nullspace must be one of raise, project, got 'drop'",
     ),
-    Case(lambda: dp.inverse(OP, "direct", x=1), TypeError, match="method direct takes the options precision, got 'x'"),
+    Case(
+        lambda: dp.inverse(OP, "direct", x=1),
+        TypeError,
+        match="method direct takes the options rtol, maxiter, nullspace, precision, got 'x'",
+    ),
     Case(
         lambda: dp.inverse(OP, "multigrid", cycle="F"),
         ValueError,
@@ -322,7 +326,7 @@ def test_message(case):
 def test_names_of_methods_are_listed():
     with pytest.raises(ValueError, match=r"^method must be one of auto, separable, .*, got 'magic'$"):
         dp.inverse(OP, "magic")
-    with pytest.raises(TypeError, match=r"^method multigrid takes the options cycle, .*, got 'cycles'; write 'cycle'$"):
+    with pytest.raises(TypeError, match=r"^method multigrid takes the options rtol, .*, got 'cycles'; write 'cycle'$"):
         dp.inverse(OP, "multigrid", cycles="V")
 
 
