@@ -41,6 +41,7 @@ __all__ = [
 MOST_ARROWS = 24  # largest number of arrows along an axis
 MOST_MARKERS = 64  # lines with more points have no markers
 LARGEST_FACTOR = 2.0  # growth factor at the red end of the colour map
+BAR_SHARE = 0.2  # share of the width of axes that is left for the colour bar and its labels
 MOST_TICKS = 6  # labels along a logarithmic axis; more would overlap in three plots side by side
 
 
@@ -63,7 +64,7 @@ def plot(
         A 1-D field is plotted as a line, a 2-D field as a colour map, and a 3-D field as three slices through the
         middle. Of a face field the magnitude is shown, and in 2-D also arrows.
     ax : matplotlib Axes, optional
-        Axes to draw on. Default: the current axes of pyplot.
+        Axes to draw on. Default: the current axes of pyplot if they are empty, otherwise those of a new figure.
     title, label : str, optional
         Title of the plot, and label of the colour bar (in 1-D: of the vertical axis).
     limits : (float, float), optional
@@ -82,7 +83,7 @@ def plot(
     ShapeError
         If `u` is not a field on the cells, faces or nodes of the grid.
     TypeError
-        If `u` is complex.
+        If `u` is complex, or `ax` is something else than Axes.
     ImportError
         If matplotlib is not installed.
 
@@ -96,6 +97,8 @@ def plot(
     >>> picture = plot(Grid((2, 3)), np.ones((2, 3)), ax=figure().add_subplot(), title="flat")
     >>> picture.get_xlabel(), picture.get_ylabel(), picture.get_title()
     ('x', 'y', 'flat')
+
+    To write the picture to a file, for example "flat.png", use ``picture.figure.savefig("flat.png")``.
     """
     check_grid("plot", grid)
     values = np.asarray(plain(u))
@@ -126,6 +129,8 @@ def plot(
         # pcolormesh expects rows along y, so the array is transposed.
         image = view.pcolormesh(*lines, part.T, shading="auto", vmin=low, vmax=high, cmap=cmap, rasterized=True)
         view.set(aspect="equal", xlabel=grid.axes[axes[0]], ylabel=grid.axes[axes[1]])
+    if ax.figure.get_layout_engine() is None:
+        _make_room(ax)
     bar = ax.inset_axes((1.03, 0.0, 0.04, 1.0))  # as high as the plot, for every aspect ratio
     ax.figure.colorbar(image, cax=bar, label=label or "")
     if components and grid.dim == 2:
@@ -221,6 +226,13 @@ def _scalar_field(
     return reduce(np.hypot, parts), "cells", parts
 
 
+def _make_room(ax: Any) -> None:
+    """Make axes narrower, so that a colour bar at their right end is inside the figure."""
+    position = ax.get_position(original=True)
+    ax.set_position((position.x0, position.y0, (1.0 - BAR_SHARE) * position.width, position.height))
+    ax.set_in_layout(True)  # set_position excludes the axes from a layout that the user may choose later
+
+
 def _range(u: NDArray[Any]) -> tuple[float, float]:
     """Return the smallest and the largest finite value, or (0, 1) if there is no finite value."""
     finite = u[np.isfinite(u)]
@@ -310,7 +322,7 @@ def convergence(best: Minimum, ax: Any = None, against: str = "iteration") -> An
     best : Minimum
         The result of `minimize`.
     ax : matplotlib Axes, optional
-        Default: the current axes of pyplot.
+        Default: the current axes of pyplot if they are empty, otherwise those of a new figure.
     against : "iteration", "seconds", "evaluations" or "solves"
         The quantity on the horizontal axis.
 
@@ -365,7 +377,7 @@ def v_curve(audit: Audit, ax: Any = None) -> Any:
     audit : Audit
         The result of `check.gradient`.
     ax : matplotlib Axes, optional
-        Default: the current axes of pyplot.
+        Default: the current axes of pyplot if they are empty, otherwise those of a new figure.
 
     Returns
     -------
@@ -439,9 +451,25 @@ def figure() -> Any:
 
 
 def current(ax: Any) -> Any:
-    """Return `ax`, or the current axes of pyplot if `ax` is None."""
+    """Return `ax`. If it is None, return the current axes of pyplot if they are empty, else those of a new figure.
+
+    Raises
+    ------
+    TypeError
+        If `ax` is neither None nor Axes.
+    """
     if ax is None:
-        return _matplotlib(".pyplot").gca()
+        pyplot = _matplotlib(".pyplot")
+        if pyplot.get_fignums():
+            axes = pyplot.gca()
+            if not axes.has_data() and not axes.child_axes:
+                return axes
+        return pyplot.figure(layout="constrained").add_subplot()
+    if isinstance(ax, (str, Path)):
+        raise TypeError(
+            f"ax must be matplotlib Axes, got the path {str(ax)!r}; write dp.plot(grid, u).figure.savefig({str(ax)!r})"
+        )
+    check_type("ax", ax, _matplotlib(".axes").Axes, "matplotlib Axes", "ax=figure.add_subplot()")
     return ax
 
 

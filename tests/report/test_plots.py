@@ -139,6 +139,46 @@ def test_without_axes_pyplot_is_used():
     pyplot.close("all")
 
 
+def test_a_second_picture_gets_a_new_figure():
+    pyplot = pytest.importorskip("matplotlib.pyplot")
+    for grid in (dp.Grid(3), dp.Grid((2, 2)), dp.Grid((2, 2, 2))):
+        figure, empty_axes = pyplot.subplots()
+        one, other = (dp.plot(grid, np.ones(grid.shape)) for _ in range(2))
+        assert one is empty_axes and other.figure is not figure and other is pyplot.gca()
+        assert len(one.lines) + len(one.collections) + len(one.child_axes) <= 4
+    pyplot.close("all")
+
+
+@pytest.mark.parametrize(
+    "shape", [(8, 2), pytest.param((2, 8), marks=pytest.mark.whole), pytest.param((2, 3, 4), marks=pytest.mark.whole)]
+)
+def test_the_labels_of_the_colour_bar_are_inside_the_figure(shape):
+    """On axes of the user, in figures without a layout engine, and on axes that plot makes."""
+    pyplot = pytest.importorskip("matplotlib.pyplot")
+    grid = dp.Grid(shape)
+    u = np.linspace(-1.0, 1.0, grid.cells.size).reshape(shape)
+    for ax in (pyplot.subplots()[1], pyplot.subplots(1, 2, figsize=(9, 4))[1][1], None):
+        figure = dp.plot(grid, u, ax, label="T [K]").figure
+        figure.canvas.draw()
+        bounds = figure.get_tightbbox()
+        assert bounds.x0 >= 0 and bounds.x1 <= figure.get_figwidth(), (bounds, figure.get_figwidth())
+    pyplot.close("all")
+
+
+def test_a_path_in_place_of_axes_is_refused(tmp_path):
+    with pytest.raises(
+        TypeError,
+        match=re.escape(
+            "ax must be matplotlib Axes, got the path 'a.png'; write dp.plot(grid, u).figure.savefig('a.png')"
+        ),
+    ):
+        dp.plot(dp.Grid(2), np.ones(2), "a.png")
+    with pytest.raises(TypeError, match="ax must be matplotlib Axes, got the path '.*'; write .*savefig"):
+        dp.plot(dp.Grid(2), np.ones(2), tmp_path / "a.png")
+    with pytest.raises(TypeError, match="ax takes matplotlib Axes, got Figure; write ax=figure.add_subplot"):
+        dp.plot(dp.Grid(2), np.ones(2), plots.figure())
+
+
 def test_input_is_not_modified(ax):
     grid = dp.Grid((3, 3))
     u = np.random.default_rng(0).random((3, 3))
