@@ -38,7 +38,9 @@ def total_variation(grid: Grid, eps: float, solid: ArrayLike | None = None) -> C
     grid : Grid
     eps : float
         Smoothing parameter, > 0 [unit / length]. The integrand is close to |grad u| where |grad u| is much larger than
-        eps, and close to |grad u|^2 / (2 eps) where it is much smaller.
+        eps, and close to |grad u|^2 / (2 eps) where it is much smaller. For jumps of height J between cells of width
+        h, 0.01 J / h is a good first choice: with a larger eps jumps are smoothed, with a smaller one `minimize` needs
+        more iterations.
     solid : bool array, shape `grid.shape`, optional
         True for cells that are excluded. Slopes on their faces do not contribute.
 
