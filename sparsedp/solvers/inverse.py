@@ -83,7 +83,7 @@ def inverse(
         multigrid   levels          25          largest number of levels
         krylov      preconditioner  None        "jacobi", "shifted_laplace" (for waves), Operator or function
         krylov      diff            "implicit"  "implicit" or "unrolled" (differentiate the iterations)
-        krylov      iterations      None        fixed number of iterations; the residual is not tested
+        krylov      iterations      None        number of iterations; no tolerance is tested
         structured  precision       "auto"      precision of the cycle: "single" or "double"
         direct      precision       "auto"      precision of the LU factors: "single" or "double"
         ==========  ==============  ==========  =================================================================

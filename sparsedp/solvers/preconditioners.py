@@ -93,7 +93,8 @@ def krylov_engine(
         How derivatives are computed: by one adjoint solve, or through the iterations themselves. The
         latter costs memory and time for each iteration; it is for comparison, and for training `start`.
     iterations : int, optional
-        Exactly this many iterations, whatever the residual: then there is no refinement and no error.
+        Number of iterations. No tolerance is tested, there is no refinement, and a large residual raises no error.
+        The engine stops earlier only if the residual is 0 or no longer decreases.
 
     Returns
     -------

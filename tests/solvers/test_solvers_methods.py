@@ -230,6 +230,9 @@ def test_truncated_solves():
     assert inv.info.forward.iterations == 7 and inv.info.forward.status == "max_iterations"
     inv.T(np.ones(op.domain.shape))
     assert inv.info.adjoint.iterations == 7 and inv.info.adjoint.residual > 1e-6
+    many = dp.inverse(op, "krylov", iterations=2000)  # it stops when rounding errors stop the residual from decreasing
+    many(np.ones(op.domain.shape))
+    assert 20 < many.info.forward.iterations < 2000 and many.info.forward.status == "converged"
 
 
 @pytest.mark.parametrize("problem", ["negative", "robin, stretched"])
