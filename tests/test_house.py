@@ -196,6 +196,9 @@ def test_importing_one_thing_does_not_load_everything(name):
     assert len(found) <= CLOSURES[name], sorted(found)
 
 
+PRIVATE = {("kernels/__init__.py", "scipy.sparse._sparsetools.csr_matvec")}
+
+
 def test_foreign_libraries_come_through_their_door():
     none(
         f"{m.place}:{line} imports {target}; only {place} may"
@@ -208,13 +211,17 @@ def test_foreign_libraries_come_through_their_door():
 
 
 def test_no_private_names_of_foreign_libraries():
-    """They may change with any release; what autograd's tape needs stands behind its door."""
+    """They may change with any release; what autograd's tape needs stands behind its door.
+
+    `PRIVATE` has the exceptions: each import is guarded, its result is tested at run time, and public names replace it.
+    """
     none(
         f"{m.place}:{line} imports {target}"
         for m in modules()
         for target, line in imports(m)
         if not within(target, "sparsedp") and m.place != "autodiff/tape.py"
         if any(part.startswith("_") and not part.endswith("__") for part in target.split("."))
+        if (m.place, target) not in PRIVATE
     )
 
 

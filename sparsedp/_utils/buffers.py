@@ -7,15 +7,18 @@ memory page at its first access. The buffer of a result is recycled when the arr
 from __future__ import annotations
 
 import weakref
+from functools import partial
 from math import prod
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import DTypeLike
 
-__all__ = ["empty"]
+__all__ = ["allocator", "empty"]
 
 LARGE = 1 << 18  # bytes; smaller arrays are recycled by the C library
 SPARE = 1 << 30  # largest total size of free buffers in bytes; a field on 256^3 cells and one on the faces take half
@@ -46,6 +49,23 @@ def empty(shape: tuple[int, ...], dtype: DTypeLike) -> np.ndarray:
     buffer = _take(size)
     result: np.ndarray = np.ndarray(shape, dtype, buffer)
     weakref.finalize(result, _release, buffer).atexit = False
+    return result
+
+
+def allocator(shape: tuple[int, ...], dtype: DTypeLike = float, zeros: bool = False) -> Callable[[], np.ndarray]:
+    """Return a function without arguments that returns a new array, of zeros or uninitialised.
+
+    The function does not compare the size of the array with LARGE: this is done here, once.
+    """
+    if prod(shape) * np.dtype(dtype).itemsize < LARGE:
+        return partial(np.zeros if zeros else np.empty, shape, dtype)
+    return partial(_zeros if zeros else empty, shape, dtype)
+
+
+def _zeros(shape, dtype):
+    """Return an array of zeros in recycled memory."""
+    result = empty(shape, dtype)
+    result.fill(0)
     return result
 
 

@@ -1084,7 +1084,9 @@ def linear(name: str, forward: Callable, transpose: Callable) -> tuple[Rule, Rul
 
 
 def _apply(op, u):
-    return timed(op.name, "forward", op.apply, u)
+    if active:
+        return timed(op.name, "forward", op.apply, u)
+    return op.apply(u)
 
 
 _operator = primitive(_apply)
@@ -1100,8 +1102,12 @@ def _operator_vjp(argnums, ans, args, options):
     def pull(g):
         if isbox(g):
             cotangent = timed(op.name, "vjp", apply_operator, op.T, g)
-        else:
+        elif active:
             cotangent = timed(op.name, "vjp", op.T.apply, g)
+        else:
+            cotangent = op.T.apply(g)
+        if type(cotangent) is np.ndarray and cotangent.dtype is dtype and reference is None:
+            return (cotangent,)
         return (cast(match_value(cotangent, reference), dtype),)
 
     return pull

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 __all__ = [
     "along_axis",
     "compiled",
+    "product_loop",
     "run",
     "set_threads",
     "summed",
@@ -167,6 +168,28 @@ def summed(shape: tuple[int, int, int], axes: Sequence[Tridiagonal | None], shif
             reference.kronecker_sum(*fields, axes, shift)
 
     return act
+
+
+@functools.cache
+def product_loop() -> Callable[..., None] | None:
+    """Return SciPy's loop ``add_product(rows, columns, indptr, indices, data, x, out)``, or None.
+
+    It adds the product of a CSR matrix and a vector to `out`. SciPy's operator ``@`` calls it too, after dispatch and
+    checks that take longer than a small product. The loop is in a private module. It is used only if it exists and
+    gives the right result for a small matrix.
+    """
+    indptr = np.array([0, 2, 3], np.int32)
+    indices = np.array([0, 2, 1], np.int32)
+    out = np.zeros(2)
+    try:
+        from scipy.sparse._sparsetools import csr_matvec
+
+        csr_matvec(2, 3, indptr, indices, np.array([1.5, 0.25, -3.0]), np.array([2.0, 0.5, -4.0]), out)
+    except (ImportError, TypeError, ValueError):
+        return None
+    if not np.array_equal(out, [2.0, -1.5]):
+        return None
+    return csr_matvec
 
 
 def along_axis(u: NDArray, out: NDArray, rows: Rows, scale: float, accumulate: bool) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import weakref
+from collections.abc import Callable
 from functools import cached_property
 from math import prod
 from numbers import Number
@@ -32,6 +33,7 @@ __all__ = ["Operator"]
 EXPLICIT_BELOW_COMPILED = 4608
 EXPLICIT_BELOW_PLAIN = 262144
 AS_OPERATOR = "dp.from_matrix(M, A.domain, A.codomain)"  # advice when M, a sparse matrix, is combined with A
+MOST_BOUND = 64  # number of forms of arguments for which an operator keeps a function
 SPY_BELOW = 20_000  # matrices with at most this many rows and columns are drawn in notebooks, which takes 0.1 s
 
 
@@ -91,6 +93,7 @@ class Operator(Frozen, Reconstructible):
         "solve": "inv(b), with inv = dp.inverse(op)",
     }
     _transposed = None
+    _bound: dict[tuple, Callable[[Any], Any]]  # (shape, dtype) of an array -> function of such arrays, see `bound`
 
     def __init__(
         self, structure: Structure, domain: Space, codomain: Space, name: str, form: str | None = None
@@ -104,6 +107,7 @@ class Operator(Frozen, Reconstructible):
             name=name,
             form=form or _chosen_form(structure),
             backend=codomain.backend if domain.backend is NUMPY else domain.backend,
+            _bound={},
         )
 
     def recipe(self) -> tuple:
@@ -161,25 +165,82 @@ class Operator(Frozen, Reconstructible):
         ValueError
             If `out` overlaps `u` or is not contiguous.
         """
+        if out is None and type(u) is np.ndarray:
+            apply = self._bound.get((u.shape, u.dtype))
+            if apply is not None and u.flags.c_contiguous:
+                return apply(u)
         return self.backend.apply(self, u, out)
 
     def apply_array(self, u: Any, out: np.ndarray | None = None) -> np.ndarray:
         """Apply the operator to a NumPy array: see `apply`."""
         u = field_array(self, u, batch=True)
-        shape = self.codomain.shape
-        dtype = result_dtype(self.structure, u.dtype)
-        lead = u.shape[: u.ndim - len(self.domain.shape)]
         if out is None:
-            out = buffers.empty(lead + shape, dtype)
-        else:
-            check_out(self, out, u, dtype, lead + shape)
-        if lead:
-            count = prod(lead)
-            for field, result in zip(u.reshape(count, self.shape[1]), out.reshape(count, self.shape[0])):
-                self._acting.apply(field, result)
-        else:
-            self._acting.apply(u.reshape(-1), out.reshape(-1))
+            return self.bound(u)(u)
+        lead = self._batch_shape(u)
+        check_out(self, out, u, result_dtype(self.structure, u.dtype), lead + self.codomain.shape)
+        _apply_to_batch(self._acting, prod(lead), u, out)
         return out
+
+    def bound(self, u: Any) -> Callable[[Any], Any]:
+        """Return a function that applies the operator to plain arrays with the shape and the dtype of `u`.
+
+        The function does not check its argument, which must be C-contiguous. It returns a new array, and may be called
+        by several threads at once. What depends only on shape and dtype is decided here, once: the operator keeps the
+        function. `apply` calls it too.
+
+        Parameters
+        ----------
+        u : array, shape (..., *`domain.shape`)
+            Its entries are not used.
+
+        Returns
+        -------
+        callable
+        """
+        if not self.backend.whole_fields or type(u) is not np.ndarray:
+            return self.apply
+        key = u.shape, u.dtype
+        apply = self._bound.get(key)
+        if apply is None:
+            if field_array(self, u, batch=True).dtype != u.dtype:
+                return self.apply_array  # which converts integers, and numbers in another byte order
+            apply = self._bind(self._batch_shape(u), u.dtype)
+            if len(self._bound) >= MOST_BOUND:
+                self._bound.clear()
+            self._bound[key] = apply
+        return apply
+
+    def _bind(self, lead, dtype):
+        """Return the function for arrays of this dtype with leading axes of shape `lead`. It must not refer to self."""
+        acting = self._acting
+        shape = lead + self.codomain.shape
+        write, zeros = acting.bound(dtype)
+        new_array = buffers.allocator(shape, result_dtype(self.structure, dtype), zeros and not lead)
+
+        def apply_to_flat(u):
+            out = new_array()
+            write(u, out)
+            return out
+
+        def apply(u):
+            out = new_array()
+            write(u.reshape(-1), out.reshape(-1))
+            return out
+
+        def apply_to_batch(u):
+            out = new_array()
+            _apply_to_batch(acting, prod(lead), u, out)
+            return out
+
+        if lead:
+            return apply_to_batch
+        if len(shape) == len(self.domain.shape) == 1:
+            return apply_to_flat
+        return apply
+
+    def _batch_shape(self, u):
+        """Return the shape of the leading axes of an array of fields."""
+        return u.shape[: u.ndim - len(self.domain.shape)]
 
     @cached_property
     def local_structure(self) -> Structure:
@@ -408,6 +469,13 @@ class Operator(Frozen, Reconstructible):
             if matrix.nnz:
                 entries["where"] = spy(matrix)
         return facts(self.name, entries)
+
+
+def _apply_to_batch(structure, count, u, out):
+    """Apply a structure to an array of `count` fields, and write the results into `out`."""
+    rows, columns = structure.shape
+    for field, result in zip(u.reshape(count, columns), out.reshape(count, rows), strict=True):
+        structure.apply(field, result)
 
 
 def _with_matrix(matrix, *arguments):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
+from functools import partial
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -390,20 +391,21 @@ class Inverse(Operator):
             return self._solve_from(b, start)
         if active or isbox(b):
             return apply_operator(self, b)
+        if type(b) is np.ndarray:  # as in `Operator.apply`; repeated here so that a call takes few steps
+            solve = self._bound.get((b.shape, b.dtype))
+            if solve is not None and b.flags.c_contiguous:
+                return solve(b)
         return self.apply(b)
 
-    def apply(self, u: Any, out: np.ndarray | None = None) -> Any:
-        """Solve for data that are not traced, without recording; see `Operator.apply`."""
-        if (
-            type(u) is np.ndarray
-            and u.shape == self.domain.shape
-            and u.dtype == self.structure.dtype
-            and u.flags.c_contiguous
-            and out is None
-            and self.backend.whole_fields
-        ):  # the solver can use one such field directly, without a conversion or a copy of the solution
-            return self.structure.product(u.reshape(-1)).reshape(self.codomain.shape)
-        return super().apply(u, out)
+    def _bind(self, lead, dtype):
+        """Return the function for arrays of this dtype with leading axes of shape `lead`: see `Operator.bound`."""
+        structure = self.structure
+        if lead or dtype != structure.dtype or structure.start is not None:
+            return super()._bind(lead, dtype)
+        # The solver can use one such field directly, without a conversion or a copy of the solution.
+        solve = partial(structure.solver.solve, transposed=structure.transposed, checked=structure.checked)
+        shape = self.codomain.shape
+        return lambda b: solve(b.reshape(-1)).reshape(shape)
 
     def _solve_from(self, b: Any, start: Any) -> Any:
         """Solve from an initial guess, or by iterations that autograd records."""

@@ -9,11 +9,12 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
+from sparsedp._utils import buffers
 from sparsedp._utils.validation import EPS
 from sparsedp.errors import NonFiniteError
 from sparsedp.grid.grid import Grid
 from sparsedp.operators.operator import Operator
-from sparsedp.operators.structure.base import Matrix
+from sparsedp.operators.structure.base import Matrix, result_dtype
 from sparsedp.operators.structure.kronecker import Kronecker
 from sparsedp.operators.structure.lazy import Chain, Diagonal, Mask, Sum
 from sparsedp.solvers.nullspace import NullSpace, find_null_space
@@ -69,6 +70,7 @@ class System:
         self.rtol = rtol
         self.maxiter = maxiter
         self.exponent = 0
+        self._products: dict[tuple, tuple] = {}  # see `product`
         if self.faces is not None and self.faces.within(LARGEST_EXPONENT - 1):
             return
         exponent = exponent_of(self.norm(False))
@@ -88,16 +90,26 @@ class System:
 
     def product(self, x: np.ndarray, transposed: bool = False) -> np.ndarray:
         """Return A x or A^T x for the unknowns as a fresh flat array; x is 0 elsewhere. It is not counted."""
-        op = self.op.T if transposed else self.op
-        has_matrix = "entries" in self.__dict__ and not isinstance(op.structure, Kronecker)
-        structure = op._matrix_structure if has_matrix else op._acting  # a product with the matrix is one pass
-        if isinstance(structure, Matrix):
-            y = structure.matrix @ x
-        else:
-            y = structure.product(x)
+        key = transposed, "entries" in self.__dict__, x.dtype
+        bound = self._products.get(key)
+        if bound is None:
+            bound = self._products[key] = self._bound_product(*key)
+        new_array, write = bound
+        y = new_array()
+        write(x, y)
         if self.active is not None:
             y[~self.active] = 0.0
         return y
+
+    def _bound_product(self, transposed, has_entries, dtype):
+        """Return a function that allocates the product with an array of this dtype, and a function that writes it."""
+        op = self.op.T if transposed else self.op
+        if has_entries and not isinstance(op.structure, Kronecker):
+            structure = op._matrix_structure  # a product with the matrix is one pass
+        else:
+            structure = op._acting
+        write, zeros = structure.bound(dtype)
+        return buffers.allocator(structure.shape[:1], result_dtype(structure, dtype), zeros), write
 
     def structure_of(self, op: Operator) -> Structure:
         """Return the Structure of an operator on the entries that this process holds."""

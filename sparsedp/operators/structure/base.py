@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import deepcopy
+from functools import partial
 from operator import is_
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp import kernels
 from sparsedp._utils.base_classes import Uncached
 from sparsedp._utils.counters import count
 
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "INT32_LIMIT",
+    "BoundProduct",
     "Matrix",
     "Structure",
     "Transposable",
@@ -30,6 +33,22 @@ __all__ = [
 
 INT32_LIMIT = 2**31
 PROBES = 3  # number of random vectors for estimating the magnitude of a map whose entries are unknown
+
+
+class BoundProduct(NamedTuple):
+    """The product of a linear map with arrays of one dtype: see `Structure.bound`.
+
+    Attributes
+    ----------
+    write : callable
+        ``write(x, out)`` writes A x into `out`, for flat contiguous arrays. It checks nothing, may be called by several
+        threads at once, and must not refer to an Operator, because that would be a reference cycle.
+    zeros : bool
+        Whether `out` must be filled with zeros before.
+    """
+
+    write: Callable[[NDArray, NDArray], Any]
+    zeros: bool = False
 
 
 class Structure(Uncached):
@@ -77,6 +96,13 @@ class Structure(Uncached):
             out.imag = self.product(x.imag.copy())
         else:
             self.act(x, out)
+
+    def bound(self, dtype: np.dtype) -> BoundProduct:
+        """Return the product with arrays of this dtype.
+
+        It computes the same as `apply`. What depends only on the dtype is decided here instead of in every call.
+        """
+        return BoundProduct(self.apply)
 
     def act(self, x: NDArray, out: NDArray) -> None:
         """Write A x into `out`, for float64 and, if `takes_complex`, complex128 arrays."""
@@ -155,6 +181,15 @@ class Matrix(Structure):
     def act(self, x: NDArray, out: NDArray) -> None:
         """Write A x into `out`: see `Structure.act`."""
         out[...] = self.matrix @ x
+
+    def bound(self, dtype: np.dtype) -> BoundProduct:
+        """Return the product with arrays of this dtype: see `Structure.bound`."""
+        add_product = kernels.product_loop()
+        if add_product is None or not dtype == self.dtype == float:
+            return super().bound(dtype)
+        matrix = self.matrix
+        write = partial(add_product, *matrix.shape, matrix.indptr, matrix.indices, matrix.data)
+        return BoundProduct(write, zeros=True)
 
     def transpose(self) -> Structure:
         """Return the plain transpose."""

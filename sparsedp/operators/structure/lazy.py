@@ -13,12 +13,13 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp import kernels
+from sparsedp._utils import buffers
 from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.validation import check_shape
 from sparsedp.autodiff.tape_constants import frozen
 from sparsedp.errors import DerivativeError
 from sparsedp.grid.space import components
-from sparsedp.operators.structure.base import Structure, compact, rows_of
+from sparsedp.operators.structure.base import BoundProduct, Structure, compact, rows_of
 from sparsedp.operators.structure.kronecker import Kronecker
 
 if TYPE_CHECKING:
@@ -53,6 +54,12 @@ class Diagonal(Structure):
     def act(self, x: NDArray, out: NDArray) -> None:
         """Write A x into `out`: see `Structure.act`."""
         np.multiply(x, self.values, out=out)
+
+    def bound(self, dtype: np.dtype) -> BoundProduct:
+        """Return the product with arrays of this dtype: see `Structure.bound`."""
+        if dtype == self.dtype == float:
+            return BoundProduct(self.act)
+        return super().bound(dtype)
 
     def transpose(self) -> Structure:
         """Return the plain transpose."""
@@ -108,6 +115,23 @@ class Chain(Structure):
             x = member.product(x)
         self.members[0].apply(x, out)
 
+    def bound(self, dtype: np.dtype) -> BoundProduct:
+        """Return the product with arrays of this dtype: see `Structure.bound`."""
+        if not dtype == self.dtype == float or self.shape[1] >= FUSED_FROM:
+            return super().bound(dtype)
+        inner = [_allocated(member) for member in self.members[:0:-1]]
+        last = self.members[0].bound(dtype)
+        write_last = last.write
+
+        def write(x, out):
+            for new_array, write_product in inner:
+                product = new_array()
+                write_product(x, product)
+                x = product
+            write_last(x, out)
+
+        return BoundProduct(write, last.zeros)
+
     @cached_property
     def _fused(self):
         """A function that applies all members in one pass if they are differences through faces; else None."""
@@ -157,6 +181,23 @@ class Sum(Structure):
         first.apply(x, out)
         for member in rest:
             out += member.product(x)
+
+    def bound(self, dtype: np.dtype) -> BoundProduct:
+        """Return the product with arrays of this dtype: see `Structure.bound`."""
+        if not dtype == self.dtype == float:
+            return super().bound(dtype)
+        first = self.members[0].bound(dtype)
+        write_first = first.write
+        rest = [_allocated(member) for member in self.members[1:]]
+
+        def write(x, out):
+            write_first(x, out)
+            for new_array, write_product in rest:
+                product = new_array()
+                write_product(x, product)
+                out += product
+
+        return BoundProduct(write, first.zeros)
 
     def transpose(self) -> Structure:
         """Return the plain transpose."""
@@ -247,6 +288,12 @@ def compose(a: Structure, b: Structure) -> Structure:
     if len(members) == 1:
         return members[0]
     return Chain(members)
+
+
+def _allocated(structure):
+    """Return a function that returns a new array for a product in float64, and the function that writes it there."""
+    bound = structure.bound(np.dtype(float))
+    return buffers.allocator(structure.shape[:1], float, bound.zeros), bound.write
 
 
 def _nested(members):
