@@ -1,4 +1,4 @@
-"""What one application of an operator costs: every form, beside the limit of the machine.
+"""The run time of one application of an operator, for each form, compared with the limit of the machine.
 
 Bytes counted: 16 a cell for a Laplacian (one read, one write), 24 a number for the triad a = b + s c.
 All rows of a block run in turn and the smallest time counts; only ratios in one run mean anything.

@@ -1,7 +1,7 @@
 """What the first use on a machine costs: each scene in a fresh process with an empty cache of compiled loops.
 
-Seconds of the clock from `import sparsedp` to the result, the loops that were compiled for it, and the same once more
-with what stands on disk by then. Gates: 5 s, and 15 s where a structured solve is in it.
+Prints the wall-clock seconds from `import sparsedp` to the result and the number of loops compiled, for a first run and
+for a second run that uses the loops on disk. Limits: 5 s, and 15 s for scenes with a structured solve.
 
 Run ``python -m benchmarks.cold_start [--only NAME]`` in the root of the repository.
 """

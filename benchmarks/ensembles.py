@@ -1,7 +1,8 @@
 """Twelve elliptic gradients of 256^2 cells: here, and by processes, one thread each; the bits are the same.
 
-Each process sets up the solver of a new coefficient for itself. So two of them can be no faster than six gradients are
-here: that is the second row. What is left between is messages, and two cores that share caches and memory.
+Each process sets up its own solver for a new coefficient. Two processes therefore cannot be faster than six gradients
+in one process: this limit is the second row. The remaining difference is due to messages, and to two cores that share
+caches and memory.
 
 Run ``python -m benchmarks.ensembles [cells]`` in the root of the repository.
 """

@@ -3,8 +3,9 @@
 Measured: processor seconds a cell and iteration on one rank; how iterations grow with the grid; messages and bytes of
 an iteration, counted by Open MPI on 27 ranks, one of which has neighbours on all sides. Assumed: the network below;
 that messages grow as the levels do, as log(cells), and bytes as the surface of a block; that each rank has as much
-memory bandwidth as the one that was measured alone. No network is measured: an estimate on paper. What one process and
-two ranks take stands beside it; two ranks wait for each other, so theirs are seconds of a clock, for a quiet machine.
+memory bandwidth as the one that was measured alone. No network is measured; this is an estimate. The measured times of
+one process and of two ranks are printed beside it. Two ranks wait for each other, so their times are wall-clock times,
+which need a machine without other work.
 
 Run ``python -m benchmarks.estimate [--cells 96] [--ranks 27]`` in the root of the repository, where PETSc is installed.
 """
@@ -55,7 +56,7 @@ def child(shape, laps):
 
 
 def on_ranks(count, shape, laps, *options):
-    """`child` on so many ranks."""
+    """Run `child` on `count` ranks."""
     name = "x".join(map(str, shape))
     command = ["mpirun", "--oversubscribe", *options, "-n", str(count), sys.executable, "-m", "mpi4py"]
     command += ["-m", "benchmarks.estimate", "--shape", name, "--laps", str(laps)]
@@ -67,7 +68,7 @@ def on_ranks(count, shape, laps, *options):
 
 
 def sent(count, shape, laps):
-    """Messages and bytes of each rank, one row for one, in a program of so many solves."""
+    """Return messages and bytes of each rank, one row for each, in a program of `laps` solves."""
     with tempfile.TemporaryDirectory() as folder:
         names = {"enable": "1", "enable_output": "3", "filename": f"{folder}/sent"}
         options = [word for name, value in names.items() for word in ("--mca", f"pml_monitoring_{name}", value)]

@@ -131,7 +131,7 @@ def convolutions(quick):
     square = rng.standard_normal((1024, 1024))
     tasks = {"conv": lambda: loss((p, x)), "gemm": lambda: filters @ columns, "square": lambda: square @ square}
     spent = best_times(tasks, 3)
-    speed = 6e-9 * channels**2 * 25 * 8 * n * n / spent["conv"]  # forward, and both products on the way back
+    speed = 6e-9 * channels**2 * 25 * 8 * n * n / spent["conv"]  # forward, and both products of the backward pass
     same, best = 2e-9 * channels**2 * 25 * 8 * n * n / spent["gemm"], 2e-9 * 1024**3 / spent["square"]
     print(
         f"convolution {n}^2: {100 * speed / same:.0f} % of one gemm of its shape, {100 * speed / best:.0f} % of 1024^3"

@@ -1,7 +1,7 @@
 """What a gradient through many steps costs: against autograd over slices, in memory, and in steps run again.
 
 All rows of a block run in turn and the smallest time counts; only ratios in one run mean anything. The error beside
-a time is the largest difference of the gradient to that of the first row, relative to the largest entry.
+a time is the largest difference from the gradient of the first row, relative to the largest entry.
 
 Run ``python -m benchmarks.rollout [--quick]`` in the root of the repository.
 """

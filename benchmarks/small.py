@@ -3,8 +3,8 @@
 Three cases: Burgers' equation composed from an operator and a transport (case A7), smoke that rises in a closed box,
 and a Runge-Kutta step of two unknowns. Each is written twice: with the library, and as a user of slices would, a twin
 that runs under autograd and under jax (float64, jitted, warm; a scan of single steps or of ten, whichever is faster).
-All rows of a case run in turn, the smallest time counts. Beside it stands the largest difference of the gradient to
-that of the twin under autograd, relative to the largest entry.
+All rows of a case run in turn, the smallest time counts. The column beside it is the largest difference from the
+gradient of the twin under autograd, relative to the largest entry.
 
 Run ``python -m benchmarks.small`` in the root of the repository.
 """

@@ -41,7 +41,7 @@ class Flow:
         return {"v": self.inside(momentum) + v - self.inside(v), "p": self.D(v) + self.pin * p}
 
     def loop(self, step, state, goal, every=100):
-        """Seconds of steps in time until the figure is this close to that of the steady state."""
+        """Return the seconds of time steps until the figure is this close to its steady value."""
         clock, steps, off, words = process_time(), 0, np.inf, []
         for close in (1e-3, 1e-6, 1e-9):
             while off > close:

@@ -1,8 +1,8 @@
 """What a forward and an adjoint solve by transforms cost, beside the bare transforms of SciPy.
 
 The operator is -divergence @ gradient on a box with equal cells. Its inverse carries the whole
-contract: projection where it is singular, the true residual, the record. The bare pairs are what one
-writes by hand: for the right-hand side and for the cotangent a forward transform, a product with
+contract: projection where it is singular, the true residual, the record. The bare pairs are
+written by hand: for the right-hand side and for the cotangent a forward transform, a product with
 precomputed weights and a backward transform, with as many workers as the library has threads.
 
 Both run in turn and the smallest time of each counts, because only ratios of one run mean anything

@@ -30,7 +30,7 @@ SCHEMES = {
     "semi_lagrangian, cubic": {"scheme": "semi_lagrangian", "interpolation": "cubic"},
     "maccormack": {"scheme": "maccormack"},
 }
-ASKED = {1: "u", 2: "u, v", 3: "u, v, dt"}  # the first so many arguments
+ASKED = {1: "u", 2: "u, v", 3: "u, v, dt"}  # by the number of arguments that are differentiated
 LIMIT = 3.5  # value and gradient on the tape, over the step forward
 
 

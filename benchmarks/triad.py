@@ -1,4 +1,4 @@
-"""How near the compiled Laplacian comes to the memory bandwidth of this machine.
+"""Compare the compiled Laplacian with the memory bandwidth of this machine.
 
 The measure is the STREAM triad a = b + s c, counted as 24 bytes a number; the Laplacian is counted
 as 16 bytes a cell, one read and one write. All rows of a table are measured in turn and the

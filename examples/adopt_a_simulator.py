@@ -130,7 +130,7 @@ print(f"\nloss {value:.4f}; its gradient in {x.size} unknowns took {step.runs - 
 # %%
 # The picture
 # -----------
-# Left: what is left of :math:`v`. Right: how much a little more :math:`v` at the start adds to the loss. It counts in
+# Left: :math:`v` at the end. Right: how much a little more :math:`v` at the start adds to the loss. It counts in
 # the spot, where there is something to grow.
 #
 # Exercises

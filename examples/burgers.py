@@ -121,7 +121,7 @@ starts["L-BFGS"] = dp.minimize(smooth_loss, np.zeros(options.cells), "lbfgs", ma
 # %%
 # How good are they?
 # ------------------
-# The mean error is that of the whole run, frames 0 to 31; the last column counts 33 frames and divides by 32, as
+# The mean error covers the whole run, frames 0 to 31; the last column counts 33 frames and divides by 32, as
 # published figures for an observation in a file do.
 
 print("the start, found by           loss  mean error  at the start  33 frames over 32")

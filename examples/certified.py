@@ -68,8 +68,8 @@ def control(method, rtol=1e-10):
 # error can be estimated by solves for *corrections*, and these may be loose: an error that is known to 1 % is known.
 # `dp.certify` does this for any loss with solves in it. Beside it stands the truth, from a direct solver.
 #
-# The value can be corrected as well. Its error is of the order of the residual, what is left after the correction is
-# of the order of a product of two small numbers.
+# The value can be corrected as well. Its error is of the order of the residual. After the correction, the error is of
+# the order of a product of two small numbers.
 
 exact_value, exact = dp.value_and_grad(control("direct"))(start)
 

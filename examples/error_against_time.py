@@ -4,8 +4,8 @@ Which scheme and solver for a given error?
 
 Burgers and Poisson: errors of values and gradients against run time.
 
-"Faster" means nothing without an error, and "more exact" nothing without a time. What one wants to know is which method
-reaches an error of one percent first, and whether that holds for the gradient as well. So every method is run on
+"Faster" means nothing without an error, and "more exact" nothing without a time. The question is which method reaches
+an error of one percent first, and whether the same method is the fastest for the gradient. So every method is run on
 several grids, and error is drawn against time: once for an equation in time with three schemes, once for a linear
 system with five solvers.
 

@@ -6,8 +6,8 @@ Leapfrog, a sponge, six shots and many receivers: the wave speed under ground is
 
 Shots near the surface send waves down. Where the speed of the rock changes, a part of them is reflected. Receivers
 record the pressure. From these records we reconstruct the speed in every cell, which is called full waveform inversion.
-The crust is that of the model ak135 (B. Kennett, E. Engdahl, R. Buland, Geophys. J. Int. 122, 1995), and a body in it
-is 10 % slower.
+The crust is taken from the model ak135 (B. Kennett, E. Engdahl, R. Buland, Geophys. J. Int. 122, 1995). A body in it is
+10 % slower.
 
 Run it: ``python examples/full_waveform.py [cells deep] [--out FOLDER]``
 """
@@ -159,8 +159,8 @@ print(f"slowest place: {answer.flat[place]:.3f} at {where}")
 # ---------
 # 1. Shoot from one end only, with six shots between 8 and 20 km. Which side of the body is lost?
 # 2. Make the body 30 % slower. Does the search still find it, and if not: does a lower frequency help?
-# 3. Leave the sponge out (`damping=None`) in the run of the search, but not in that of the data. What does it find at
-#    the ends?
+# 3. Omit the sponge (`damping=None`) in the runs of the search, but not in the run that computes the data. What does
+#    the search find at the ends?
 
 if options.out:
     from matplotlib import pyplot

@@ -35,7 +35,7 @@ options = parser.parse_args()
 #
 # .. math:: \ddot x_1 = -x_1 - 0.2 \, (x_1 - x_2), \qquad \ddot x_2 = -x_2 - 0.2 \, (x_2 - x_1) + f .
 #
-# A row of the matrix holds what one entry of the state does to the rates of all.
+# A row of the matrix has the effect of one entry of the state on all rates.
 
 SPRINGS = np.array(
     [
@@ -118,7 +118,7 @@ print("method                 gradients  seconds       loss     unseen published
 
 
 def train(label, f, method, maxiter, every, budget=np.inf, published="", **settings):
-    """Train from the same start; print a row every so many gradients, and when the budget of seconds is spent."""
+    """Train from the same start; print a row after every `every` gradients, and when the time is used up."""
     curve = curves[label] = []
     figures = published.split()
 

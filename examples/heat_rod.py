@@ -101,7 +101,7 @@ def loss(u):
 # %%
 # Is the gradient right?
 # ----------------------
-# A gradient through hundreds of steps is easily wrong in a way that nobody sees. So it is compared with differences of
+# An error in a gradient through hundreds of steps is hard to see. So the gradient is compared with differences of
 # the loss itself, along a few directions and with many step sizes. What counts is the last line, the verdict.
 
 print(f"gradient of the loss after {steps} steps, against finite differences:")

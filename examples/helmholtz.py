@@ -62,7 +62,7 @@ def layer(x, size=1.0):
 # %%
 # On a line we can measure that. Right of the source there is a wave that goes and one that comes back,
 # :math:`u_j = a \, e^{i \kappa j} + b \, e^{-i \kappa j}`, and a fit tells :math:`|b / a|`. The phase from cell to cell
-# is that of the grid, where :math:`2 - 2 \cos \kappa = \omega^2 h^2`.
+# is the one on the grid, where :math:`2 - 2 \cos \kappa = \omega^2 h^2`.
 
 line = dp.Grid(200, spacing=h)
 solve_line = dp.elliptic_solver(dp.divergence(line), dp.gradient(line, dp.dirichlet))

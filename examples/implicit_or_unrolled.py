@@ -82,8 +82,8 @@ def solvers(A):
 # %%
 # What is measured
 # ----------------
-# The least time of ten rounds, in which all ways take turns, and the most memory that is held at one time. The error is
-# that of the gradient, relative to the one of a direct solve.
+# The table has the shortest time of ten rounds, in which all ways take turns, and the peak memory. The error is the
+# difference from the gradient by a direct solve, relative to this gradient.
 
 
 def seconds(action):

@@ -91,9 +91,9 @@ class Search:
 # %%
 # A number of sweeps, given in advance
 # ------------------------------------
-# The plain way: so many sweeps for :math:`u`, then as many for :math:`\lambda`. They begin at zero, or at the last
-# answers, which are close. From zero, :math:`f^T \lambda` is exactly the derivative of the sweeps themselves, since
-# :math:`A` is symmetric: what would come out if all sweeps were taped.
+# The plain way: a fixed number of sweeps for :math:`u`, then as many for :math:`\lambda`. They begin at zero, or at the
+# last answers, which are close. From zero, :math:`f^T \lambda` is exactly the derivative of the sweeps, since :math:`A`
+# is symmetric: the derivative that a tape of all sweeps would give.
 
 
 def fixed(sweeps_at, keep=False):

@@ -79,8 +79,8 @@ print(f"{options.samples} samples with heat {warmth:.0f}, noise of the data (sin
 # %%
 # First way: gradient descent
 # ---------------------------
-# The gradient of :math:`|\text{heat}(x) - y|^2 / 2` damps each wave once more. A step of rate 1 from zero leaves of a
-# wave's error the share :math:`1 - \varphi_k^2`; after :math:`n` steps the sum of the geometric series is
+# The gradient of :math:`|\text{heat}(x) - y|^2 / 2` damps each wave a second time. A step of rate 1 from zero
+# multiplies the error of a wave by :math:`1 - \varphi_k^2`; after :math:`n` steps the sum of the geometric series is
 #
 # .. math:: \hat x_k = \frac{1 - (1 - \varphi_k^2)^n}{\varphi_k} \, \hat y_k .
 #
@@ -116,8 +116,8 @@ def physical(y):
 
 
 # %%
-# Third way: what one knows beforehand
-# ------------------------------------
+# Third way: prior knowledge
+# --------------------------
 # Temperatures are not negative, and rectangles have few edges. Of all starts that fit we want the one with the least
 # sum of jumps between neighbours:
 #

@@ -4,8 +4,8 @@ What flows in, from sensors behind a cylinder
 
 An unknown profile of a wind, found through a whole flow.
 
-Wind enters a channel, flows around a cylinder, and leaves. How fast it is at each height where it enters, nobody has
-measured. There are three columns of sensors behind the cylinder, and they are off by 1 %. A search with gradients
+Wind enters a channel, flows around a cylinder, and leaves. Its speed at each height of the inflow is unknown. There are
+three columns of sensors behind the cylinder, with errors of 1 %. A search with gradients
 through more than a hundred steps of flow finds the profile.
 
 Run it: ``python examples/obstacle.py [cells] [--out FOLDER]``
@@ -110,8 +110,7 @@ print("gradient against finite differences:", dp.check.gradient(loss, flat, quic
 # %%
 # The search
 # ----------
-# It starts from the same wind at all heights. One gradient costs a few times what one run costs, however many unknowns
-# there are.
+# It starts from the same wind at all heights. One gradient costs as much as a few runs, for any number of unknowns.
 
 best = dp.minimize(loss, flat, maxiter=30)
 

@@ -4,7 +4,7 @@ Four patterns, one stepper each
 
 Gray-Scott, Cahn-Hilliard, Swift-Hohenberg and Kuramoto-Sivashinsky in a plane, and a rate found from a picture.
 
-Spots that divide, films that coarsen, rolls, and a flame that never comes to rest: four equations of textbooks, each a
+Spots that divide, films that coarsen, rolls, and a flame that never settles: four equations of textbooks, each a
 few lines here. All have a stiff linear part and a nonstiff nonlinear part, which `dp.stepper` takes separately.
 Each is compared with a known result, and each is differentiable in its parameters.
 
@@ -182,7 +182,7 @@ print(f"growth of a small wave {growth:.4f} ({k**2 - k**4:.4f})")
 # %%
 # A rate, found from a picture
 # ----------------------------
-# Somebody shows us :math:`v` after 25 steps, and says how it began. How much was fed? The search starts at 0.04.
+# Given are the start, and :math:`v` after 25 steps. How much was fed? The search starts at 0.04.
 
 seen = dp.rollout(eat, soup, rates, 25)["v"]
 

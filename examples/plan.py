@@ -2,7 +2,7 @@ r"""
 What does a gradient cost, and what does it not need?
 =====================================================
 
-Two questions to one law: what each calls, sets up and keeps, and what is left out.
+Two questions to one law: what each calls, sets up and keeps, and what is skipped.
 
 Water is pumped out of the ground, and we measure the pressure in the middle. If the rock is known, the unknown is where
 to pump; if the wells are known, the unknown is the rock. Both problems use the same law, but their gradients need

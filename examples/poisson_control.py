@@ -6,8 +6,7 @@ To the exact optimum, and at the same cost on every grid.
 
 We heat a plate with cold edges, and want a given temperature in it, at a low price for heating. This is the standard
 problem of optimal control. Since both of its terms are quadratic, sine waves solve it one by one, and we can see how
-close a search with gradients comes to the exact optimum. Whether it takes more steps on finer grids depends on one
-line.
+close to the exact optimum a search with gradients ends. Whether it takes more steps on finer grids depends on one line.
 
 Run it: ``python examples/poisson_control.py [cells] [--out FOLDER]``
 """

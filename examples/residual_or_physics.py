@@ -28,7 +28,7 @@ options = parser.parse_args()
 # %%
 # The task
 # --------
-# It is that of the example `burgers.py`: on a ring of 128 cells,
+# It is the same as in the example `burgers.py`: on a ring of 128 cells,
 #
 # .. math:: u_t + u \, u_x = \nu \, u_{xx} .
 #
@@ -91,7 +91,7 @@ def field(w, points=points):
 # %%
 # Two residuals
 # -------------
-# The first is that of the equation, in central differences on the points of the grid, :math:`2 \Delta t` and
+# The first is the residual of the equation, in central differences on the points of the grid, :math:`2 \Delta t` and
 # :math:`2 h` wide:
 #
 # .. math:: r = \frac{u^{m+1}_i - u^{m-1}_i}{2 \Delta t} + u^m_i \, \frac{u^m_{i+1} - u^m_{i-1}}{2 h}

@@ -111,7 +111,7 @@ def slender(s):
 
 
 def share(s):
-    """Its drag, relative to that of the disc."""
+    """Its drag, relative to the drag of the disc."""
     return drag(slender(s)) / drag(slender(0.0))
 
 

@@ -59,7 +59,7 @@ def network(weights, u):
 
 
 def solver(cells, dt):
-    """An explicit step on a ring of so many cells, and the places of the cells."""
+    """Return an explicit step on a ring of `cells` cells, and the positions of the cells."""
     h = 2 * np.pi / cells
     sheet = dp.Grid((RUNS, cells), spacing=(1e9, h), periodic=True)
     along = dp.component(sheet, 1)  # of a face field: the faces along the ring
@@ -164,8 +164,8 @@ def train(unrolled, truncate=None, fresh=True):
 # %%
 # Six trainings
 # -------------
-# Each network then runs 100 steps on data that none has seen. The error is beside that of the coarse solver alone; what
-# is lost of the mass is rounding.
+# Each network then runs 100 steps on data that none has seen. Its error is compared with the error of the coarse solver
+# alone. Mass is conserved up to rounding.
 
 unseen = window(10**6, 50, 100)
 

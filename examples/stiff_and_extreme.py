@@ -5,8 +5,8 @@ What breaks a scene?
 Three sound scenes, and two with a fault, driven through stiff and extreme cases.
 
 A loss that works for the numbers at hand may fail for others: a longer time step, a larger viscosity, a NaN, a field
-that is read-only. ``dp.stress`` tries all that in turn and says what became of each case: passed, refused with an error
-that tells why, degraded, or FAILED. A failure is a wrong number that nobody would have noticed.
+that is read-only. ``dp.stress`` tries all that in turn and gives the outcome of each case: passed, refused with an
+error that states the reason, degraded, or FAILED. A failure is a wrong number without an error.
 
 Run it: ``python examples/stiff_and_extreme.py [cells] [--out FOLDER]``
 """
@@ -85,7 +85,7 @@ def ink(p):
 #
 # .. math:: \frac{\Delta t \, \nu}{h^2} \le \frac{1}{4} .
 #
-# Here the number is 0.6, written by hand and checked by nobody: the shortest waves change their sign and become 3.8
+# Here the number is 0.6, and no check refuses it: the shortest waves change their sign and become 3.8
 # times as large in a step. After 20 steps the loss is still a finite number.
 
 L = dp.laplacian(square, dp.dirichlet)
@@ -100,7 +100,7 @@ def too_long(p):
 # %%
 # A fault: a null space that was left in
 # --------------------------------------
-# The pressure again, but somebody has inverted the singular matrix as if it were none. Rounding, here 1e-14 on the
+# The pressure again, but the singular matrix is inverted as if it were regular. Rounding, here 1e-14 on the
 # diagonal, makes it regular, and the inverse has a factor of 1e14 for constants. For a right-hand side without a mean
 # the answer looks right.
 
@@ -153,7 +153,7 @@ for dt, factors in zip(growth.time_steps, growth.factors):
 # Exercises
 # ---------
 # 1. Print a whole result, ``print(results["ink in a wind"])``. Which cases were refused, and with what words?
-# 2. Make the explicit step right: ``0.2 * h**2``. What is left among the failures?
+# 2. Make the explicit step stable: ``0.2 * h**2``. Which failures remain?
 # 3. Project in the last scene, ``forgotten(b - np.mean(b))``. Which failures go away, and which stay?
 
 if options.out:

@@ -34,7 +34,7 @@ options = parser.parse_args()
 #
 # .. math:: v_t + \nabla \cdot (v \otimes v) = \nu \, \Delta v - \nabla p, \qquad \nabla \cdot v = 0 .
 #
-# The reason: what the flow carries is a pure gradient here, and pressure takes it away. What is left is
+# The reason: here the convection term is a pure gradient, which the pressure cancels. The remaining equation is
 # :math:`v_t = \nu \, \Delta v`, and for these waves :math:`\Delta v = -2 v`.
 #
 # Each component is sampled where it lives: `face_centres(0)` are the centres of the faces across x.
@@ -59,7 +59,7 @@ def vortices(n):
 # -----------
 # The scheme of graphics, after an example in the documentation of PhiFlow: viscosity, then the velocity is carried
 # along by itself, then the projection takes its divergence away. It looks upstream and interpolates, and interpolation
-# smooths in each of 199 steps: after them a good part of the vortices is gone.
+# smooths in each of 199 steps, so that the vortices become much weaker.
 
 
 def first_order(n):
@@ -115,7 +115,7 @@ def second_order(n):
 
 
 def error(start, run):
-    """Relative error at the end: root mean square of the error over that of the velocity."""
+    """Relative error at the end: root mean square of the error, divided by the root mean square of the velocity."""
     return np.linalg.norm(run(start, VISCOSITY) / DECAY - start) / np.linalg.norm(start)
 
 

@@ -2,7 +2,7 @@ r"""
 A torch network and a solve in one training loop
 ================================================
 
-A law that nobody has measured, learned from what follows from it.
+An unmeasured law, learned from its consequences.
 
 Heat flows through plates whose conductivity depends on their material in an unknown way. What is seen are materials and
 steady temperatures, never a conductivity. A network of torch stands for the law, a solver of this library for the

@@ -28,7 +28,7 @@ options = parser.parse_args()
 # The problem
 # -----------
 # The physics is :math:`y = (x_1, x_2^2)`, and the loss :math:`J = |y|^2`. It can be undone: a root has two branches,
-# and we stay on that of the present :math:`x`.
+# and we stay on the branch of the present :math:`x`.
 
 
 def physics(x):

@@ -127,7 +127,7 @@ for label, (method, size) in methods.items():
 
 
 def largest_residual(b, count):
-    """Largest entry of the residual after so many iterations of CG from zero."""
+    """Return the largest entry of the residual after `count` iterations of CG from zero."""
     inv = dp.inverse(box, "krylov", iterations=count, nullspace="project")
     return np.max(np.abs(b - box(inv(b))))
 

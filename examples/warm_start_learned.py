@@ -54,8 +54,8 @@ def smoke_divergence():
 # %%
 # The solvers
 # -----------
-# For training: so many iterations of CG, unrolled, so that the tape keeps all of them. For judging: CG and multigrid
-# until the residual is 1e-3, and a direct solve for the truth.
+# For training: a fixed number of iterations of CG, unrolled, so that the tape keeps all of them. For evaluation: CG and
+# multigrid until the residual is 1e-3, and a direct solve for the truth.
 
 iterations = n // 4
 unrolled = dp.inverse(box, "krylov", diff="unrolled", iterations=iterations, nullspace="project")
@@ -98,7 +98,7 @@ def guess(w, b):
 #
 # .. math:: E(x) = \tfrac{1}{2} \, x^T A x - b^T x = E(x^*) + \tfrac{1}{2} \, (x - x^*)^T A \, (x - x^*) .
 #
-# So the energy can be the loss, and nobody has to solve anything in order to train. It is taken before the iterations
+# So the energy can be the loss, and training needs no exact solution. It is taken before the iterations
 # of CG or after them.
 
 

@@ -94,9 +94,9 @@ def work_precision(
     problem : callable
         ``problem(**settings)`` returns (loss, x) or (loss, x, facts). The dict `facts` has values for the columns
         "unknowns", "steps" and "tolerance". Other numbers and strings in it become further columns. It may also have
-        a function "output": then the forward error is that of the array output(x), and not the error of the loss. If
-        x is None, loss() is called without arguments, for example to run an optimizer; its result is compared with
-        the reference, and there is no gradient.
+        a function "output": then the forward error is the error of the array output(x), and not of the loss. If x is
+        None, loss() is called without arguments, for example to run an optimizer; its result is compared with the
+        reference, and there is no gradient.
     methods : dict
         A dict of settings for each method, by name of the method.
     over : dict, optional
