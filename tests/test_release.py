@@ -225,7 +225,7 @@ def test_sdist_and_wheel_are_sound(built):
     said = run(sys.executable, "-m", "twine", "check", "--strict", str(sdist), str(wheel), folder=built)
     assert said.count("PASSED") == 2
     packed = {name for name in zipfile.ZipFile(wheel).namelist() if "dist-info" not in name}
-    sources = (path for kind in ("py", "pyi") for path in (ROOT / "sparsedp").rglob(f"*.{kind}"))
+    sources = (path for kind in ("*.py", "*.pyi", "py.typed") for path in (ROOT / "sparsedp").rglob(kind))
     assert packed == {path.relative_to(ROOT).as_posix() for path in sources}
     with tarfile.open(sdist) as archive:
         inside = {Path(*Path(name).parts[1:]).as_posix() for name in archive.getnames()}
@@ -235,10 +235,14 @@ def test_sdist_and_wheel_are_sound(built):
 
 @pytest.mark.slow
 def test_the_wheel_works_without_the_checkout(built, tmp_path):
+    """It also has types for users: mypy ignores those of an installed package without the file py.typed."""
     run(sys.executable, "-m", "venv", "clean", folder=tmp_path)
     python = str(tmp_path / "clean" / ("Scripts" if os.name == "nt" else "bin") / "python")
     [wheel] = built.glob("*.whl")
     run(python, "-m", "pip", "install", str(wheel), folder=tmp_path)
+    (tmp_path / "script.py").write_text("import sparsedp\nreveal_type(sparsedp.Grid((2,)).dim)\n", encoding="utf-8")
+    options = ["--config-file=", "--follow-imports=silent", "--ignore-missing-imports", "--python-executable", python]
+    assert 'Revealed type is "int"' in run(sys.executable, "-m", "mypy", *options, "script.py", folder=tmp_path)
     assert run(python, "-c", SMOKE.replace("VERSION", repr(PROJECT["version"])), folder=tmp_path).split() == ["agrees"]
     said = run(python, "-m", "sparsedp", "demo", "--size", "16", "--out", "demo", folder=tmp_path)
     assert "Error against run time" in said and (tmp_path / "demo" / "table.csv").exists()
