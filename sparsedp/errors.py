@@ -61,6 +61,17 @@ class NonFiniteGradientWarning(UserWarning):
 class ConvergenceError(SparsedpError, RuntimeError):
     """A solve did not meet its tolerance.
 
+    The message states the residual that was reached, and `info.status` the cause:
+
+    - "max_iterations": increase `maxiter`, give a `preconditioner`, or use another `method`.
+    - "stagnated", "diverged", "indefinite_operator": use ``method="direct"``, or check the operator.
+    - "setup_failed": the operator is singular; add a shift, or fix the value of an unknown.
+    - "empty_row", "empty_column": an unknown or an equation is missing in the matrix.
+
+    If Newton's method fails (`implicit`, `steady`, implicit time steps), start from a better guess or take a smaller
+    step. ``minimize`` handles this error at trial points. The guide docs/guides/solvers.md describes the rules that
+    every solve follows, with a table of all causes.
+
     Attributes
     ----------
     info : SolveInfo or None

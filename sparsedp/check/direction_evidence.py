@@ -497,7 +497,7 @@ def _word_and_reason(evidence: DirectionEvidence) -> tuple[str, str]:
         return "noise", reason
     if evidence.is_close or evidence.is_zero:
         return _with_a_small_gap(evidence)
-    return "noise", f"noise of {evidence.resolution:.1e} of the derivative hides it"
+    return "noise", f"the noise is {evidence.resolution:.1e} of the derivative: not enough to tell"
 
 
 def _without_any_change(evidence: DirectionEvidence) -> tuple[str, str]:
@@ -507,7 +507,7 @@ def _without_any_change(evidence: DirectionEvidence) -> tuple[str, str]:
     predicted = abs(evidence.slope) * evidence.silent
     if predicted > 2 * THRESHOLDS.bars_disagree * evidence.smallest_change:
         return "disagrees", "the loss does not change along this direction, the gradient says it does"
-    return "noise", "the rounding of the loss hides the derivative"
+    return "noise", "the derivative is smaller than the rounding error of the loss"
 
 
 def _with_a_significant_gap(evidence: DirectionEvidence) -> tuple[str, str]:

@@ -63,8 +63,7 @@ class ModeComparison(NamedTuple):
         if self.gap <= THRESHOLDS.mode_tolerances * tolerance:
             return "open", f"{reason}, which solves to rtol {tolerance:g} may leave; tighten them"
         if self.is_hidden:
-            hidden = "and the noise of the loss hides which is right: the derivative may be rounding"
-            return "hidden modes", f"{reason}, {hidden}"
+            return "hidden modes", f"{reason}: not enough to tell which is right, both may be noise of the loss"
         return "broken", f"{reason}: the JVP or the VJP of a rule is wrong"
 
 

@@ -66,7 +66,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ConservationLaw", "conservation_law"]
 
-NO_WAVES = "; has the state left where it has waves (a density or a depth below 0)? Take a smaller dt"
+IF_NOT_FINITE = "; a density or a depth may have become negative: take a smaller dt"
 GHOSTS = 2  # ghost cells beyond each end: the slope in the nearer one needs the value of the farther one
 # The mode of np.pad that fills the ghost cells, by boundary condition; None stands for a periodic axis.
 PAD_MODES: dict[Any, Any] = {None: "wrap", free_slip: "symmetric", outflow: "edge", inflow_side: "edge"}
@@ -368,7 +368,7 @@ class ConservationLaw(Reconstructible):
         first_field = u[(0,) * (u.ndim - self.grid.dim)]
         for speed in map(plain, speeds):
             _checked_result("speed", speed, first_field)
-            check_finite(f"the speed of a conservation_law along {AXES[axis]}", speed, advice=NO_WAVES)
+            check_finite(f"the speed of a conservation_law along {AXES[axis]}", speed, advice=IF_NOT_FINITE)
         if np.any(plain(speeds[0]) > plain(speeds[1])):  # the flux would not be upwind
             raise ValueError(
                 "the speed of a conservation_law must be >= 0, or a pair, the slowest before the fastest; write abs(u) "

@@ -11,7 +11,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp._utils.counters import thread
-from sparsedp._utils.pytree import flatten, norm, paired
+from sparsedp._utils.pytree import described, flatten, is_branch, labels, norm, paired
 from sparsedp._utils.validation import check_function, check_number, check_shape, check_whole
 from sparsedp.autodiff.derivative import pullback
 from sparsedp.optimize.result import Minimum, Record
@@ -20,11 +20,11 @@ __all__ = ["ADMM"]
 
 IMBALANCE = 10.0  # the penalty rho changes when one residual is more than this many times the other
 PENALTY_FACTOR = 2.0  # factor by which rho is multiplied or divided
-ADAPTIVE_ROUNDS = 50  # rho is constant after this number of iterations, which the convergence theory requires
+ADAPTIVE_ITERATIONS = 50  # rho is constant after this number of iterations, which the convergence theory requires
 INNER_TOLERANCE = 1e-6  # tolerance of the minimization over x in each iteration
 
 
-class Round(NamedTuple):
+class Iteration(NamedTuple):
     """The result of one ADMM iteration.
 
     Attributes
@@ -126,8 +126,13 @@ class ADMM:
         """
         if callable(self.inner) and bounds is not None:
             raise TypeError("admm with a function as inner does not use bounds; leave them out, or apply them in inner")
+        if self.operator is None and is_branch(start):
+            raise TypeError(
+                f"admm without operator= takes one array as start, got {described(start)}; write the linear map from "
+                f"the start to an array, for example operator=lambda x: {labels(start, 'x')[0]}"
+            )
         run = _Run(self, loss, start, bounds, minimize_smooth)
-        message = f"stopped after {maxiter} rounds, the limit maxiter"
+        message = f"stopped after {maxiter} iterations, the limit maxiter"
         converged = False
         run.record(run.x, run.z, np.inf)
         try:
@@ -220,7 +225,7 @@ class _Run:
         dual = norm(pull(np.conj(self.z - z_before))) / (norm(pull(np.conj(self._w))) or 1.0)
         self._balance(number, primal, dual)
         self.evaluations += evaluations
-        return Round(self.x, image, primal, dual)
+        return Iteration(self.x, image, primal, dual)
 
     def _first_rho(self):
         """Return the initial rho, weight / mean |K x| at the start; the mean is replaced by 1 if it is 0."""
@@ -229,7 +234,7 @@ class _Run:
 
     def _balance(self, number, primal, dual):
         """Change rho for the next iteration if one residual is much larger than the other."""
-        if number >= ADAPTIVE_ROUNDS or max(primal, dual) <= IMBALANCE * min(primal, dual):
+        if number >= ADAPTIVE_ITERATIONS or max(primal, dual) <= IMBALANCE * min(primal, dual):
             return
         factor = PENALTY_FACTOR if primal > dual else 1 / PENALTY_FACTOR
         self._rho = self._rho * factor

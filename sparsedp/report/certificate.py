@@ -38,6 +38,7 @@ from sparsedp.solvers.scaling import length
 
 __all__ = ["Certificate", "Certified", "certified", "certify", "distance"]
 
+ON_RANKS = "an estimate of the error of solves (certify, certified)"  # in the message if fields are distributed
 TARGET = 0.01  # default target of `certify`: relative error of the gradient
 SHARE = 0.01  # relative tolerance of a correction
 ROUNDING_ERROR = 1e-13  # relative errors below this are due to rounding, not to solves
@@ -138,6 +139,7 @@ class RecordedSolves(dict[SolveKey, RecordedSolve]):
 
     def linear(self, solver: Any, b: NDArray[Any], transposed: bool, checked: bool, start: Any) -> NDArray[Any]:
         """Return the flat solution of a linear solve. The solver calls this in place of its own `solve`."""
+        solver.system.unscaled.backend.check(ON_RANKS)
         if transposed:
             operator = solver.system.unscaled.T
         else:
@@ -162,6 +164,7 @@ class RecordedSolves(dict[SolveKey, RecordedSolve]):
 
     def root(self, root: Any, equation: Any, guess: NDArray[Any], leaves: Any) -> NDArray[Any]:
         """Return the flat solution of a nonlinear solve."""
+        equation.unknowns.backend.check(ON_RANKS)
 
         def corrected(x: NDArray[Any], kept: Any) -> NDArray[Any]:
             return root.newton_correction(equation, x, leaves, self.share, -kept)
@@ -237,6 +240,8 @@ def certify(loss: Callable[[Any], Any], x: Any, target: float = TARGET) -> Certi
     ------
     ValueError
         If `target` is not between 0 and 1. Exceptions of the loss are not caught.
+    TypeError
+        If the loss solves systems of fields that are distributed over MPI ranks.
 
     See Also
     --------
@@ -477,10 +482,13 @@ class Certified:
     def _evaluate(self, value_and_gradient: Callable[[Any], Any], x: Any) -> tuple[float, Any]:
         """Return value and gradient, with solves corrected until both are accurate enough."""
         # The first pass reuses the solutions of the last evaluation without solves. The change from this pass to the
-        # next one shows the error.
-        value, gradient = self._pass(value_and_gradient, x, RecordedSolves(self._solves, None, self.share))
+        # next one shows the error. If all solvers are direct, the first pass solves, and no other pass is needed.
+        earlier = self._solves
+        if not self._any_iterative():
+            earlier = {}
+        value, gradient = self._pass(value_and_gradient, x, RecordedSolves(earlier, None, self.share))
         self.evaluations += 1
-        if not any(solve.iterative for solve in self._solves.values()):
+        if not self._any_iterative():
             return value, gradient
         for _ in range(MOST_CORRECTIONS):
             new_value, new_gradient = self._pass(value_and_gradient, x, RecordedSolves(self._solves, share=self.share))
@@ -490,6 +498,10 @@ class Certified:
             if is_close:
                 break
         return value, gradient
+
+    def _any_iterative(self) -> bool:
+        """Return whether a solve of the last pass was iterative."""
+        return any(solve.iterative for solve in self._solves.values())
 
     def _pass(self, value_and_gradient: Callable[[Any], Any], x: Any, solves: RecordedSolves) -> tuple[float, Any]:
         """Run value and gradient once with `solves`, and keep them. The value is corrected by y . r."""

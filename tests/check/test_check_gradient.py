@@ -153,8 +153,16 @@ INCONCLUSIVE = {
         lambda u: 1 + 0 * u,
         "not twice differentiable",
     ),
-    "noise": (lambda u: np.sum(u**2) + 0.1 * hash_noise(u), lambda u: 2 * u, "hides it"),
-    "staircase": (lambda u: float(np.sum(np.floor(u))), lambda u: 0 * u, "hides it"),
+    "noise": (
+        lambda u: np.sum(u**2) + 0.1 * hash_noise(u),
+        lambda u: 2 * u,
+        "of the derivative: not enough to tell",
+    ),
+    "staircase": (
+        lambda u: float(np.sum(np.floor(u))),
+        lambda u: 0 * u,
+        "of the derivative: not enough to tell",
+    ),
     "constant": (lambda u: 3.0, lambda u: 0 * u, "the loss is constant to rounding"),
     "infinite": (lambda u: np.inf, lambda u: 0 * u, "the loss is inf at x"),
     "tiny": (lambda u: 1e-320 * np.sum(u**2), lambda u: 2e-320 * u, "it underflows"),

@@ -109,7 +109,7 @@ def test_a_loss_and_a_gradient_that_are_rounding_are_inconclusive(x, gradient):
     """At ones the loss is exactly 0 and does not change along the constant, and the gradient is not exactly 0."""
     found = AUDIT(cancelled, x, gradient, directions=1)
     assert abs(found.value) < 1e-22 and found.verdict == "inconclusive", found
-    assert gradient is not None or "the derivative may be rounding" in found.reason
+    assert gradient is not None or "not enough to tell which is right, both may be noise of the loss" in found.reason
 
 
 def wrong_cube(vjp_error, jvp_error):

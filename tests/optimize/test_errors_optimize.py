@@ -118,6 +118,12 @@ WRONG = [
         "rho of admm, the weight divided by the size of K x, is inf here; rescale x or write rho=",
     ),
     (
+        lambda: dp.minimize(lambda x: x["a"] ** 2, {"a": 1.0, "b": 2.0}, "admm", weight=1.0),
+        TypeError,
+        "admm without operator= takes one array as start, got a dict of a, b; write the linear map from the start to "
+        "an array, for example operator=lambda x: x['a']",
+    ),
+    (
         run(method="newton_cg", inner=0),
         ValueError,
         "inner of newton_cg must be a whole number >= 1, got 0; the default is 200",

@@ -189,14 +189,14 @@ def test_admm_stops_at_maxiter_and_by_its_callback():
     loss = lambda x: anp.sum((x - 1) ** 2)
     seen = []
     best = dp.minimize(loss, np.zeros(3), "admm", maxiter=3, tolerance=0.0, weight=0.1)
-    assert len(best.history) == 4 and best.message == "stopped after 3 rounds, the limit maxiter"
+    assert len(best.history) == 4 and best.message == "stopped after 3 iterations, the limit maxiter"
     call = lambda record, x: seen.append(record) or len(seen) == 2
     best = dp.minimize(loss, np.zeros(3), "admm", tolerance=0.0, callback=call, weight=0.1)
     assert len(best.history) == 3 and best.message == "stopped by the callback"
 
 
 def test_an_interrupted_round_of_admm_ends_the_run():
-    """The interrupted inner minimization returns its best point; the rounds must end too."""
+    """The interrupted inner minimization returns its best point; the iterations must end too."""
     calls = []
 
     def loss(x):

@@ -93,6 +93,18 @@ REFUSED = [
     ),
     (
         TypeError,
+        "an estimate of the error of solves (certify, certified) does not work on ranks yet; give it the grid from "
+        "before dp.distribute",
+        lambda s: dp.certify(lambda u: anp.sum(dp.inverse(-dp.laplacian(s.grid, dp.dirichlet))(u)), s.u),
+    ),
+    (
+        TypeError,
+        "an estimate of the error of solves (certify, certified) does not work on ranks yet; give it the grid from "
+        "before dp.distribute",
+        lambda s: dp.certify(lambda k: anp.sum(dp.steady(lambda x, k: x**3 - k, s.u, k)), 8.0),
+    ),
+    (
+        TypeError,
         "a tensor does not work on ranks yet; give it the grid from before dp.distribute",
         lambda s: dp.elliptic_solver(dp.divergence(s.grid), s.G)(np.ones((2, 2, 5, 4)), np.ones((5, 4))),
     ),

@@ -194,6 +194,9 @@ def test_direct_solves_and_refusals():
     loose = dp.certified(0.1)
     assert dp.minimize(control("direct"), 0 * X, tolerance=loose).converged
     assert loose.passes == loose.evaluations and loose.iterations == 0
+    solve = dp.inverse(-L, "direct")
+    misfit = lambda s: anp.sum((solve(s * X) - solve(0.5 * X)) ** 2)  # not the quadratic model of its first solves
+    assert dp.minimize(misfit, 2.0, tolerance=dp.certified(0.1)).x == pytest.approx(0.5, rel=1e-7)
     with pytest.raises(
         ValueError,
         match=r"fraction of certified must be between 0 and 1, got 2; write for example certified\(0.1\)",
