@@ -225,8 +225,8 @@ def stepper(
     Cost: n linear steps and their gradient take one set-up and 2 n solves (tr_bdf2: 4 n). With a tolerance a gradient
     takes about six times the steps of its value, and three times the time of a gradient without the error estimate.
     radau evaluates three Jacobians for the derivative of a step, batches them over many steps, and records one rule on
-    the tape for an interval; a gradient takes 1.5 to 3.2 times the time of its value, and 3 to 5 times if the rate is
-    written for vectors.
+    the tape for an interval; a gradient takes 1.5 to 3.2 times as long as the value, and 3 to 5 times if the rate is
+    vectorized.
 
     Breaks and events: du/db = f_- - f_+ just after a break b, where f_- and f_+ are the rates before and after it. The
     derivative of the time of an event g = 0 follows from the implicit function theorem,
