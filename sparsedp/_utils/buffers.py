@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import DTypeLike
 
-__all__ = ["allocator", "empty"]
+__all__ = ["allocator", "empty", "zeros"]
 
 LARGE = 1 << 18  # bytes; smaller arrays are recycled by the C library
 SPARE = 1 << 30  # largest total size of free buffers in bytes; a field on 256^3 cells and one on the faces take half
@@ -52,18 +52,20 @@ def empty(shape: tuple[int, ...], dtype: DTypeLike) -> np.ndarray:
     return result
 
 
-def allocator(shape: tuple[int, ...], dtype: DTypeLike = float, zeros: bool = False) -> Callable[[], np.ndarray]:
-    """Return a function without arguments that returns a new array, of zeros or uninitialised.
+def allocator(shape: tuple[int, ...], dtype: DTypeLike = float, filled: bool = False) -> Callable[[], np.ndarray]:
+    """Return a function without arguments that returns a new array: zeros if `filled`, else uninitialised.
 
     The function does not compare the size of the array with LARGE: this is done here, once.
     """
     if prod(shape) * np.dtype(dtype).itemsize < LARGE:
-        return partial(np.zeros if zeros else np.empty, shape, dtype)
-    return partial(_zeros if zeros else empty, shape, dtype)
+        return partial(np.zeros if filled else np.empty, shape, dtype)
+    return partial(zeros if filled else empty, shape, dtype)
 
 
-def _zeros(shape, dtype):
-    """Return an array of zeros in recycled memory."""
+def zeros(shape: tuple[int, ...], dtype: DTypeLike) -> np.ndarray:
+    """Return an array of zeros, in recycled memory if it is large."""
+    if prod(shape) * np.dtype(dtype).itemsize < LARGE:
+        return np.zeros(shape, dtype)
     result = empty(shape, dtype)
     result.fill(0)
     return result

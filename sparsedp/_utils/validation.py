@@ -287,12 +287,11 @@ def check_finite(
 
 def surely_finite(value: Any) -> bool:
     """Test cheaply whether all entries are finite, without a temporary array; may return False if sums overflow."""
-    if type(value) is np.float64:
-        return isfinite(value)
-    if type(value) is np.ndarray and value.size <= BLOCK and value.dtype == FLOAT and value.flags.c_contiguous:
-        flat = value.reshape(-1)
-        if isfinite(np.vdot(flat, flat)):  # fast; if a square overflows, the sum below decides
+    if type(value) is np.ndarray and value.size <= BLOCK and value.dtype == FLOAT:
+        if isfinite(np.vdot(value, value)):  # fast; if a square overflows, the sum below decides
             return True
+    elif type(value) is np.float64:
+        return isfinite(value)
     with np.errstate(all="ignore"):
         return bool(np.isfinite(np.sum(value)))
 

@@ -22,6 +22,8 @@ import numpy as np
 from sparsedp.advection.interpolant import InterpolatedComponent
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from sparsedp.advection.interpolant import Interpolant
@@ -48,9 +50,11 @@ class Trajectory:
         Displacements of the departure points from the points.
     """
 
+    __slots__ = ("_half_way", "displacement", "interpolant")
+
     def __init__(self, interpolant: Interpolant, w: NDArray, step: float) -> None:
         self.interpolant = interpolant
-        self._half_way: list[InterpolatedComponent] = []  # for midpoint: the velocity components at the midpoints
+        self._half_way: Sequence[InterpolatedComponent] = ()  # for midpoint: the velocity components at the midpoints
         if interpolant.half_way is not None:
             first_half = Trajectory(interpolant.half_way, w, 0.5 * step)
             self._half_way = [first_half.at_departure_points(row, EMPTY) for row in w]

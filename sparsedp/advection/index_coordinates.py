@@ -67,6 +67,7 @@ class IndexCoordinates:
         grid = settings.grid
         self.shape = settings.space.parts[number]
         self.inverse_widths = np.array([1.0 / float(widths[0]) for widths in grid.widths])
+        self._last_scale = 0.0, self.inverse_widths * 0.0
         self.axes: list[PointsOfAxis] = []
         if all(grid.uniform):
             return
@@ -85,10 +86,18 @@ class IndexCoordinates:
                 _check_monotone(settings.scheme, gaps)
             self.axes.append(PointsOfAxis(gaps, widths.size if periodic else None, cubic))
 
+    def _scale(self, step: float) -> NDArray:
+        """Return the time step divided by the widths of the cells. The array of the last step is reused."""
+        last_step, scale = self._last_scale  # one attribute, so that threads read matching values
+        if last_step != step:
+            scale = self.inverse_widths * step
+            self._last_scale = step, scale
+        return scale
+
     def displacement(self, m: NDArray, step: float) -> Displacement:
         """Return the displacements for velocities m (axis, point) and a signed time step."""
         if not self.axes:
-            return Displacement(m, self.inverse_widths * step, ())
+            return Displacement(m, self._scale(step), ())
         if self.axes[0].cubic:
             slopes_per_point = 1
         else:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +11,7 @@ from sparsedp._utils import buffers
 from sparsedp._utils.validation import EPS
 from sparsedp.advection.ghost_cells import ghost_sources, solid_filling
 from sparsedp.advection.index_coordinates import IndexCoordinates
+from sparsedp.advection.settings import wall_space
 from sparsedp.kernels import interpolation_weights
 from sparsedp.kernels.interpolation_weights import PAD
 
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from sparsedp.advection.settings import TransportSettings
 
 __all__ = ["InterpolatedComponent", "Interpolant"]
+
+GATHER_BELOW = 8192  # number of samples up to which one gather is faster than copies of blocks
 
 
 class Interpolant:
@@ -61,10 +63,18 @@ class Interpolant:
             self.half_way = Interpolant(settings, number, closed=True)
         self._inside = tuple(slice(PAD, PAD + n) for n in self.points.shape)
         self._ghosts, self._sources = ghost_sources(settings, number, self.points, closed)
+        self._gathered = None
+        if self.points.samples <= GATHER_BELOW:
+            self._gathered = self._indices_of_samples(0 if closed else wall_space(settings).size)
         self._filling: sp.csr_array | None = None
         if settings.of == "cells" and settings.solid is not None and not closed:  # faces of solids keep their value
             self._filling = solid_filling(settings.grid, settings.solid)
             self._filling_transpose = sp.csr_array(self._filling.T)
+
+    def _indices_of_samples(self, inflow_values: int) -> NDArray:
+        """Return for each sample its index in the component followed by the inflow values."""
+        n = self.points.size
+        return self._padded(np.arange(n), np.arange(n, n + inflow_values)).astype(np.intp)
 
     def fill_solid(self, u: NDArray) -> NDArray:
         """Return the component with its solid cells filled; see `solid_filling`."""
@@ -85,6 +95,14 @@ class Interpolant:
 
     def pad(self, u: NDArray, inflow: NDArray) -> NDArray:
         """Return the samples: the component with its ghost cells, followed by the inflow values."""
+        if self._gathered is None:
+            return self._padded(u, inflow)
+        if inflow.size:
+            u = np.concatenate((u, inflow))
+        return u.take(self._gathered)
+
+    def _padded(self, u: NDArray, inflow: NDArray) -> NDArray:
+        """Return the samples by copying blocks, which for large arrays is faster than gathering entries."""
         cells = self.points.samples
         samples = buffers.empty((cells + inflow.size,), float)
         samples[:cells].reshape(self.points.padded)[self._inside] = u.reshape(self.points.shape)
@@ -98,9 +116,10 @@ class Interpolant:
         The cotangent `samples` is overwritten.
         """
         cells = self.points.samples
-        np.add.at(samples, self._sources, samples[self._ghosts])
+        np.add.at(samples, self._sources, samples.take(self._ghosts))
         of_u.reshape(self.points.shape)[...] = samples[:cells].reshape(self.points.padded)[self._inside]
-        of_inflow += samples[cells:]
+        if of_inflow.size:
+            of_inflow += samples[cells:]
 
 
 class InterpolatedComponent:
@@ -116,17 +135,22 @@ class InterpolatedComponent:
         All inflow values.
     """
 
+    __slots__ = ("_samples", "displacement", "inflow", "interpolant", "points", "u")
+
     def __init__(self, interpolant: Interpolant, displacement: Displacement, u: NDArray, inflow: NDArray) -> None:
         self.interpolant = interpolant
         self.displacement = displacement
         self.u = u
         self.inflow = inflow
         self.points = interpolant.points
+        self._samples: NDArray | None = None
 
-    @cached_property
+    @property
     def samples(self) -> NDArray:
         """The filled component with its ghost cells, followed by the inflow values."""
-        return self.interpolant.pad(self.interpolant.fill_solid(self.u), self.inflow)
+        if self._samples is None:
+            self._samples = self.interpolant.pad(self.interpolant.fill_solid(self.u), self.inflow)
+        return self._samples
 
     def with_field(self, u: NDArray, inflow: NDArray) -> InterpolatedComponent:
         """Return another field at the same departure points."""
@@ -153,8 +177,7 @@ class InterpolatedComponent:
 
         `of_samples` is a pair (indices of samples, cotangents of these samples) with further contributions.
         """
-        samples = buffers.empty((self.points.samples + self.inflow.size,), float)
-        samples[:] = 0.0
+        samples = buffers.zeros((self.points.samples + self.inflow.size,), float)
         if of_samples is not None:
             np.add.at(samples, *of_samples)
         values, scale, _ = self.displacement

@@ -10,11 +10,11 @@ import numpy as np
 from sparsedp._utils.validation import check_finite, surely_finite
 from sparsedp.advection.arguments import FLOAT, check_step, flatten_array
 from sparsedp.advection.settings import FIELD, INFLOW, STEP, VELOCITY
-from sparsedp.autodiff.tape import Rule, cast, dtype_of, isbox, linear, plain
+from sparsedp.autodiff.tape import MOST_BOUND, Rule, cast, dtype_of, form_of, isbox, linear, plain
 from sparsedp.errors import DerivativeError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -28,13 +28,33 @@ ARGUMENTS = ("u", "v", "dt", "inflow")
 
 def rule_of(method: TransportMethod) -> Rule:
     """Return a transport step as a differentiable function of (u, v, dt, inflow)."""
+    space = method.settings.space
 
     def forward(u, v, dt, inflow):
-        return _unflatten_result(u, method.forward(*_flatten(method, u, v, dt, inflow)), method.settings.space.shape)
+        return _unflatten_result(u, method.forward(*_flatten(method, u, v, dt, inflow)), space.shape)
+
+    def bind(*values):
+        flatten = _bound_flatten(method, *values)
+        if flatten is None:
+            return forward
+
+        def bound_forward(u, v, dt, inflow):
+            return method.forward(*flatten(u, v, dt, inflow)).reshape(space.shape)
+
+        return bound_forward
+
+    flattened: dict[tuple, Any] = {}  # form of the arguments -> result of `_bound_flatten`
 
     def vjp(nums, ans, *args):
+        form = form_of(args)
+        if form not in flattened:
+            if len(flattened) >= MOST_BOUND:
+                flattened.clear()
+            flattened[form] = _bound_flatten(method, *args)
+        flatten = flattened[form]
+
         def pull(g, *sums):
-            return _pull(method, nums, args, g, sums)
+            return _pull(method, nums, args, g, sums, flatten)
 
         return pull
 
@@ -55,15 +75,24 @@ def rule_of(method: TransportMethod) -> Rule:
         return _unflatten(ans, tangent)
 
     rule = Rule(method.name, forward, vjp, jvp)
+    rule.bind = bind
     rule.adds = method.accumulates
     return rule
 
 
-def _pull(method: TransportMethod, nums: Sequence[int], args: tuple, g: Any, sums: tuple) -> list:
-    """Return the cotangents of the arguments `nums`, in the shapes of these arguments; see `Rule` for `sums`."""
-    flat = _flatten(method, *args)
+def _pull(
+    method: TransportMethod, nums: Sequence[int], args: tuple, g: Any, sums: tuple, flatten: Callable | None
+) -> list:
+    """Return the cotangents of the arguments `nums`, in the shapes of these arguments.
+
+    See `Rule` for `sums` and `_bound_flatten` for `flatten`.
+    """
+    if flatten is None:
+        flat = _flatten(method, *args)
+    else:
+        flat = flatten(*args)
     g = _flatten_tangent(FIELD, method, g)
-    traced = type(g) is not np.ndarray or any(map(isbox, flat))
+    traced = type(g) is not np.ndarray or (flatten is None and any(map(isbox, flat)))
     velocity_sum = None
     if sums and not traced and STEP not in nums:
         velocity_sum = _velocity_sum(args, dict(zip(nums, sums)))
@@ -79,7 +108,7 @@ def _pull(method: TransportMethod, nums: Sequence[int], args: tuple, g: Any, sum
     results = []
     for position, (num, cotangent) in enumerate(zip(nums, cotangents, strict=True)):
         accumulated = velocity_sum is not None and cotangent is velocity_sum
-        if not finite and not accumulated:
+        if not finite and not accumulated and not surely_finite(cotangent):
             _check_derivative(method, f"the gradient in {ARGUMENTS[num]}", cotangent, (g,))
         results.append(sums[position] if accumulated else _unflatten(args[num], cotangent))
     return results
@@ -100,11 +129,15 @@ def _cotangents(
 
     A step depends only on v dt, so that the cotangent of dt follows from the cotangent of the velocity.
     """
-    requested = tuple({VELOCITY if num == STEP else num for num in nums})
+    requested = nums
+    if STEP in nums:
+        requested = tuple({VELOCITY if num == STEP else num for num in nums})
     if velocity_sum is None:
         values, finite = method.vjp(requested, g, *flat)
     else:
         values, finite = method.vjp(requested, g, *flat, velocity_sum)
+    if requested is nums:
+        return list(values), finite
     cotangents = dict(zip(requested, values, strict=True))
     if STEP in nums:
         cotangents[STEP] = anp.dot(flat[VELOCITY], cotangents[VELOCITY]) / flat[STEP]
@@ -144,6 +177,36 @@ def _linear_rules(method: TransportMethod, nums: Sequence[int], flat: tuple) -> 
 
 
 # ---- between the arguments of the user and flat float64 arrays -------------------------------------------------------
+
+
+def _bound_flatten(method: TransportMethod, u: Any, v: Any, dt: Any, inflow: Any) -> Callable | None:
+    """Return a function like `_flatten`, without checks of the form, for arguments of the same form as these.
+
+    Return None for arguments that need a conversion or are traced.
+    """
+    for array, shapes in ((u, method.field_shapes), (v, method.velocity_shapes)):
+        if type(array) is not np.ndarray or array.shape not in shapes or array.dtype != FLOAT:
+            return None
+        if not array.flags.c_contiguous:
+            return None
+    if type(dt) is not float or type(inflow) is not float:
+        return None
+    flat_field = u.ndim == 1
+    flat_velocity = v.ndim == 1
+    count = method.walls.size
+    no_inflow = np.zeros(0)
+
+    def flatten(u, v, dt, inflow):
+        if not 0 < dt < np.inf:
+            check_step(method.name, dt)
+        return (
+            u if flat_field else u.reshape(-1),
+            v if flat_velocity else v.reshape(-1),
+            dt,
+            np.full(count, inflow) if count else no_inflow,
+        )
+
+    return flatten
 
 
 def _flatten(method: TransportMethod, u: Any, v: Any, dt: Any, inflow: Any) -> tuple[Any, Any, Any, Any]:

@@ -60,6 +60,8 @@ class ComponentStep:
         All inflow values.
     """
 
+    __slots__ = ("back", "values")
+
     def __init__(self, interpolant: Interpolant, w: NDArray, dt: float, u: NDArray, inflow: NDArray) -> None:
         self.back = Trajectory(interpolant, w, dt)
         self.values = self.back.at_departure_points(u, inflow)
@@ -97,12 +99,15 @@ class SemiLagrangian(TransportMethod):
     def __init__(self, settings: TransportSettings) -> None:
         super().__init__(settings)
         self.components = [Interpolant(settings, number) for number in range(len(settings.space.parts))]
+        dim = settings.grid.dim
+        self._velocity_parts = [
+            (slice(dim * c.span.start, dim * c.span.stop), (dim, c.span.stop - c.span.start)) for c in self.components
+        ]
         self.solid = settings.solid_points  # mask of the points whose value does not change
 
     def _split_velocity(self, w: NDArray) -> list[NDArray]:
         """Return, for each component, the velocities at its points as an array (axis, point)."""
-        dim = self.settings.grid.dim
-        return [w[dim * c.span.start : dim * c.span.stop].reshape(dim, -1) for c in self.components]
+        return [w[span].reshape(shape) for span, shape in self._velocity_parts]
 
     def _steps(self, u: NDArray, v: NDArray, dt: float, inflow: NDArray) -> Iterator[tuple[slice, Any]]:
         """Yield, for each component, the range of its entries in the field and its step."""
@@ -118,7 +123,8 @@ class SemiLagrangian(TransportMethod):
 
     def forward(self, u: NDArray, v: NDArray, dt: float, inflow: NDArray) -> NDArray:
         """Return the field after one step."""
-        if not all(map(surely_finite, (u, v, inflow))):
+        finite = surely_finite(u) and (v is u or surely_finite(v)) and (not inflow.size or surely_finite(inflow))
+        if not finite:
             check_numbers(self.settings, u, v, inflow)  # the result alone does not show all of them
         out = buffers.empty(u.shape, float)
         for span, step in self._steps(u, v, dt, inflow):
@@ -145,15 +151,12 @@ class SemiLagrangian(TransportMethod):
             of_moved = np.where(self.solid, 0.0, g)
         of_u = buffers.empty((u.size if of_field_wanted else 0,), float)
         of_inflow = np.zeros(inflow.size)
-        of_w = buffers.empty((u.size * self.settings.grid.dim if of_velocity_wanted else 0,), float)
-        steps = self._steps(u, v, dt, inflow)
-        for (span, step), of_component_w in zip(steps, self._split_velocity(of_w), strict=True):
-            step.vjp(
-                of_moved[span],
-                of_u[span] if of_field_wanted else None,
-                of_inflow,
-                of_component_w if of_velocity_wanted else None,
-            )
+        parts_of_w: list = [None] * len(self.components)
+        if of_velocity_wanted:
+            of_w = buffers.empty((u.size * self.settings.grid.dim,), float)
+            parts_of_w = self._split_velocity(of_w)
+        for (span, step), part_of_w in zip(self._steps(u, v, dt, inflow), parts_of_w, strict=True):
+            step.vjp(of_moved[span], of_u[span] if of_field_wanted else None, of_inflow, part_of_w)
         if of_field_wanted and self.solid is not None:
             of_u += g - of_moved
         cotangents = {FIELD: of_u, INFLOW: of_inflow}

@@ -863,9 +863,13 @@ class Rule(Reconstructible):
         Whether pullbacks are called as ``pull(g, *sums)``. For each cotangent to be returned `sums` has an array with
         the sum of the other cotangents of this argument, or None. The pullback may add its cotangent to this array in
         place and return the array; otherwise it must return a new array.
+    bind : callable or None
+        ``bind(*values)`` returns the function for `bound`, which returns what `forward` returns, bit for bit. None
+        stands for `forward` itself.
     """
 
     adds = False
+    bind: Callable | None = None
 
     def __init__(
         self,
@@ -882,12 +886,30 @@ class Rule(Reconstructible):
         self.jvp = jvp
         self.keywords = keywords
         self.constructor_call = made or (Rule, (name, forward, vjp, jvp, keywords))
+        self._bound: dict[tuple, Callable] = {}
 
     def __call__(self, *args: Any, **options: Any) -> Any:
         """Evaluate the rule, and record the call if an argument is traced."""
         if self.keywords or options:
             args = self._positional(args, options)
         return _call(self, *args)
+
+    def bound(self, *values: Any) -> Callable:
+        """Return a function with the signature of `forward` for plain arguments of the form of these: see `form_of`.
+
+        What depends only on the form, such as checks of shapes, is decided here, once: the rule keeps the function. It
+        checks values in every call, and may be called by several threads at once.
+        """
+        if self.bind is None:
+            return self.forward
+        form = form_of(values)
+        function = self._bound.get(form)
+        if function is None:
+            function = self.bind(*values)
+            if len(self._bound) >= MOST_BOUND:
+                self._bound.clear()
+            self._bound[form] = function
+        return function
 
     def _positional(self, args, options):
         """Return all arguments by position."""
@@ -910,14 +932,35 @@ class Rule(Reconstructible):
         return f"<rule {self.name}>"
 
 
+MOST_BOUND = 64  # number of forms of arguments for which a rule keeps a function
+
+
+def form_of(values: Iterable) -> tuple:
+    """Return the form of some arguments as a hashable value.
+
+    It consists of the type of each argument, and for arrays of the shape, the dtype and whether they are C-contiguous.
+    """
+    form: list = []
+    for value in values:
+        if type(value) is np.ndarray:
+            form.append((value.shape, value.dtype, value.flags.c_contiguous))
+        else:
+            form.append(type(value))
+    return tuple(form)
+
+
 def _run(rule, *args):
     """Call the function of a rule on plain values."""
     for arg in args:
-        if type(arg) is not np.ndarray and is_branch(arg) and any(map(isbox, leaves(arg))):
-            raise DerivativeError(
-                f"{rule.name} got a traced value inside a {type(arg).__name__}; pass it as an argument"
-            )
-    return timed(rule.name, "forward", rule.forward, *args)
+        kind = type(arg)
+        if kind is np.ndarray or kind is float:
+            continue
+        if is_branch(arg) and any(map(isbox, leaves(arg))):
+            raise DerivativeError(f"{rule.name} got a traced value inside a {kind.__name__}; pass it as an argument")
+    act = rule.forward if rule.bind is None else rule.bound(*args)
+    if active:
+        return timed(rule.name, "forward", act, *args)
+    return act(*args)
 
 
 _primitive = primitive(_run)

@@ -12,16 +12,18 @@ contiguous and of dtype float64; this is not checked. Displacements may be NaN.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 from math import prod
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sparsedp import kernels
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -43,7 +45,8 @@ WEIGHTS = {
 WEIGHTS_AT_POINTS = ((0, 1, 0, 0), (-0.5, 0, 0.5, 0))  # weights of the value and of the slope
 
 
-class Points(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Points:
     """The points of a field, and the interpolation between them.
 
     Attributes
@@ -90,16 +93,25 @@ class Points(NamedTuple):
         weights = np.concatenate([[value, slope], np.reshape(WEIGHTS_AT_POINTS, (2, 4, 1))], 2)
         return cls(tuple(shape), padded, prod(shape), prod(padded), np.array(axes), weights)
 
+    @cached_property
+    def weights_of_value(self) -> NDArray[np.float64]:
+        """The row of `weights` for the value."""
+        return self.weights[:1]
+
+    @cached_property
+    def interpolate_all(self) -> Callable[..., bool]:
+        """The compiled loop `interpolation.interpolate` over all points."""
+        return kernels.bound("interpolation", "interpolate", -(-self.size // TILE), self.size << len(self.shape))
+
+    @cached_property
+    def scatter_all(self) -> Callable[..., bool]:
+        """The compiled loop `interpolation.scatter` over all points, on one thread."""
+        return kernels.bound("interpolation", "scatter", -(-self.size // TILE), self.size << len(self.shape), 1)
+
     @property
     def strides(self) -> NDArray[np.int64]:
         """Strides of the axes of the field in the flat array of samples."""
         return self.axes[-len(self.shape) :, 1]
-
-
-def _run(name: str, points: Points, threads: int, *args: Any) -> bool:
-    """Run a compiled loop over all points, and return whether it is available."""
-    tiles = -(-points.size // TILE)
-    return kernels.run("interpolation", name, tiles, points.size << len(points.shape), threads, *args)
 
 
 def _cells(points: Points, w: NDArray, scale: NDArray, subset: Any = slice(None)) -> tuple[NDArray, NDArray]:
@@ -155,11 +167,11 @@ def interpolate(
     """
     if g is None:
         rows = out[None]
-        args = (samples, w, scale, points.axes, points.weights[:1], EMPTY, rows, bounds)
+        done = points.interpolate_all(samples, w, scale, points.axes, points.weights_of_value, EMPTY, rows, bounds)
     else:
         rows = out
-        args = (samples, w, scale, points.axes, points.weights, g, rows, bounds)
-    if _run("interpolate", points, kernels.threads(), *args):
+        done = points.interpolate_all(samples, w, scale, points.axes, points.weights, g, rows, bounds)
+    if done:
         return out
     for axis, row in enumerate(rows):
         along = None if g is None else axis
@@ -176,7 +188,7 @@ def scatter(points: Points, w: NDArray, scale: NDArray, g: NDArray, samples: NDA
 
     It runs on one thread, because several points add to the same sample.
     """
-    if not _run("scatter", points, 1, w, scale, points.axes, points.weights[:1], g, samples):
+    if not points.scatter_all(w, scale, points.axes, points.weights_of_value, g, samples):
         for index, weight in entries(points, w, scale):
             np.add.at(samples, index, weight * g)
     return samples

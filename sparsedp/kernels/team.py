@@ -239,6 +239,20 @@ class Kernel:
             with contextlib.suppress(TypeError):
                 dispatcher(*arguments, "start", "stop")
 
+    def run_all(self, rows: int, work: int, threads: Any, args: tuple) -> bool:
+        """Run the loop over range(rows) if it is available, and return whether it is.
+
+        The parameters are those of `run`; `threads` may also be a function that returns the number of threads.
+        """
+        loop = self._dispatcher or self.compiled
+        if loop is None:
+            return False
+        if work < SERIAL:
+            loop(*args, 0, rows)
+        else:
+            self.run(rows, work, threads() if callable(threads) else threads, *args)
+        return True
+
     def run(self, rows: int, work: int, threads: int, *args: Any) -> None:
         """Run the loop over range(rows), split into one part for each thread; on one thread if `work` is below SERIAL.
 

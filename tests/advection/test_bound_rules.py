@@ -1,0 +1,101 @@
+"""Rule.bound of transport: a function for arguments of one form, with the bits of `forward` and the same checks."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+import sparsedp as dp
+from sparsedp.autodiff.tape import MOST_BOUND, Rule
+
+SCHEMES = ["upwind", "van_leer", "semi_lagrangian", "maccormack"]
+GRIDS = [
+    dp.Grid(9, size=1.0, periodic=True),
+    dp.Grid((5, 4), size=1.0),
+    dp.Grid((3, 4, 3), periodic=(True, False, True)),
+]
+
+
+def arguments(move, rng, inflow=0.3):
+    u = rng.standard_normal(move.space.shape)
+    v = 0.1 * rng.standard_normal(move.settings.velocity_shapes[0])
+    return u, v, 0.05, inflow
+
+
+@pytest.mark.parametrize("grid", GRIDS, ids=str)
+@pytest.mark.parametrize("of", ["cells", "faces"])
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_same_bits(scheme, of, grid, rng):
+    move = dp.transport(grid, scheme, dp.dirichlet, velocity="cells", of=of)
+    rule = move._rule
+    args = arguments(move, rng)
+    walls = rng.standard_normal(move.walls.shape)
+    for values in (args, (*args[:3], walls)):
+        bound = rule.bound(*values)
+        wanted = rule.forward(*values)
+        assert bound(*values).tobytes() == rule(*values).tobytes() == wanted.tobytes()
+        assert rule.bound(*(np.copy(x) if np.ndim(x) else x for x in values)) is bound
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_cotangents_do_not_depend_on_the_layout_of_arguments(scheme, rng):
+    """Strided arguments are flattened with all checks, contiguous ones by the bound function."""
+    move = dp.transport(GRIDS[1], scheme, velocity="cells")
+    u, v, dt, inflow = arguments(move, rng)
+    g = rng.standard_normal(u.shape)
+    nums = (0, 1, 2, 3)
+    wanted = move._rule.vjp(nums, None, u, v, dt, inflow)(g)
+    found = move._rule.vjp(nums, None, np.asfortranarray(u), np.asfortranarray(v), dt, inflow)(g)
+    for one, other in zip(found, wanted, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_values_are_checked_in_every_call(scheme, rng):
+    move = dp.transport(GRIDS[1], scheme, dp.dirichlet, velocity="cells")
+    u, v, dt, inflow = arguments(move, rng)
+    move(u, v, dt, inflow)
+    for number in range(2):
+        bad = [u.copy(), v.copy()]
+        bad[number].flat[3] = np.inf
+        with pytest.raises(dp.errors.NonFiniteError, match="needs a finite"):
+            move(*bad, dt, inflow)
+    with pytest.raises(dp.errors.NonFiniteError, match="needs finite inflow values"):
+        move(u, v, dt, np.nan)
+    for wrong in (0.0, -dt, np.nan):
+        with pytest.raises((ValueError, dp.errors.NonFiniteError), match="dt of transport"):
+            move(u, v, wrong, inflow)
+
+
+@pytest.mark.parametrize("scheme", ["semi_lagrangian", "maccormack"])
+def test_large_fields_are_padded_with_the_same_values(scheme, monkeypatch, rng):
+    """Ghost cells are gathered for small fields, and copied in blocks for large ones."""
+    for grid in GRIDS:
+        results = []
+        for limit in (0, 10**6):
+            monkeypatch.setattr("sparsedp.advection.interpolant.GATHER_BELOW", limit)
+            move = dp.transport(grid, scheme, dp.dirichlet, velocity="cells", backtrace="midpoint")
+            args = arguments(move, np.random.default_rng(1))
+            results.append((move._rule(*args), *move._rule.vjp((0, 1, 3), None, *args)(np.cos(args[0]))))
+        for one, other in zip(*results, strict=True):
+            assert np.asarray(one).tobytes() == np.asarray(other).tobytes()
+
+
+def test_a_time_step_that_changes(rng):
+    """The scale of displacements belongs to the time step of the call."""
+    move = dp.transport(GRIDS[0], "semi_lagrangian", velocity="cells")
+    u, v, *_ = arguments(move, rng)
+    for dt in (0.05, 0.02, 0.05):
+        fresh = dp.transport(GRIDS[0], "semi_lagrangian", velocity="cells")
+        assert move(u, v, dt).tobytes() == fresh(u, v, dt).tobytes()
+
+
+def test_rules_keep_few_functions_and_pickle_none(rng):
+    move = dp.transport(GRIDS[0], velocity="cells")
+    size = len(pickle.dumps(move))
+    args = arguments(move, rng)
+    move._rule(*args)
+    assert len(pickle.dumps(move)) == size
+    assert 0 < len(move._rule._bound) <= MOST_BOUND
+    plain = Rule("double", lambda x: 2 * x)
+    assert plain.bound(1.0) is plain.forward
