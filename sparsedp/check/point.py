@@ -6,7 +6,7 @@ direction is an ordinary dot product.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from sparsedp._utils.validation import check_finite
 from sparsedp.autodiff.backend import gathered
 from sparsedp.autodiff.flattening import Packing, joined
 
-__all__ = ["QUICK_DIRECTIONS", "Point", "audit_generator", "root_mean_square"]
+__all__ = ["QUICK_DIRECTIONS", "Point", "audit_generator", "is_random", "root_mean_square"]
 
 MOST_LEAVES = 8  # a tree with more leaves has no separate direction for each leaf
 LARGEST_SHARE = 4.0  # the gradient direction moves an entry by at most this many units
@@ -43,6 +43,16 @@ def _as_numpy(leaf: Any) -> Any:
     if isinstance(leaf, (float, complex)):
         return np.asarray(leaf)[()]
     return gathered(leaf)
+
+
+def is_random(name: str) -> bool:
+    """Return whether a name is that of a random direction in all leaves together."""
+    return name.removeprefix("random ").isdigit()
+
+
+def _contains(directions: Iterable[NDArray[Any]], direction: NDArray[Any]) -> bool:
+    """Return whether a direction or its opposite is one of some directions."""
+    return any(np.array_equal(direction, other) or np.array_equal(direction, -other) for other in directions)
 
 
 class Point(Packing):
@@ -100,7 +110,8 @@ class Point(Packing):
         gradient : ndarray
             The gradient under test.
         count : int
-            Number of random directions in all leaves together.
+            Number of random directions in all leaves together. Those that are equal or opposite to an earlier one are
+            omitted: for one real number there is only one direction.
         rng : Generator
         is_wanted : callable, optional
             ``is_wanted(name)`` selects directions; default: all.
@@ -112,7 +123,11 @@ class Point(Packing):
             direction in each leaf, the same displacement in all entries of a leaf, the gradient, and the entry with
             the largest gradient.
         """
-        displacements = {f"random {number + 1}": self.random(rng) for number in range(count)}
+        displacements: dict[str, NDArray[Any]] = {}
+        for number in range(count):
+            displacement = self.random(rng)
+            if not _contains(displacements.values(), displacement):
+                displacements[f"random {number + 1}"] = displacement
         if 1 < len(self.names) <= MOST_LEAVES:
             leaf_number = self._for_each_entry(range(len(self.values)))
             for number, name in enumerate(self.names):

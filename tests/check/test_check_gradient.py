@@ -74,6 +74,29 @@ def test_one_wrong_entry_in_ten_thousand():
     assert wrong.verdict == "disagrees"
 
 
+@pytest.mark.parametrize(
+    "x, quick, factor, least, most",
+    [
+        (np.linspace(1.0, 2.0, 200), False, 1.0, 130, 160),
+        (np.linspace(1.0, 2.0, 200), True, 1.0, 55, 65),
+        (1.5, False, 1.0, 30, 40),
+        (np.linspace(1.0, 2.0, 200), False, 1.01, 350, 450),
+        (np.linspace(1.0, 2.0, 200), True, 1.01, 150, 180),
+    ],
+)
+def test_the_documented_numbers_of_evaluations(x, quick, factor, least, most):
+    found = AUDIT(lambda u: np.sum(u**3), x, gradient=lambda u: factor * 3 * u**2, quick=quick)
+    assert bool(found) == (factor == 1) and least <= found.evaluations <= most
+
+
+def test_random_directions_are_not_repeated():
+    """One number can be moved along one direction only; two numbers along two random ones that differ."""
+    names = [line.direction for line in AUDIT(lambda u: u**2, 1.5, gradient=lambda u: 2 * u, directions=5).lines]
+    assert names == ["random 1"]
+    lines = AUDIT(lambda u: u[0] * u[1], (1.5, 0.5), gradient=lambda u: (u[1], u[0]), directions=9).lines
+    assert sum(line.direction.removeprefix("random ").isdigit() for line in lines) == 2
+
+
 def test_a_minimum_and_a_gradient_of_zero():
     result = AUDIT(lambda u: anp.sum((u - X) ** 2), X)
     assert result and "0 to rounding" in result.reason
