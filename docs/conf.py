@@ -9,6 +9,7 @@ sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
 import course_notebooks
 import docstrings
 import gallery_scripts
+from docutils import nodes
 
 import sparsedp
 
@@ -98,12 +99,21 @@ html_theme_options = {
 }
 
 
+def mark_tables_of_options(app, doctree):
+    """Give tables of options a class: on a phone, site.css puts the meaning below the name of the option."""
+    for table in doctree.findall(nodes.table):
+        head = [entry.astext() for row in table.findall(nodes.thead) for entry in row.findall(nodes.entry)]
+        if head == ["method", "option", "default", "meaning"]:
+            table["classes"].append("options")
+
+
 def setup(app):
     gallery_scripts.stage()
     gallery_scripts.let_processes_in()
     app.connect("autodoc-process-docstring", docstrings.rewrite, priority=400)  # before napoleon
     app.connect("autodoc-process-docstring", docstrings.link, priority=600)  # after it
     app.connect("viewcode-follow-imported", docstrings.defined_in)
+    app.connect("doctree-read", mark_tables_of_options)
     app.connect("builder-inited", gallery_scripts.thumbnails, priority=900)  # after sphinx-gallery has run the examples
     app.connect("builder-inited", gallery_scripts.measured, priority=910)
     app.connect("builder-inited", course_notebooks.offer, priority=920)

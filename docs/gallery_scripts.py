@@ -89,6 +89,7 @@ def stage():
     texts = {Path(HEADER): INTRODUCTION}
     for title, paragraph, rows in sections():
         place = Path(folder(title))
+        paragraph = re.sub(r"`docs/(\w+)\.md`", r":doc:`/\1`", paragraph)
         texts[place / HEADER] = f"{title}\n{'-' * len(title)}\n\n{paragraph}\n"
         for name, shows in rows.items():
             texts[place / name] = titled((ROOT / "examples" / name).read_text(encoding="utf-8"), shows)
@@ -181,6 +182,10 @@ def draw_card(name):
     figure.suptitle("")
     panel.set_title("")  # the card has a title
     panel.set_anchor("C")
+    legend = panel.get_legend()
+    if legend:
+        legend.set_frame_on(True)  # text on lines would be hard to read
+        legend.get_frame().set(alpha=0.8, edgecolor="none")
     for axis in (panel.xaxis, panel.yaxis):
         axis.set_minor_formatter(NullFormatter())  # labels between the decades would overlap
     CARDS.mkdir(parents=True, exist_ok=True)
@@ -188,9 +193,14 @@ def draw_card(name):
 
 
 def thumbnails(app):
-    """The cards: one panel of the picture of an example or, without a picture, what it printed."""
+    """The cards: one panel of the picture of an example or, without a picture, what it printed or shows."""
     gallery = Path(app.srcdir) / "gallery"
-    for page in (gallery / folder(title) / f"{Path(name).stem}.rst" for title, _, rows in sections() for name in rows):
+    pages = {
+        gallery / folder(title) / f"{Path(name).stem}.rst": shows
+        for title, _, rows in sections()
+        for name, shows in rows.items()
+    }
+    for page, shows in pages.items():
         text = page.read_text(encoding="utf-8")
         card = page.parent / "images" / "thumb" / f"sphx_glr_{page.stem}_thumb.png"
         if (CARDS / f"{page.stem}.png").exists():
@@ -198,7 +208,7 @@ def thumbnails(app):
         if ".. image-sg::" in text:
             continue
         printed = re.search(r"rst-class:: sphx-glr-script-out\s+\.\. code-block:: none\n\n(.*?)\n\n\n", text, re.DOTALL)
-        lines = textwrap.dedent(printed[1] if printed else page.stem).splitlines()[:12]
+        lines = textwrap.dedent(printed[1]).splitlines()[:12] if printed else textwrap.wrap(shows, 38)
         figure = Figure(figsize=CARD_SIZE, facecolor="#f3f4f5")
         figure.text(0.04, 0.94, "\n".join(line[:38] for line in lines), va="top", family="monospace", size=9)
         figure.savefig(card, dpi=CARD_DPI)

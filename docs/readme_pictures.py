@@ -5,6 +5,7 @@
 All of them together are at most 300 kB (tests/test_pages.py), because every clone contains them.
 """
 
+import os
 import subprocess
 import sys
 import tempfile
@@ -20,6 +21,8 @@ NAMES = "recovery", "plume", "cylinder", "patterns"
 SIZES = {"plume": "64", "cylinder": "20", "patterns": "48"}  # cells, the first argument of the examples
 WIDTHS = {"plume": 1.0, "cylinder": 1.0, "patterns": 0.5}  # the part that is shown, from the left
 CARD = 720, 368  # pixels of a picture of an example
+MARGIN = 16  # pixels on each side of it
+FONT_SIZES = {"plume": 14, "cylinder": 14, "patterns": 10}  # text that is readable on a card
 COLOURS = 256
 
 
@@ -39,7 +42,7 @@ def side_by_side(left, right):
 def card(image, part):
     """Return the left part of an image on a white card."""
     shown = image.crop((0, 0, round(part * image.width), image.height))
-    shown.thumbnail(CARD, Image.Resampling.LANCZOS)
+    shown.thumbnail((CARD[0] - 2 * MARGIN, CARD[1] - 2 * MARGIN), Image.Resampling.LANCZOS)
     white = Image.new("RGB", CARD, "white")
     white.paste(shown, ((CARD[0] - shown.width) // 2, (CARD[1] - shown.height) // 2))
     return white
@@ -65,7 +68,11 @@ def draw():
     for name, size in SIZES.items():
         with tempfile.TemporaryDirectory() as folder:
             script = ROOT / "examples" / f"{name}.py"
-            subprocess.run([sys.executable, script, size, "--out", folder], check=True)
+            style = Path(folder) / "matplotlibrc"
+            lines = f"font.size: {FONT_SIZES[name]}", "figure.constrained_layout.use: True"
+            style.write_text("\n".join(lines), encoding="utf-8")
+            environment = {**os.environ, "MATPLOTLIBRC": str(style)}
+            subprocess.run([sys.executable, script, size, "--out", folder], check=True, env=environment)
             save(card(opened(Path(folder) / f"{name}.png"), WIDTHS[name]), name)
 
 
