@@ -21,8 +21,9 @@ table { display: block; overflow-x: auto; width: max-content; max-width: 100%;
   background: linear-gradient(to left, Canvas 40%, transparent) right / 3rem 100% no-repeat local,
     linear-gradient(to left, #888a, transparent) right / 0.8rem 100% no-repeat scroll;
   border-collapse: collapse; margin: 1rem 0; font-size: 0.85rem; font-variant-numeric: tabular-nums; }
-th, td { padding: 0.15rem 0.6rem; text-align: left; border-bottom: 1px solid #8884; }
+th, td { padding: 0.15rem 0.6rem; text-align: left; vertical-align: top; border-bottom: 1px solid #8884; }
 td { min-width: 3rem; } td:not([nowrap]) { min-width: 11rem; }
+td:last-child:not([nowrap]) { min-width: min(18rem, 75vw); }
 :is(th, td):first-child { position: sticky; left: 0; background: Canvas; min-width: 0; }
 th { cursor: pointer; white-space: nowrap; }
 th[aria-sort=ascending]::after { content: " \\2191"; } th[aria-sort=descending]::after { content: " \\2193"; }
