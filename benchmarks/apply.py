@@ -48,7 +48,7 @@ def slices(u, out):
 
 
 def tasks(shape, with_matrix):
-    """Name -> function, for one grid."""
+    """Return the functions to measure on one grid, by name."""
     uniform = dp.laplacian(dp.Grid(shape, size=1.0), dp.dirichlet).matrix_free()
     bent = dp.laplacian(dp.Grid(shape, spacing=[stretched(n) for n in shape]), dp.dirichlet).matrix_free()
     u, out = np.random.default_rng(0).random(shape), np.empty(shape)
@@ -93,7 +93,7 @@ def forms():
 
 
 def both_forms(n):
-    """Name -> function, for the two forms on n x n cells."""
+    """Return functions that apply both forms on n x n cells, by name."""
     op, u = dp.laplacian(dp.Grid((n, n))), np.ones((n, n))
     return {"explicit": partial(op.explicit().apply, u), "free": partial(op.matrix_free().apply, u)}
 

@@ -160,7 +160,7 @@ class Counted:
 
 
 def compared(problem, seed=0):
-    """Problem -> our result and our evaluations to the loss that SciPy ends at, and SciPy's evaluations to it."""
+    """Return our result, and the evaluations that we and SciPy need to reach the final loss of SciPy."""
     loss, start, (lower, upper) = problem(np.random.default_rng(seed))
     sides = [np.broadcast_to(np.nan if side is None else side, start.shape).ravel() for side in (lower, upper)]
     pairs = [tuple(None if np.isnan(side) else side for side in pair) for pair in zip(*sides)]

@@ -83,7 +83,7 @@ dp.value_and_grad(loss)(1e-2 * random.random(grid.faces.size))
 
 
 def seconds(program, cache):
-    """Run a program in a process of its own -> seconds of the clock."""
+    """Run a program in a process of its own, and return the elapsed seconds."""
     start = time.perf_counter()
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
     subprocess.run([sys.executable, "-c", START + program], env=environment, check=True, capture_output=True)

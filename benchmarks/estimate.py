@@ -34,7 +34,7 @@ COUNTED = 48  # cells along an axis where messages are counted
 
 
 def solved(grid, laps):
-    """Grid -> (iterations of div k grad u = b, its least seconds, of the processor and of a clock), without set-up."""
+    """Solve div k grad u = b; return the iterations and the least CPU and elapsed seconds, without the set-up."""
     solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.dirichlet), rtol=RTOL)
     x, y = grid.centres()[:2]
     k, b = dp.average(grid)(np.exp(np.sin(6 * x) * np.sin(6 * y))), np.sin(7 * x) * np.cos(5 * y) + x

@@ -23,7 +23,7 @@ SIZES = (128, 256, 512)
 
 
 def prototype(n):
-    """Face components -> face components, by NumPy slices and scipy.fft."""
+    """Return the value and gradient function of a projection that uses only NumPy slices and scipy.fft."""
     h = 1 / n
     line = (4 / h**2) * np.sin(np.pi * np.arange(n) / (2 * n)) ** 2
     eigenvalues = line[:, None] + line
@@ -50,7 +50,7 @@ def prototype(n):
 
 
 def tasks(n):
-    """Name -> function, and the error of our gradient against the prototype's."""
+    """Return the functions to measure, by name, and the error of our gradient relative to that of the prototype."""
     grid = dp.Grid((n, n), size=1.0)
     rng = np.random.default_rng(0)
     v, target = rng.standard_normal((2, grid.faces.size))

@@ -270,7 +270,7 @@ def lines(scene):
 
 
 def row(name, quick):
-    """Name, whether few cells do -> (our number, by how much it is off, seconds, verdict of its gradient)."""
+    """Return our number, its error, the seconds, and the verdict on its gradient."""
     scene, _, published, n, few = CASES[name]
     coarse, p = scene(few)
     verdict = dp.check.gradient(coarse, p, quick=True).verdict

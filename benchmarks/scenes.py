@@ -8,7 +8,7 @@ __all__ = ["ANISOTROPIC", "JUMPS", "VARIABLE", "WINDS", "conductance", "vortex",
 
 
 def conductance(k, size=1.0, boundary=dp.dirichlet):
-    """Coefficient on the cells -> -div k grad, with the harmonic averages on the faces."""
+    """Return -div k grad for a coefficient on cells, with its harmonic averages on faces."""
     grid = dp.Grid(k.shape, size=size)
     faces = dp.diagonal(grid.faces, dp.harmonic_average(grid)(k))
     return -dp.divergence(grid) @ faces @ dp.gradient(grid, boundary)

@@ -75,7 +75,7 @@ def times(task, repeats):
 
 
 def row(scene, op, make, repeats=3):
-    """Print a row -> (seconds of one solve, seconds of set-up); what fails keeps its row, with NaN."""
+    """Print a row, and return the seconds of one solve and of the set-up; both are NaN if the solve fails."""
     generator = np.random.default_rng(5)
     kept = op.T.apply(op.apply(generator.random(op.domain.shape))) != 0  # solid cells hold no equation
     b, g = generator.standard_normal((2, *op.domain.shape)) * kept

@@ -71,7 +71,7 @@ def peer(hierarchy, b):
 
 
 def row(name, shape, repeats):
-    """Measure one problem, print its row -> seconds of a solve."""
+    """Measure one problem, print its row, and return the seconds of a solve."""
     op = PROBLEMS[name](shape)
     matrix, kept = unknowns(op.matrix)
     b, g = np.zeros((2, prod(shape)))

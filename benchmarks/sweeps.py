@@ -55,7 +55,7 @@ def sweep(shape, signs, implicit):
 
 
 def least_seconds(tasks):
-    """Name -> function, run in turn -> name -> least seconds of the processor."""
+    """Run functions in turn, and return the least CPU seconds of each, by name."""
     least = dict.fromkeys(tasks, np.inf)
     for _ in range(REPEATS):
         for name, task in tasks.items():

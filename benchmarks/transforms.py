@@ -41,20 +41,20 @@ TRANSFORMS = {  # kind: there, back, further arguments
 
 
 def operator(shape, kinds):
-    """Shape, kind of each axis -> -divergence @ gradient on the unit box."""
+    """Return -divergence @ gradient on the unit box for a shape and a kind of each axis."""
     grid = dp.Grid(shape, size=1.0, periodic=[kind == "periodic" for kind in kinds])
     boundary = {axis: SIDES[kind] for axis, kind in zip(grid.axes, kinds, strict=True) if kind != "periodic"}
     return -dp.divergence(grid) @ dp.gradient(grid, boundary or dp.neumann)
 
 
 def eigenvalues(n, kind):
-    """Cells of an axis of length 1 -> eigenvalues of minus the second difference."""
+    """Return the eigenvalues of the negative second difference on an axis of length 1."""
     place = np.arange(n) + {"dirichlet": 1.0, "half": 0.5}.get(kind, 0.0)
     return 4.0 * n**2 * np.sin(np.pi * place / (n if kind == "periodic" else 2 * n)) ** 2
 
 
 def bare(shape, kinds):
-    """Shape, kind of each axis -> the function b -> x that one writes with scipy.fft."""
+    """Return a function that solves for x with scipy.fft alone."""
     values = reduce(np.add.outer, map(eigenvalues, shape, kinds))
     if kinds[-1] == "periodic":
         values = values[..., : shape[-1] // 2 + 1]

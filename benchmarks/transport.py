@@ -47,7 +47,7 @@ def exact():
 
 
 def wave(n, options):
-    """The loss of one scene: wind -> the mode of the field at the end. Sine waves carried at a CFL number of 0.275."""
+    """Return the loss of one scene, a mode of the final field. The wind carries sine waves at a CFL number of 0.275."""
     grid = dp.Grid((n, n), size=1.0, periodic=True)
     x, y = grid.centres()
     mode = np.sin(2 * pi * x) * np.sin(2 * pi * y)

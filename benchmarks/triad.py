@@ -44,14 +44,14 @@ def _numba_triad():
 
 
 def triad(shape):
-    """Shape of the arrays -> function without arguments that runs one triad over its own arrays."""
+    """Return a function without arguments that runs one triad over its own arrays."""
     a, b, c = (np.ones(prod(shape)) for _ in range(3))
     run = _numba_triad() if kernels.compiled() else _numpy_triad
     return lambda: run(a, b, c, 3.0)
 
 
 def best_times(tasks, repeats):
-    """Name -> function, run in turn `repeats` times -> name -> smallest time [s]."""
+    """Run functions in turn `repeats` times, and return the smallest time [s] of each, by name."""
     best = dict.fromkeys(tasks, float("inf"))
     for lap in range(repeats + 1):
         for name, task in tasks.items():
@@ -63,12 +63,12 @@ def best_times(tasks, repeats):
 
 
 def triad_bandwidth(shape, repeats=10):
-    """Shape of the arrays -> bandwidth of the triad [GB/s], 24 bytes a number."""
+    """Return the bandwidth of the triad [GB/s], with 24 bytes for each number."""
     return 24e-9 * prod(shape) / best_times({"triad": triad(shape)}, repeats)["triad"]
 
 
 def laplacian_axes(shape, stretched):
-    """Shape (n0, n1, n2) -> Laplacian with values zero at the walls, None for axes of one cell."""
+    """Return 1-D Laplacians with zero values at the walls for a shape (n0, n1, n2); None for axes of one cell."""
     return tuple(None if n == 1 else _line(n, stretched) for n in shape)
 
 
@@ -83,7 +83,7 @@ def _line(n, stretched):
 
 
 def laplacian_csr(axes):
-    """Tridiagonal matrices -> the sparse matrix of their sum."""
+    """Return the sparse matrix of the Kronecker sum of tridiagonal matrices."""
     lines = [
         sp.csr_array((1, 1))
         if x is None

@@ -48,7 +48,7 @@ viscosity = 0.01
 
 
 def network(weights, u):
-    """Fields, shape (runs, cells) -> fluxes, by convolutions. No weights: no correction."""
+    """Return the fluxes that the convolutions compute from fields of shape (runs, cells); 0 without weights."""
     if not weights:
         return 0.0
     *hidden, last = weights

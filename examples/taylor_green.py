@@ -63,7 +63,7 @@ def vortices(n):
 
 
 def first_order(n):
-    """The velocity at the start, and ``run(v, nu)`` -> the velocity at the end."""
+    """Return the initial velocity, and the function ``run(v, nu)`` that returns the final velocity."""
     grid, start = vortices(n)
     L = dp.face_laplacian(grid)
     carry = dp.transport(grid, "semi_lagrangian", of="faces")
@@ -91,7 +91,7 @@ def first_order(n):
 
 
 def second_order(n):
-    """The velocity at the start, and ``run(v, nu)`` -> the velocity at the end."""
+    """Return the initial velocity, and the function ``run(v, nu)`` that returns the final velocity."""
     grid, start = vortices(n)
     L = dp.face_laplacian(grid)
     convect = dp.convection(grid)

@@ -32,7 +32,7 @@ options = parser.parse_args()
 
 
 def physics(x):
-    """Two variables -> two results."""
+    """Return two results for two variables."""
     return np.stack([x[0], x[1] ** 2])
 
 

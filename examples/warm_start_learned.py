@@ -83,7 +83,7 @@ unseen = np.stack([smoke_divergence() for _ in range(8)])
 
 
 def guess(w, b):
-    """Weights and a batch of right-hand sides -> a first guess for each."""
+    """Return an initial guess for each right-hand side of a batch."""
     blocks = b.reshape(-1, 8, side, 8, side).mean((2, 4)).reshape(-1, 64)
     far = np.reshape(network.dense(w["far"], blocks) @ interpolation, b.shape)
     hidden = network.tanh(network.convolution(w["first"], b[:, None], "replicate"))
