@@ -28,10 +28,10 @@ scenes = options.scenes
 # %%
 # Many scenes, one grid
 # ---------------------
-# Each scene is a ring of 32 cells. All of them together are a sheet, a scene in each column. The columns stand so far
-# apart that nothing passes from one to the next: one call of an operator then serves all scenes.
+# Each scene is a periodic interval with 32 cells. All scenes are the columns of one two-dimensional grid. The columns
+# are so far apart that they do not influence each other: one call of an operator then computes all scenes.
 #
-# In each, the velocity carries itself, spreads, and feels the force,
+# In each scene the velocity satisfies Burgers' equation with a force,
 #
 # .. math:: u_t + u \, u_x = \nu \, u_{xx} + f .
 
@@ -54,7 +54,7 @@ def step(u, _, push):
 # %%
 # Starts and ends
 # ---------------
-# A hump to the right and one to the left, and a steady force, all drawn at random for each scene.
+# One hump moves to the right and one to the left. Both humps and a steady force are random in each scene.
 
 rng = np.random.default_rng(0)
 
@@ -82,18 +82,18 @@ wanted = run(truth)
 # %%
 # What is asked
 # -------------
-# The least total force, under the condition that the end is met:
+# The least total force that leads to the wanted final state:
 #
 # .. math:: \min_f \; \Delta t \sum |f| \quad \text{with} \quad \Phi(f) = u_{\text{wanted}} .
 #
-# Two things stand in the way of a plain search. The absolute value has a kink at 0, so it is smoothed to
-# :math:`\sqrt{f^2 + \epsilon^2}`, with an :math:`\epsilon` that shrinks. And there is a condition in every cell. The
-# **augmented Lagrangian** puts a price :math:`\lambda` and a penalty on the miss
+# Two things prevent a direct minimization. The absolute value has a kink at 0, so it is smoothed to
+# :math:`\sqrt{f^2 + \epsilon^2}`, with an :math:`\epsilon` that decreases. And there is a constraint in every cell. The
+# **augmented Lagrangian** adds a term with a multiplier :math:`\lambda` and a penalty for the deviation
 # :math:`m = \Phi(f) - u_{\text{wanted}}`,
 #
 # .. math:: \Delta t \sum \sqrt{f^2 + \epsilon^2} + \lambda^T m + \frac{\mu}{2} |m|^2 ,
 #
-# and after each search the price goes up by :math:`\mu \, m` where the end is still missed.
+# and after each minimization :math:`\mu \, m` is added to the multiplier.
 
 
 def size(force, eps=0.0):
@@ -113,8 +113,8 @@ def tell(label, number, force, seconds):
 # %%
 # The search with gradients
 # -------------------------
-# Seven rounds; each begins where the one before ended. A force below 1 times the true one is possible, since a steady
-# force is not the cheapest way.
+# Seven rounds; each starts from the result of the previous one. The total force can be smaller than the true one, since
+# a steady force is not optimal.
 
 rounds = [(0.1, 1e2), (0.1, 1e2), (0.1, 1e3), (0.05, 1e3), (0.03, 1e4), (0.03, 1e5), (0.03, 1e6)]
 force = np.zeros_like(truth)
@@ -138,9 +138,9 @@ for eps, weight in rounds:
 # %%
 # The search without
 # ------------------
-# The cross-entropy method only runs the flow. It draws 32 forces, on coarse blocks of 4 x 4, and looks at the 8 best;
-# their mean and spread draw the next ones, scene by scene. It may use as many runs as the gradients cost; a gradient
-# counts as three.
+# The cross-entropy method only simulates the flow. For each scene it draws 32 random forces, constant on blocks of
+# 4 x 4, and selects the best 8; their mean and standard deviation define the distribution of the next 32. It may use as
+# many simulations as the gradients cost; a gradient counts as three.
 
 
 def blocks(coarse):
@@ -167,14 +167,14 @@ print("published |f|/truth: reinforcement learning 1.31 after 15.6 h, a learned 
 # %%
 # The picture
 # -----------
-# The first scene, x to the right and time upwards. The least force is not steady: it acts where and when the flow lets
-# it reach the end, and is zero elsewhere.
+# The first scene, with x to the right and time upwards. The least force is not steady: it acts at positions and times
+# at which it has a strong effect on the final state, and is zero elsewhere.
 #
 # Exercises
 # ---------
 # 1. Ask for the least energy, :math:`\sum f^2`, instead. What does the force look like now, and why?
 # 2. Give the search without gradients ten times as many runs. How much does the miss shrink?
-# 3. Let the force act in the left half only (`dp.mask`). In which scenes can the end not be met?
+# 3. Let the force act in the left half only (`dp.mask`). In which scenes is the final state not reached?
 
 if options.out:
     from matplotlib import pyplot

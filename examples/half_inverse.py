@@ -30,12 +30,12 @@ options = parser.parse_args()
 # %%
 # The physics
 # -----------
-# A state has four numbers: two places and two speeds. Each mass hangs on the wall by a spring of strength 1, and the
-# two are tied to each other by one of strength 0.2:
+# A state has four numbers: two positions and two velocities. A spring of stiffness 1 connects each mass to the wall,
+# and a spring of stiffness 0.2 connects the masses:
 #
 # .. math:: \ddot x_1 = -x_1 - 0.2 \, (x_1 - x_2), \qquad \ddot x_2 = -x_2 - 0.2 \, (x_2 - x_1) + f .
 #
-# A row of the matrix has the effect of one entry of the state on all rates.
+# A row of the matrix contains the effect of one entry of the state on all rates.
 
 SPRINGS = np.array(
     [
@@ -57,8 +57,8 @@ def rate(u, force):
 move = dp.stepper("rk4", rate, 0.5)
 
 # %%
-# The physics is linear. So we run it once from each unit state, and once under each unit push, and know it all: the end
-# of any run is a sum of these.
+# The physics is linear. So we simulate once from each unit state and once for each unit push: the final state of any
+# run is a linear combination of these results.
 
 ends_of_states = dp.rollout(move, np.eye(4), np.zeros(4), STEPS)
 ends_of_pushes = dp.rollout(lambda u, _, force: move(u, force), np.zeros((STEPS, 4)), None, STEPS, inputs=np.eye(STEPS))
@@ -66,8 +66,8 @@ ends_of_pushes = dp.rollout(lambda u, _, force: move(u, force), np.zeros((STEPS,
 # %%
 # The network
 # -----------
-# Four numbers in, 24 pushes out, three hidden layers of 20 tanh units: 1444 weights. The state at the start is also
-# the one that is wanted at the end.
+# Four inputs, 24 pushes as outputs, three hidden layers of 20 tanh units: 1444 weights. The wanted final state is the
+# initial state.
 
 rng = np.random.default_rng(0)
 seen, unseen = rng.random((2, 4096, 4))
@@ -101,17 +101,17 @@ def loss(weights, states=seen):
 # %%
 # Three ways to make a step
 # -------------------------
-# Let :math:`r` be the misses of a batch and :math:`B` their Jacobian in the weights, with singular values
-# :math:`\sigma`. Steps differ in the power of :math:`\sigma` that they hold:
+# Let :math:`r` be the residuals of a batch and :math:`B` their Jacobian in the weights, with singular values
+# :math:`\sigma`. The methods differ in the power of :math:`\sigma` in their steps:
 #
-# - gradient descent goes along :math:`B^T r`, with :math:`\sigma` itself: what is weakly felt is hardly learned. Adam
-#   scales each weight, which does not mend that;
-# - Gauss-Newton divides by the Jacobian, :math:`B^{+} r`, which multiplies components by :math:`1 / \sigma`:
-#   what is weakly felt gets huge steps. Levenberg-Marquardt damps that;
-# - a **half-inverse** step stands between them: with :math:`B = U \Sigma V^T` it is :math:`V \Sigma^{-1/2} U^T r`,
-#   with half of the power of Gauss-Newton. What is weakly felt is learned, and nothing needs damping.
+# - gradient descent uses :math:`B^T r`, with the factor :math:`\sigma`: directions with small singular values are
+#   learned slowly. Adam scales each weight, which does not change this;
+# - Gauss-Newton uses :math:`B^{+} r`, with the factor :math:`1 / \sigma`: directions with small singular values get
+#   very large steps. Levenberg-Marquardt damps these;
+# - a **half-inverse** step lies between them: with :math:`B = U \Sigma V^T` it is :math:`V \Sigma^{-1/2} U^T r`, with
+#   the factor :math:`1 / \sqrt{\sigma}`. Directions with small singular values are learned, without damping.
 #
-# The function below trains in one of these ways, and keeps seconds and loss on the way.
+# The function below trains with one of these methods, and records seconds and loss.
 
 curves = {}
 print("method                 gradients  seconds       loss     unseen published")
@@ -135,8 +135,8 @@ def train(label, f, method, maxiter, every, budget=np.inf, published="", **setti
 
 
 # %%
-# Half-inverse steps on batches of 32; an epoch goes once through all samples. The published loss is a mean, so that the
-# rate 1 there is 2 / 32 of our sum of misses.
+# Half-inverse steps on batches of 32; in an epoch each sample is used once. The published loss is a mean, so that its
+# rate 1 corresponds to 2 / 32 for our sum of squared residuals.
 
 shuffled = rng.permuted(np.tile(np.arange(4096), (options.epochs, 1)), axis=1)
 batches = list(seen[shuffled].reshape(-1, 32, 4))
@@ -144,7 +144,7 @@ settings = {"batches": batches, "rate": 2 / 32, "apart": True, "published": "5.4
 train("half-inverse", misses, "half_inverse", 128 * options.epochs, 128, **settings)
 
 # %%
-# Levenberg-Marquardt sees 128 samples, always the same: 512 misses for 1444 weights.
+# Levenberg-Marquardt uses the same 128 samples in all steps: 512 residuals for 1444 weights.
 
 few = seen[:128]
 settings = {"apart": True, "damping": 1e-4}
@@ -160,12 +160,13 @@ train("Adam, equal time", loss, "adam", 10**6, 1500, longest, batches=batches)
 # %%
 # The picture
 # -----------
-# Loss on the samples that were seen, over time; both axes are logarithmic.
+# Loss on the training samples, over time; both axes are logarithmic.
 #
 # Exercises
 # ---------
-# 1. Tie the masses by a spring of 0.02 instead of 0.2. The first mass then hardly feels the pushes. Which way suffers?
-# 2. Let Levenberg-Marquardt see 16 samples. What do the two losses say?
+# 1. Use a stiffness of 0.02 instead of 0.2 between the masses. The pushes then have little effect on the first mass.
+#    Which method becomes worse?
+# 2. Give Levenberg-Marquardt 16 samples. How do the two losses change?
 # 3. Plot the 24 pushes for one sample. Are they what you would do by hand?
 
 if options.out:

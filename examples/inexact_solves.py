@@ -31,8 +31,8 @@ options = parser.parse_args()
 #
 # .. math:: -u'' = \theta \, \sin 2 \pi x, \qquad u(0) = u(1) = 0 .
 #
-# We see the solution for :math:`\theta = 2` and start at :math:`\theta = 5`. On :math:`n` points inside the interval
-# the equation is :math:`A u = \theta f`, and the loss is
+# The data are the solution for :math:`\theta = 2`, and we start at :math:`\theta = 5`. On :math:`n` points inside the
+# interval the equation is :math:`A u = \theta f`, and the loss is
 #
 # .. math:: J(\theta) = \frac{1}{2 n} \, | u - u_\text{seen} |^2 .
 #
@@ -53,7 +53,7 @@ seen = solve(2 * source)
 # With :math:`A^T \lambda = (u - u_\text{seen}) / n` the gradient is :math:`dJ / d\theta = f^T \lambda`: one solve for
 # :math:`u`, one for :math:`\lambda`.
 #
-# As the inner solver we take the slowest there is, sweeps of Jacobi. A sweep adds the residual, divided by the diagonal
+# The inner solver is the Jacobi method, which converges slowly. A sweep adds the residual, divided by the diagonal
 # :math:`2 / h^2` of :math:`A`:
 #
 # .. math:: u \leftarrow u + \tfrac{1}{2} h^2 \, (\theta f - A u) .
@@ -91,9 +91,9 @@ class Search:
 # %%
 # A number of sweeps, given in advance
 # ------------------------------------
-# The plain way: a fixed number of sweeps for :math:`u`, then as many for :math:`\lambda`. They begin at zero, or at the
-# last answers, which are close. From zero, :math:`f^T \lambda` is exactly the derivative of the sweeps, since :math:`A`
-# is symmetric: the derivative that a tape of all sweeps would give.
+# The simplest method: a fixed number of sweeps for :math:`u`, and as many for :math:`\lambda`. They start from zero, or
+# from the last solutions, which are close. If they start from zero, :math:`f^T \lambda` is exactly the derivative of
+# the sweeps, since :math:`A` is symmetric: the derivative that a tape of all sweeps would give.
 
 
 def fixed(sweeps_at, keep=False):
@@ -124,8 +124,8 @@ def fixed(sweeps_at, keep=False):
 #
 # .. math:: |e| \; \le \; \frac{|u| + |r| / 8}{|\theta|} \, \left( |s| + \frac{|r|}{8 n} \right) .
 #
-# All of it is at hand. We sweep until the bound is below half of the gradient: then its sign is right, and descent goes
-# down.
+# All these quantities are known. We sweep until the bound is below half of the gradient: then the sign of the gradient
+# is right, and a short descent step decreases the loss.
 
 
 def certified(share):
@@ -165,7 +165,7 @@ exact = START - source @ adjoint / curvature
 # %%
 # What it costs
 # -------------
-# The published rule of refinement is not told in detail; five sweeps more at each step come near it.
+# The rule of refinement is not published in detail; five more sweeps in each step give similar figures.
 
 searches = {
     "from zero, 600 sweeps a step": fixed(lambda i: 600),
@@ -190,16 +190,16 @@ for label, (sweeps, theta) in rows.items():
 # %%
 # The picture
 # -----------
-# With ten sweeps a step the solutions lag behind :math:`\theta`: descent overshoots and comes back, and nothing says
-# how far to trust it. With 46 it goes down as with exact solves, but that number had to be tried out. The bound needs
-# no trial: it costs the same, and is right wherever the search is.
+# With ten sweeps in each step the solutions lag behind :math:`\theta`: descent overshoots, and there is no estimate of
+# the error. With 46 sweeps the loss falls as with exact solves, but that number was found by trial and error. The bound
+# needs no trials: it costs the same, and it is valid at each iterate.
 #
 # Exercises
 # ---------
-# 1. Ask for the gradient to 10 % instead of half of it, `certified(0.1)`. What does it cost, and what does it gain?
-# 2. Take 60 points. How do the sweeps grow, and why?
-# 3. Replace the sweeps by ``dp.inverse(A, "krylov", iterations=k)`` from the last answers. How many iterations replace
-#    46 sweeps?
+# 1. Require an error of the gradient of 10 % instead of 50 %: `certified(0.1)`. What are the cost and the benefit?
+# 2. Use 60 points. How does the number of sweeps grow, and why?
+# 3. Replace the sweeps by ``dp.inverse(A, "krylov", iterations=k)``, started from the last solutions. How many
+#    iterations replace 46 sweeps?
 
 if options.out:
     from matplotlib import pyplot, style

@@ -37,8 +37,8 @@ grid = dp.Grid((SIDE, SIDE), periodic=True)
 heat = dp.matrix_exponential(dp.laplacian(grid), 8.0)
 
 # %%
-# On such a plate every wave :math:`k` is damped by a factor of its own, :math:`\hat y_k = \varphi_k \hat x_k`. The
-# factors are the Fourier transform of what the operator makes of a single hot cell.
+# On such a plate each wave :math:`k` is multiplied by a factor, :math:`\hat y_k = \varphi_k \hat x_k`. The factors are
+# the Fourier transform of the result for a single hot cell.
 
 dot = np.zeros(grid.shape)
 dot[0, 0] = 1.0
@@ -95,9 +95,9 @@ def descent(y):
 # %%
 # Second way: one physical gradient
 # ---------------------------------
-# Why not undo the physics? Where :math:`\varphi_k` is above the rounding of the data, dividing by it is exact enough;
-# the other waves are left alone. `dp.physical_gradient` puts such an inverse simulator in the place of the transpose:
-# the "gradient" that flows back is then the step to the solution itself.
+# Why not invert the physics? Where :math:`\varphi_k` is above the rounding of the data, division by it is accurate
+# enough; the other waves are not changed. `dp.physical_gradient` uses such an inverse simulator in place of the
+# transpose: the "gradient" is then the step to the solution.
 
 
 def inverse_simulator(end, x):
@@ -118,13 +118,13 @@ def physical(y):
 # %%
 # Third way: prior knowledge
 # --------------------------
-# Temperatures are not negative, and rectangles have few edges. Of all starts that fit we want the one with the least
-# sum of jumps between neighbours:
+# Temperatures are not negative, and rectangles have few edges. Of all initial states that fit, we choose the one with
+# the smallest sum of jumps between neighbours:
 #
 # .. math:: \min_{x \ge 0} \; \frac{1}{2} |\text{heat}(x) - y|^2 + \lambda \sum_i |x_{i+1} - x_i| .
 #
-# ADMM splits this in two: a quadratic problem, diagonal in waves, and a step that shrinks jumps and cuts off what is
-# negative, cell by cell. Both are a line of code; a third array keeps them together.
+# ADMM splits this into two problems: a quadratic one, which is diagonal in waves, and one that reduces jumps and sets
+# negative values to zero, cell by cell. Each is one line of code; a third array, the multiplier, couples them.
 
 WEIGHT = 1e-8  # lambda: single precision leaves little noise
 
@@ -169,8 +169,8 @@ def piecewise(y):
 # %%
 # The three beside each other
 # ---------------------------
-# The error is the heat at wrong places, the sum of :math:`|x - x_{\text{true}}|` over all cells. The last column holds
-# published figures on other samples of the same kind.
+# The error is the sum of :math:`|x - x_{\text{true}}|` over all cells. The last column contains published figures for
+# other samples of the same kind.
 
 ways = {
     "descent, summed": (descent, 1000, "170"),
@@ -190,13 +190,13 @@ for label, (method, gradients, published) in ways.items():
 # %%
 # The picture
 # -----------
-# The same sample five times, on one scale. Gradients give back a blur, the physical gradient sharp edges with ripples
-# around them, and the third way rectangles.
+# The same sample five times, on one scale. Gradient descent gives a blurred image, the physical gradient sharp edges
+# with ripples around them, and the third method rectangles.
 #
 # Exercises
 # ---------
-# 1. Add noise of 1e-3 to what is seen. Where must the inverse simulator stop dividing now, and how large must
-#    `WEIGHT` be? The other figures say which of the three ways suffers least.
+# 1. Add noise of 1e-3 to the data. For which factors may the inverse simulator divide now, and how large must `WEIGHT`
+#    be? Which of the three methods becomes worse the least?
 # 2. The term with :math:`x \ge 0` alone is a strong regularizer. Leave the jumps out (`t = 0` in `shrink`) and compare.
 
 if options.out:

@@ -32,8 +32,8 @@ options = parser.parse_args()
 #
 # .. math:: u_t + u \, u_x = \nu \, u_{xx} .
 #
-# The field at :math:`t = 1/2`, step 16, is seen. It holds a shock, which has swallowed a part of the start; so a good
-# answer is one that fits what is seen, obeys the equation, and is simple otherwise.
+# The data are the field at :math:`t = 1/2`, after 16 steps. It contains a shock, in which information about the initial
+# state is lost. So a good result fits the data, satisfies the equation, and is smooth otherwise.
 
 n = 128
 h = 2 / n
@@ -69,8 +69,8 @@ def misfit(u):
 # %%
 # A network for the whole history
 # -------------------------------
-# It maps a place and a time to :math:`u`, through three layers of 20. The place enters as :math:`\sin \pi x` and
-# :math:`\cos \pi x`, so that the ring is closed. We ask it for all 32 frames at once.
+# It maps position and time to :math:`u`, with three layers of 20 units. Its inputs are :math:`\sin \pi x` and
+# :math:`\cos \pi x` instead of :math:`x`, so that :math:`u` is periodic. We evaluate all 32 frames at once.
 
 rng = np.random.default_rng(0)
 sizes = (3, 20), (20, 20), (20, 20), (20, 1)
@@ -97,9 +97,9 @@ def field(w, points=points):
 # .. math:: r = \frac{u^{m+1}_i - u^{m-1}_i}{2 \Delta t} + u^m_i \, \frac{u^m_{i+1} - u^m_{i-1}}{2 h}
 #           - \nu \, \frac{u^m_{i+1} - 2 u^m_i + u^m_{i-1}}{h^2} .
 #
-# It is small where :math:`u` is smooth, and no scheme says what to do at a shock. The second asks for what the solver
-# would do, :math:`r = (u^{m+1} - \Phi(u^m)) / \Delta t`, with a step :math:`\Phi`: if it were zero, the network would
-# be a run of the solver. Its size is also the measure by which all answers are compared.
+# It is small where :math:`u` is smooth, but it does not describe a shock. The second is the residual of a step
+# :math:`\Phi` of the solver, :math:`r = (u^{m+1} - \Phi(u^m)) / \Delta t`: if it is zero, the network is a solution of
+# the discrete equation. Its norm is also used to compare all results.
 
 
 def by_equation(w):
@@ -127,8 +127,8 @@ def by_scheme(w):
 # %%
 # Through the solver
 # ------------------
-# The loss of a start is the misfit after 16 steps. Of all starts that fit, we ask for the least steep one, by a small
-# price on slopes. The start is a network at the first frame, or the plain 128 numbers.
+# The loss of an initial state is the misfit after 16 steps, plus a small penalty on slopes, which selects the smoothest
+# of all initial states that fit. The initial state is given by a network at the first frame, or by 128 numbers.
 
 
 def through(u):
@@ -144,7 +144,7 @@ def start_of(w):
 # %%
 # Side by side
 # ------------
-# All four by L-BFGS. The error is the mean of :math:`|u - u_\text{true}|` over all frames, and at the start.
+# All four use L-BFGS. The error is the mean of :math:`|u - u_\text{true}|` over all frames, and over the first one.
 
 searches = {
     "network, residual of equation": (by_equation, weights, field),
@@ -165,25 +165,26 @@ for label, (loss, begin, frames_of) in searches.items():
     print(f"{np.mean(error):7.4f} {error[0]:9.4f} {np.sqrt(broken(u)):17.1e}", flush=True)
 
 # %%
-# What to make of it
-# ------------------
-# Ten iterations are too few for any network. With 200 of them those with a residual are still off by 0.15 and 0.05 on
-# average, the two behind a solver by less than 0.01.
+# Conclusions
+# -----------
+# Ten iterations are too few for any network. After 200 iterations the mean errors of the methods with a residual are
+# still 0.15 and 0.05, those of the methods with a solver below 0.01.
 #
-# A residual needs no solver, and the network gives :math:`u` at any place and time, nearly. What it gives obeys the
-# equation nearly, too: the loss weighs the misfit against the physics, and the sum of both can be small with a shock
-# that is off. Behind a solver there is nothing to weigh. Every answer is a run, and a gradient costs no more. Where a
-# search tries a start so steep that the cotangent grows out of bounds, the rollout warns, and the search goes back.
+# A residual needs no solver, and the network returns an approximation of :math:`u` at any position and time. This
+# approximation satisfies the equation only approximately: the loss is a weighted sum of misfit and residual, and it can
+# be small although the shock is at a wrong position. With a solver there are no such weights, since each result
+# satisfies the discrete equation, and a gradient costs no more. If a line search tries an initial state that is so
+# steep that cotangents overflow, the rollout warns, and the line search shortens its step.
 #
 # The picture
 # -----------
-# The four starts, and the error of each over time.
+# The four initial states, and the error of each solution over time.
 #
 # Exercises
 # ---------
-# 1. Multiply the residual by 0.01, or by 100. Which column of the table goes up for which one that goes down?
-# 2. Take a state before the shock, step 4, as what is seen. Do the networks come closer?
-# 3. Make the viscosity an unknown of both schools. Which one finds it?
+# 1. Multiply the residual by 0.01, or by 100. Which column of the table increases, and which one decreases?
+# 2. Use a state before the shock, after 4 steps, as data. Do the errors of the networks decrease?
+# 3. Make the viscosity an unknown of both kinds of methods. Which kind finds it?
 
 if options.out:
     from matplotlib import pyplot, style

@@ -37,14 +37,15 @@ viscosity = 0.01
 # %%
 # The solver
 # ----------
-# Burgers' equation with a force, as a balance of what flows through the faces of cells:
+# Burgers' equation with a force, in conservation form, with fluxes through the faces of cells:
 #
 # .. math:: u_t + \left( \frac{u^2}{2} - \nu \, u_x + N(u) \right)_x = f .
 #
-# :math:`N` is the network, or nothing. It corrects a flux: what leaves a cell enters the next one, whatever the
-# network says, so the sum of :math:`u` cannot be spoilt. The flux is upwind. Where cells are coarse, that smears.
+# :math:`N` is the output of the network, or zero. It corrects the flux, so the sum of :math:`u` is conserved for any
+# output: what leaves a cell enters its neighbour. The upwind flux causes numerical diffusion on coarse cells.
 #
-# Each run is a row of a sheet; rows stand so far apart that nothing passes between them.
+# All runs are computed at once, each as one row of a two-dimensional grid. The rows are far apart, so that there is no
+# diffusion between them.
 
 
 def network(weights, u):
@@ -87,8 +88,8 @@ def coarsen(u):
 # %%
 # What the network learns from
 # ----------------------------
-# The fine solver runs under 20 travelling sines of random height, speed, phase and wavenumber, other ones for each run.
-# Its states and forces, on coarse cells, are what is known.
+# In each run of the fine solver, the force is a sum of 20 travelling sine waves with random amplitudes, speeds, phases
+# and wavenumbers. Its states and forces, averaged over coarse cells, are the training data.
 
 
 @cache
@@ -117,13 +118,13 @@ def window(number, begin, steps):
 # %%
 # The loss
 # --------
-# The coarse solver starts from a true state and runs :math:`k` steps with the network in each. All states on the way
-# count:
+# The coarse solver starts from a true state and takes :math:`k` steps, each with the network. The loss contains all
+# :math:`k` states:
 #
 # .. math:: J(\theta) = \text{mean}_{j \le k} \, | u_j(\theta) - \bar u_j |^2 .
 #
-# Its gradient goes back through all :math:`k` steps of the solver. With `truncate=1` it is cut after each one: then a
-# correction is never told what it does to later steps.
+# Its gradient contains the derivatives of all :math:`k` steps of the solver. With `truncate=1` the backward pass stops
+# after each step: then the gradient omits the effect of a correction on later steps.
 
 
 def miss(weights, seen, **how):
@@ -136,8 +137,8 @@ def miss(weights, seen, **how):
 # %%
 # Training
 # --------
-# Adam in three rounds of falling rate. The number of steps may change with the round. Every 150 gradients the record is
-# a new one, made when it is asked for, unless `fresh` says to stay with the first.
+# Adam, in three rounds with decreasing learning rate. The number of steps may change from round to round. Every 150
+# gradients, new training data are generated, unless `fresh` is False: then all gradients use the first data.
 
 LAYERS = (1, 16, 1.0), (16, 16, 1.0), (16, 1, 0.0)  # channels in, out, gain: no correction at the start
 RATES = 3e-3, 1e-3, 3e-4
@@ -164,8 +165,8 @@ def train(unrolled, truncate=None, fresh=True):
 # %%
 # Six trainings
 # -------------
-# Each network then runs 100 steps on data that none has seen. Its error is compared with the error of the coarse solver
-# alone. Mass is conserved up to rounding.
+# Each network then runs 100 steps on test data. Its error is compared with the error of the coarse solver alone. Mass
+# is conserved up to rounding.
 
 unseen = window(10**6, 50, 100)
 
@@ -212,14 +213,14 @@ for label, how in trainings.items():
 # %%
 # The picture
 # -----------
-# The first run, x to the right and time upwards: what is true on the fine grid, what the coarse solver makes of it, and
-# the same with the last network. Right: how the errors grow.
+# The first run, with x to the right and time upwards: the fine solution, the coarse solution, and the coarse solution
+# with the last network. Right: the errors over time.
 #
 # Exercises
 # ---------
 # 1. Train through 16 steps from the start. What happens in the first gradients, and why does it help to begin with 1?
 # 2. Let the network add to the rate, not to the flux. Watch the column of lost mass.
-# 3. Give the network 8 channels, or 32. Is its size the limit, or what it is shown?
+# 3. Give the network 8 channels, or 32. Is the error limited by its size, or by the training data?
 
 if options.out:
     from matplotlib import pyplot, style

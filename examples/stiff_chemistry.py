@@ -28,7 +28,7 @@ end = options.end
 # %%
 # Three reactions
 # ---------------
-# A turns into B slowly, B meets C and turns back, and two B make a C:
+# A becomes B slowly, B reacts with C and becomes A again, and C is formed from two B:
 #
 # .. math:: A \xrightarrow{p_1} B, \qquad B + C \xrightarrow{p_2} A + C, \qquad 2 B \xrightarrow{p_3} B + C,
 #
@@ -36,7 +36,7 @@ end = options.end
 #
 # .. math:: A' = p_2 B C - p_1 A, \qquad B' = p_1 A - p_2 B C - p_3 B^2, \qquad C' = p_3 B^2 .
 #
-# A fourth unknown adds up C over time: it is :math:`G = \int_0^T C \, dt`.
+# A fourth unknown is the integral of C over time, :math:`G = \int_0^T C \, dt`.
 
 RATES = np.array([0.04, 1e4, 3e7])
 start = np.array([1.0, 0.0, 0.0, 0.0])
@@ -53,14 +53,14 @@ def robertson(u, p):
 # %%
 # Why it is stiff
 # ---------------
-# Within milliseconds B goes to where it is made as fast as it is lost, :math:`B \approx \sqrt{p_1 / p_3} = 4 \cdot
-# 10^{-5}`. From then on it just follows A and C, which take seconds. But a disturbance of B still dies out with
-# :math:`2 p_3 B + p_2 C`, some 2000 times a second. Explicit steps have to be short enough for this, though nothing
-# happens at this pace any more: with a rate :math:`\lambda` those of rk4 are stable up to :math:`2.8 / \lambda`.
-# `radau` is implicit and damps at any step.
+# Within milliseconds B reaches the equilibrium of production and loss, :math:`B \approx \sqrt{p_1 / p_3} = 4 \cdot
+# 10^{-5}`. After that it follows A and C, which change over seconds. But a disturbance of B still decays at the rate
+# :math:`2 p_3 B + p_2 C`, about 2000 per second. Explicit steps must be short enough for this rate, although the
+# solution changes slowly: for a rate :math:`\lambda`, rk4 is stable up to steps of :math:`2.8 / \lambda`. `radau` is
+# implicit and stable for steps of any length.
 #
-# The error of each step is kept below a tolerance relative to :math:`|u|` + floor. B is 4e-5, so the floor has to be
-# less if B is to count.
+# The error of each step is kept below a tolerance relative to :math:`|u|` + floor. Since B is 4e-5, the floor must be
+# smaller, so that B is controlled as well.
 
 small = dict(tolerance=1e-4, floor=1e-6)
 explicit = dp.stepper("rk4", robertson, end / 50, **small)
@@ -72,8 +72,8 @@ print(f"The first {end / 50:g} s: rk4 takes {len(explicit.taken)} steps, radau {
 # %%
 # The integral, and its gradient
 # ------------------------------
-# The adjoint goes back through the steps that were taken, whatever their lengths. One run back gives the derivatives in
-# all three rates. For 50 s, G and its gradient are known to ten digits.
+# The adjoint uses the accepted steps in reverse order. One backward pass gives the derivatives in all three rates. For
+# 50 s, G and its gradient are known to ten digits.
 
 KNOWN = 10.948648481
 KNOWN_SLOPES = np.array([1.734140891e2, -5.059191406e-4, 8.432346465e-8])
@@ -94,10 +94,10 @@ for tolerance in (1e-3, 1e-4, 1e-5):
     print(f"{error:10.1e}  {error_of_slopes:10.1e} {seconds:8.1f}")
 
 # %%
-# The derivative in the logarithm, :math:`p \, \partial G / \partial p`, says what 1 % more of a rate does, in units of
-# 1 %; rates of any size can be compared. There is a check that needs no table: all rates times :math:`\alpha` is the
-# same as a clock that runs :math:`\alpha` times as fast, :math:`G(\alpha p, T) = G(p, \alpha T) / \alpha`. The
-# derivative in :math:`\alpha` at 1 gives
+# The derivative in the logarithm, :math:`p \, \partial G / \partial p`, is the change of G for a relative change of a
+# rate, so that rates of any size can be compared. There is a check without reference values: multiplying all rates by
+# :math:`\alpha` is the same as rescaling time, :math:`G(\alpha p, T) = G(p, \alpha T) / \alpha`. The derivative in
+# :math:`\alpha` at 1 gives
 #
 # .. math:: \sum_i p_i \frac{\partial G}{\partial p_i} = T \, C(T) - G .
 
@@ -107,9 +107,9 @@ print(f"\nsum of the three: {np.sum(slopes * RATES):.4f}, T C(T) - G: {expected:
 # %%
 # All times at once
 # -----------------
-# For C at many times and three rates the other direction is cheaper: forward mode takes a direction in the rates along
-# through all steps. The time between two outputs is an input of the rollout, so that they can be close at the start and
-# far apart at the end.
+# For C at many times and only three rates, forward mode is cheaper: it computes the derivative along a direction of the
+# rates together with all steps. The time between two outputs is an input of the rollout, so that the outputs can be
+# close at the start and far apart at the end.
 
 times = end * np.logspace(-3, 0, 10)
 lengths = np.diff(times, prepend=0.0)
@@ -130,15 +130,15 @@ print(f"C at the end: {states[-1, 2]:.4f}; in log p1, p2, p3: {last}")
 # %%
 # The picture
 # -----------
-# At first C depends on :math:`p_1` alone: every B that is made soon ends as C. Later C drives B back into A, and
-# :math:`p_2` counts against :math:`p_1`; a faster :math:`p_3` catches B before it is driven back.
+# At first C depends on :math:`p_1` alone: all B soon becomes C. Later C turns B back into A, and :math:`p_2` has the
+# opposite effect of :math:`p_1`; with a larger :math:`p_3` more of B becomes C before that.
 #
 # Exercises
 # ---------
 # 1. Run to 5000 s. How many more steps does radau take for a hundred times the time?
-# 2. Give rk4 the whole 50 s. Compare the seconds.
-# 3. Make up measurements of C with 1 % noise, and find the three rates again by `dp.minimize` in their logarithms.
-#    Which combination of them is found worst?
+# 2. Use rk4 for the whole 50 s. Compare the run times.
+# 3. Generate measurements of C with 1 % noise, and estimate the logarithms of the three rates with `dp.minimize`. Which
+#    combination of them has the largest error?
 
 if options.out:
     from matplotlib import pyplot, style
