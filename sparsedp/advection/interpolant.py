@@ -63,9 +63,15 @@ class Interpolant:
             self.half_way = Interpolant(settings, number, closed=True)
         self._inside = tuple(slice(PAD, PAD + n) for n in self.points.shape)
         self._ghosts, self._sources = ghost_sources(settings, number, self.points, closed)
+        inflow_values = 0 if closed else wall_space(settings).size
+        self.new_samples = buffers.allocator((self.points.samples + inflow_values,), filled=True)  # new zeros
         self._gathered = None
         if self.points.samples <= GATHER_BELOW:
-            self._gathered = self._indices_of_samples(0 if closed else wall_space(settings).size)
+            self._gathered = self._indices_of_samples(inflow_values)
+            is_ghost = np.zeros(self._gathered.size, bool)
+            is_ghost[self._ghosts] = True
+            order = np.concatenate([np.flatnonzero(~is_ghost), self._ghosts])
+            self._scattered = order, self._gathered[order]
         self._filling: sp.csr_array | None = None
         if settings.of == "cells" and settings.solid is not None and not closed:  # faces of solids keep their value
             self._filling = solid_filling(settings.grid, settings.solid)
@@ -116,10 +122,16 @@ class Interpolant:
         The cotangent `samples` is overwritten.
         """
         cells = self.points.samples
-        np.add.at(samples, self._sources, samples.take(self._ghosts))
+        if self._gathered is not None:  # the same sums in the same order: each sample after the one in its own place
+            order, targets = self._scattered
+            sums = np.bincount(targets, samples.take(order), of_u.size + of_inflow.size)
+            of_u[:] = sums[: of_u.size]
+            if of_inflow.size:
+                of_inflow += sums[of_u.size :]
+            return
+        np.add.at(samples, self._sources, samples[self._ghosts])
         of_u.reshape(self.points.shape)[...] = samples[:cells].reshape(self.points.padded)[self._inside]
-        if of_inflow.size:
-            of_inflow += samples[cells:]
+        of_inflow += samples[cells:]
 
 
 class InterpolatedComponent:
@@ -177,7 +189,7 @@ class InterpolatedComponent:
 
         `of_samples` is a pair (indices of samples, cotangents of these samples) with further contributions.
         """
-        samples = buffers.zeros((self.points.samples + self.inflow.size,), float)
+        samples = self.interpolant.new_samples()
         if of_samples is not None:
             np.add.at(samples, *of_samples)
         values, scale, _ = self.displacement

@@ -253,6 +253,8 @@ def _flatten_tangent(num: int, method: TransportMethod, tangent: Any) -> Any:
 
 def _unflatten(value: Any, derivative: Any) -> Any:
     """Return a flat derivative in the shape of a value; if the value is a scalar, return the sum."""
+    if type(value) is np.ndarray and value.ndim:
+        return derivative if value.ndim == 1 else derivative.reshape(value.shape)
     shape = np.shape(value)
     if shape:
         return derivative.reshape(shape)

@@ -103,6 +103,9 @@ class SemiLagrangian(TransportMethod):
         self._velocity_parts = [
             (slice(dim * c.span.start, dim * c.span.stop), (dim, c.span.stop - c.span.start)) for c in self.components
         ]
+        size = settings.space.size
+        self._new_field = buffers.allocator((size,))
+        self._new_velocity = buffers.allocator((dim * size,))
         self.solid = settings.solid_points  # mask of the points whose value does not change
 
     def _split_velocity(self, w: NDArray) -> list[NDArray]:
@@ -110,10 +113,14 @@ class SemiLagrangian(TransportMethod):
         return [w[span].reshape(shape) for span, shape in self._velocity_parts]
 
     def _steps(self, u: NDArray, v: NDArray, dt: float, inflow: NDArray) -> Iterator[tuple[slice, Any]]:
-        """Yield, for each component, the range of its entries in the field and its step."""
-        velocities = self._split_velocity(self.interpolate_velocity(v))
-        for component, w in zip(self.components, velocities, strict=True):
-            yield component.span, self.component_step(component, w, dt, u[component.span], inflow)
+        """Yield, for each component, the range of its entries in the field and its step.
+
+        A generator, so that the memory of a step is free before the next one is computed.
+        """
+        w = self.interpolate_velocity(v)
+        for component, (part, shape) in zip(self.components, self._velocity_parts):
+            span = component.span
+            yield span, self.component_step(component, w[part].reshape(shape), dt, u[span], inflow)
 
     def _keep_solid(self, result: NDArray, u: NDArray) -> NDArray:
         """Set the points of `result` inside the solid to the values of u, and return `result`."""
@@ -126,7 +133,7 @@ class SemiLagrangian(TransportMethod):
         finite = surely_finite(u) and (v is u or surely_finite(v)) and (not inflow.size or surely_finite(inflow))
         if not finite:
             check_numbers(self.settings, u, v, inflow)  # the result alone does not show all of them
-        out = buffers.empty(u.shape, float)
+        out = self._new_field()
         for span, step in self._steps(u, v, dt, inflow):
             step.value(out[span])
         return self._keep_solid(out, u)
@@ -149,20 +156,21 @@ class SemiLagrangian(TransportMethod):
             of_moved = g
         else:
             of_moved = np.where(self.solid, 0.0, g)
-        of_u = buffers.empty((u.size if of_field_wanted else 0,), float)
+        of_u = self._new_field() if of_field_wanted else None
         of_inflow = np.zeros(inflow.size)
+        of_w = None
         parts_of_w: list = [None] * len(self.components)
         if of_velocity_wanted:
-            of_w = buffers.empty((u.size * self.settings.grid.dim,), float)
+            of_w = self._new_velocity()
             parts_of_w = self._split_velocity(of_w)
-        for (span, step), part_of_w in zip(self._steps(u, v, dt, inflow), parts_of_w, strict=True):
-            step.vjp(of_moved[span], of_u[span] if of_field_wanted else None, of_inflow, part_of_w)
-        if of_field_wanted and self.solid is not None:
+        for (span, step), part_of_w in zip(self._steps(u, v, dt, inflow), parts_of_w):
+            step.vjp(of_moved[span], None if of_u is None else of_u[span], of_inflow, part_of_w)
+        if of_u is not None and self.solid is not None:
             of_u += g - of_moved
-        cotangents = {FIELD: of_u, INFLOW: of_inflow}
-        if of_velocity_wanted:
-            cotangents[VELOCITY] = self.interpolate_velocity_vjp(of_w)
-        return tuple(cotangents[num] for num in nums), False
+        if of_w is not None:
+            of_w = self.interpolate_velocity_vjp(of_w)
+        cotangents = {FIELD: of_u, VELOCITY: of_w, INFLOW: of_inflow}
+        return tuple([cotangents[num] for num in nums]), False
 
     def jvp(self, tangents: Mapping[int, Any], u: NDArray, v: NDArray, dt: float, inflow: NDArray) -> NDArray:
         """Return the tangent of the result; see `TransportMethod`."""

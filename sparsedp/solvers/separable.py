@@ -28,12 +28,13 @@ Operations Research 33 (1985) 1107-1116: pivots without subtractions.
 
 from __future__ import annotations
 
-from functools import reduce
+from functools import partial, reduce
 from math import prod
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import scipy.fft as fft
+import scipy.fftpack as fftpack
 import scipy.linalg
 
 from sparsedp import kernels
@@ -54,6 +55,8 @@ if TYPE_CHECKING:
     from sparsedp.operators.structure.base import Structure
     from sparsedp.operators.structure.factor import Factor
     from sparsedp.solvers.system import System
+
+    Transform = Callable[[NDArray[Any]], NDArray[Any]]
 
 __all__ = [
     "AxisBasis",
@@ -78,7 +81,10 @@ ZERO_EIGENVALUE = 4 * EPS  # a sum of eigenvalues below this share of the larges
 ROUNDING = 16 * EPS  # relative difference of entries that counts as rounding
 LARGEST_SCALING_RATIO = 1e4  # of the scaling S_a: beyond it eigenvectors lose digits
 
-TRANSFORMS = {"dct": (fft.dct, fft.idct), "dst": (fft.dst, fft.idst)}  # to the coefficients, and from them
+# To the coefficients, and from them. `scipy.fftpack` calls the same loops as `scipy.fft`, without a choice of backends,
+# which takes longer than a small transform; it has no threads.
+TRANSFORMS = {"dct": (fft.dct, fft.idct), "dst": (fft.dst, fft.idst)}
+TRANSFORMS_ON_ONE_THREAD = {"dct": (fftpack.dct, fftpack.idct), "dst": (fftpack.dst, fftpack.idst)}
 # Boundary conditions at the lower and the upper end -> the transform, and the shift of its frequencies.
 TRANSFORM_OF_ENDS = {
     ("neumann", "neumann"): ("dct-2", 0.0),
@@ -113,45 +119,35 @@ class AxisBasis:
         self.eigenvalues = eigenvalues
         self.matrices = matrices
 
-    def to_coefficients(
-        self, x: NDArray[Any], axis: int, transposed: bool, workers: int, overwrite: bool
-    ) -> NDArray[Any]:
-        """Transform a field along `axis`; a Fourier axis is left as it is.
+    def transform(self, axis: int, backward: bool, transposed: bool, workers: int, overwrite: bool) -> Transform | None:
+        """Return the function that transforms a field along `axis`; None for axes that need none, as Fourier axes.
 
         Parameters
         ----------
-        x : array
         axis : int
+        backward : bool
+            Whether to transform from the coefficients, instead of to them.
         transposed : bool
             Whether the coefficients are those of the transposed factor.
         workers : int
             Number of threads.
         overwrite : bool
-            Whether the memory of x may be reused.
-
-        Returns
-        -------
-        array
+            Whether the memory of the argument may be reused.
         """
-        return self._transform(x, axis, False, transposed, workers, overwrite)
-
-    def from_coefficients(self, y: NDArray[Any], axis: int, transposed: bool, workers: int) -> NDArray[Any]:
-        """Invert `to_coefficients`. May overwrite y."""
-        return self._transform(y, axis, True, transposed, workers, True)
-
-    def _transform(self, x, axis, backward, transposed, workers, overwrite):
         if self.matrices is not None:
             if transposed:
-                return _multiply_along(self.matrices[1 - backward].T, x, axis)
-            return _multiply_along(self.matrices[backward], x, axis)
+                return partial(_multiply_along, self.matrices[1 - backward].T, axis)
+            return partial(_multiply_along, self.matrices[backward], axis)
         if self.kind in ("identity", "fourier"):
-            return x
-        transform = TRANSFORMS[self.kind[:3]][backward]
-        type_of_transform = int(self.kind[-1])
-        return transform(x, type_of_transform, axis=axis, norm="ortho", overwrite_x=overwrite, workers=workers)
+            return None
+        name = self.kind[:3]
+        options: dict[str, Any] = dict(type=int(self.kind[-1]), axis=axis, norm="ortho", overwrite_x=overwrite)
+        if workers == 1:
+            return partial(TRANSFORMS_ON_ONE_THREAD[name][backward], **options)
+        return partial(TRANSFORMS[name][backward], **options, workers=workers)
 
 
-def _multiply_along(matrix, x, axis):
+def _multiply_along(matrix, axis, x):
     """Multiply the lines of a field along one axis with a matrix."""
     n = x.shape[axis]
     if axis == x.ndim - 1:
@@ -296,6 +292,9 @@ class Spectrum:
         self.fourier_axes = tuple(a for a, axis in enumerate(axes) if axis.kind == "fourier")
         self.eigenvalues = self._sums_of_eigenvalues()
         self.workers = kernels.threads() if prod(shape) >= THREADED_FROM else 1
+        # The transforms along the axes, for the operator and for its transpose.
+        self._to_coefficients = [self._transforms(False, transposed) for transposed in (False, True)]
+        self._from_coefficients = [self._transforms(True, transposed) for transposed in (False, True)]
 
     def _sums_of_eigenvalues(self):
         along_axes = [axis.eigenvalues for axis in self.axes]
@@ -312,6 +311,17 @@ class Spectrum:
         sums[np.abs(sums) <= tolerance * largest] = 0.0
         return sums
 
+    def _transforms(self, backward, transposed):
+        """Return the functions that transform a field along the axes, in this order."""
+        numbers = range(len(self.axes))
+        transforms: list[Transform] = []
+        for number in reversed(numbers) if backward else numbers:
+            overwrite = backward or bool(transforms)  # the first one to the coefficients gets the caller's array
+            transform = self.axes[number].transform(number, backward, transposed, self.workers, overwrite)
+            if transform is not None:
+                transforms.append(transform)
+        return transforms
+
     def apply(self, weights: NDArray[Any], x: NDArray[Any], transposed: bool = False) -> NDArray[Any]:
         """Return f(A) x or f(A)^T x as a fresh flat array, given the values of f at the eigenvalues."""
         y = self.to_coefficients(x, transposed)
@@ -322,8 +332,8 @@ class Spectrum:
         """Transform a flat field along all axes, into a fresh array."""
         field = x.reshape(self.shape)
         y = field
-        for number, axis in enumerate(self.axes):
-            y = axis.to_coefficients(y, number, transposed, self.workers, overwrite=y is not field)
+        for transform in self._to_coefficients[transposed]:
+            y = transform(y)
         if self.fourier_axes:  # transformed together
             return fft.rfftn(y, axes=self.fourier_axes, workers=self.workers)
         return y.copy() if y is field else y
@@ -333,8 +343,8 @@ class Spectrum:
         if self.fourier_axes:
             lengths = [self.shape[number] for number in self.fourier_axes]
             y = fft.irfftn(y, s=lengths, axes=self.fourier_axes, overwrite_x=True, workers=self.workers)
-        for number in reversed(range(len(self.axes))):
-            y = self.axes[number].from_coefficients(y, number, transposed, self.workers)
+        for transform in self._from_coefficients[transposed]:
+            y = transform(y)
         return y.reshape(-1)
 
     def has_same_basis(self, other: Spectrum) -> bool:
@@ -411,15 +421,11 @@ class Elimination:
             remainder = row_sums[i] + modes + abs(self.lower[i]) * remainder * self.inverse_pivots[i - 1]
             inverted(abs(self.upper[i]) + remainder, line)
         self.inverse_pivots *= sign
+        self._bands = (self.lower, self.upper), (np.roll(self.upper, 1), np.roll(self.lower, -1))
 
     def solve(self, x: NDArray[Any], transposed: bool) -> None:
         """Overwrite x, of shape (n, ...) with m numbers along the other axes, with the solution."""
-        if transposed:
-            lower = np.roll(self.upper, 1)
-            upper = np.roll(self.lower, -1)
-        else:
-            lower = self.lower
-            upper = self.upper
+        lower, upper = self._bands[transposed]
         kernels.sweep(x.view(float).reshape(len(x), -1), lower, upper, self.inverse_pivots)
 
 
