@@ -28,15 +28,16 @@ options = parser.parse_args()
 # %%
 # The equation
 # ------------
-# On the ring :math:`-1 \le x < 1` the velocity :math:`u` obeys
+# On the periodic interval :math:`-1 \le x < 1` the velocity :math:`u` satisfies
 #
 # .. math:: u_t + u \, u_x = \nu \, u_{xx} .
 #
-# The second term says that the field is carried by itself: what is fast overtakes what is slow, and slopes grow. The
-# right-hand side smooths them again.
+# The second term is advection of the field by itself: fast fluid overtakes slow fluid, and slopes grow. The right-hand
+# side is diffusion, which makes them smaller.
 #
-# A step does the one after the other. Transport is *semi-Lagrangian*: look upstream by :math:`u \, \Delta t`, and take
-# what is there. This is stable for steps of any length; it smooths a little, since it interpolates between cells.
+# A step computes advection first, then diffusion. Advection is *semi-Lagrangian*: the new value is the old value at the
+# departure point, at the distance :math:`u \, \Delta t` upstream. This is stable for steps of any length, but the
+# interpolation between cells adds some diffusion.
 
 ring = dp.Grid(options.cells, size=2.0, origin=-1.0, periodic=True)
 L = dp.laplacian(ring)
@@ -55,7 +56,7 @@ def step(u, nu):
 # %%
 # Forward
 # -------
-# From :math:`u = -\sin \pi x` both halves run towards the middle and meet in a shock.
+# From :math:`u = -\sin \pi x` both halves move towards the middle and form a shock there.
 
 (x,) = ring.centres()
 truth = dp.rollout(step, -np.sin(np.pi * x), viscosity, 32, keep="all")
@@ -66,12 +67,12 @@ print("published :  0.0057228 0.0171672 0.0286103 0.0400520 0.0514921   (128 cel
 # %%
 # The question backwards
 # ----------------------
-# Now only the state after 16 steps is seen. The loss of a start is the mean squared difference there,
+# Now only the state after 16 steps is known. The loss of an initial state is the mean squared difference of this state,
 #
 # .. math:: J(u_0) = \frac{1}{n} \, | \Phi_{16}(u_0) - u_{\text{seen}} |^2 ,
 #
-# where :math:`\Phi_{16}` stands for 16 steps. Its gradient comes from one run backwards through the steps, each of
-# which maps the cotangent of its result to the cotangent of its argument.
+# where :math:`\Phi_{16}` denotes 16 steps. Its gradient takes one backward pass through the steps, each of which maps
+# the cotangent of its result to the cotangent of its argument.
 
 seen = np.loadtxt(options.observation) if options.observation else truth[16]
 
@@ -84,7 +85,7 @@ def loss(u):
 # %%
 # Gradient descent
 # ----------------
-# We start from rest and go down 200 times with rate 5. Three of the starts on the way are kept for comparison.
+# We start from :math:`u_0 = 0` and take 200 steps with rate 5. Three of the iterates are kept for comparison.
 
 loss_and_slope = dp.value_and_grad(loss)
 starts = {}
@@ -103,8 +104,8 @@ print("loss before descent 1 to 6, 11, 16, 21 ... 46:", *(f"{losses[k]:.6f}" for
 # %%
 # A better question
 # -----------------
-# Many starts end like that: where the shock has swallowed the fluid, nothing in the later state tells what it was. So
-# we ask for one of them, the least steep, by a small price on slopes, and L-BFGS finds it:
+# Many initial states lead to this state: the later state contains no information about the fluid that has entered the
+# shock. A small penalty on slopes selects the smoothest of these initial states, and L-BFGS finds it:
 #
 # .. math:: J(u_0) + 10^{-5} \cdot \text{mean} \, |\nabla u_0|^2 .
 
@@ -134,13 +135,13 @@ for name, u in starts.items():
 # %%
 # The picture
 # -----------
-# Descent has the smooth parts first. What starts around :math:`x = \pm 1/2` just reaches the shock; there it keeps a
-# zigzag, which costs next to nothing in the loss.
+# Gradient descent finds the smooth parts first. The fluid from around :math:`x = \pm 1/2` just reaches the shock; there
+# the result oscillates from cell to cell, which has almost no effect on the loss.
 #
 # Exercises
 # ---------
-# 1. Look at the state after 4 steps instead of 16. How much better is the start, and why?
-# 2. Try 1e-3 and 1e-7 as the price on slopes. What goes wrong on either side?
+# 1. Use the state after 4 steps instead of 16. How much better is the initial state, and why?
+# 2. Try 1e-3 and 1e-7 as weights of the penalty. What is wrong with each of the results?
 # 3. Make the viscosity an unknown too: `dp.minimize` takes a tuple `(u, log_nu)` as it is.
 
 if options.out:

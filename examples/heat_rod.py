@@ -32,7 +32,7 @@ options = parser.parse_args()
 #
 # .. math:: (L u)_i = \frac{u_{i+1} - 2 u_i + u_{i-1}}{h^2},
 #
-# and it knows what happens at the ends: `dirichlet` says that the temperature there is 0.
+# and it includes the condition at the ends: `dirichlet` means that the temperature there is 0.
 
 rod = dp.Grid(options.cells, size=1.0)
 L = dp.laplacian(rod, boundary=dp.dirichlet).explicit()
@@ -54,7 +54,7 @@ transpose = lambda g: L.matrix.T @ g
 defvjp(apply, lambda answer, u: transpose)
 
 # %%
-# Every operator of this library carries these three lines with it. Let us see that ours give the same gradient.
+# Every operator of this library contains these three lines. The next lines show that ours give the same gradient.
 
 (x,) = rod.centres()
 bump = np.exp(-(((x - 0.3) / 0.1) ** 2))
@@ -85,7 +85,8 @@ def cool(u):
 
 
 # %%
-# What is seen is a rod that was warm around :math:`x = 0.6`. The loss is how far we are from it,
+# The data are the final temperatures of a rod that was warm around :math:`x = 0.6`. The loss is the deviation from
+# them,
 #
 # .. math:: J(u) = \sum_i h \, \left(\text{cool}(u)_i - w_i\right)^2 .
 
@@ -110,7 +111,7 @@ print(dp.check.gradient(loss, bump))
 # %%
 # Back to the start
 # -----------------
-# With a gradient, the search is one call. We begin with a bump at the wrong place.
+# With a gradient, the minimization is one call. We begin with a bump at the wrong position.
 
 best = dp.minimize(loss, bump, maxiter=20)
 print(f"loss {loss(bump):.2e} -> {best.value:.2e} in {len(best.history)} entries of history")
@@ -118,8 +119,8 @@ print(f"loss {loss(bump):.2e} -> {best.value:.2e} in {len(best.history)} entries
 # %%
 # The picture
 # -----------
-# The start that is found ends as wanted, and it is near the true one, but it is not the same: cooling wipes out fine
-# detail, and what is wiped out leaves no trace in the loss.
+# The initial state that is found fits the data and is near the true one, but it is not the same: cooling removes fine
+# details, so that they have no effect on the loss.
 #
 # Exercises
 # ---------

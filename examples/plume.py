@@ -26,7 +26,7 @@ options = parser.parse_args()
 # %%
 # The box
 # -------
-# Smoke lives in cells, wind on the faces between them. Smoke enters in a disc, in every step.
+# Smoke has values in cells, the wind on the faces between them. Smoke enters in a disc, in every step.
 
 grid = dp.Grid((options.cells, 5 * options.cells // 4), size=(80.0, 100.0))
 h = 80 / options.cells  # width of a cell
@@ -40,13 +40,13 @@ source = 0.2 * ((x - 30) ** 2 + (y - 15) ** 2 <= 10**2)
 # %%
 # The laws
 # --------
-# The wind :math:`v` and the smoke :math:`s` obey
+# The wind :math:`v` and the smoke :math:`s` satisfy
 #
 # .. math:: s_t + v \cdot \nabla s = q, \qquad
 #           v_t + v \cdot \nabla v = s \, e_y + \nu \, \Delta v - \nabla p, \qquad \nabla \cdot v = 0 .
 #
-# In words: smoke is carried and added; wind is carried by itself, lifted by smoke, slowed by viscosity, and kept free
-# of divergence by the pressure :math:`p`. Each needs an operator.
+# Smoke is advected and added. The wind is advected by itself, accelerated upwards by smoke, and slowed by viscosity;
+# the pressure :math:`p` keeps it free of divergence. Each of these laws needs an operator.
 
 carry_smoke = dp.transport(grid, "semi_lagrangian")
 carry_wind = dp.transport(grid, "semi_lagrangian", boundary=dp.dirichlet, of="faces")  # no wind beyond the walls
@@ -57,7 +57,7 @@ project = dp.projection(grid)
 
 # %%
 # Viscosity acts on each component of the wind, on the mesh of its own faces. As in the published run, the wind is 0 one
-# spacing beyond the last samples; a Robin condition says that.
+# spacing beyond the last samples; this is a Robin condition.
 
 bend = [dp.laplacian(dp.Grid(grid.face_shape(axis), spacing=h), dp.robin(2, h)) for axis in (0, 1)]
 
@@ -69,7 +69,7 @@ def diffuse(wind):
 
 
 # %%
-# The step itself is the laws, one after the other.
+# A step applies these laws one after the other.
 
 
 def step(state, source):
@@ -85,8 +85,8 @@ def step(state, source):
 # %%
 # Forward
 # -------
-# From air at rest, with the largest wind of each step beside the published one. The divergence is what the solver of
-# the pressure has left.
+# From air at rest. The table shows the largest wind of each step beside the published one. The divergence is the
+# residual of the pressure solve.
 
 still = np.zeros(grid.shape), np.zeros(grid.faces.size)
 smoke, wind = dp.rollout(step, still, source, steps, keep="all")
@@ -102,8 +102,8 @@ for k in range(1, steps + 1):
 # %%
 # Where would more smoke lift the cloud?
 # --------------------------------------
-# The height of the cloud is the centre of its smoke. Its gradient in the source answers for all cells at once, by one
-# run backwards through transport, buoyancy and eleven pressure solves.
+# The height of the cloud is that of its centre of mass. One backward pass through transport, buoyancy and eleven
+# pressure solves computes its derivative with respect to the source in all cells.
 #
 # .. math:: J(q) = \frac{\sum_i y_i \, s_i}{\sum_i s_i}
 
@@ -121,8 +121,8 @@ print("gradient of the height in the source, against finite differences:", dp.ch
 # The picture
 # -----------
 # Left: smoke after the last step. Right: how much one more unit of smoke in a cell, in each step, would lift the cloud.
-# High up it lifts the centre by being there, in the stream by driving it. Low and beside the stream it only pulls the
-# centre down.
+# High up, additional smoke lifts the centre of mass by its position; in the stream, by its buoyancy. At low positions
+# beside the stream it lowers the centre.
 #
 # Exercises
 # ---------

@@ -27,7 +27,7 @@ options = parser.parse_args()
 # %%
 # Four sources
 # ------------
-# Each is a disc of radius 3 that gives off smoke in every step. The last one is the one to imitate.
+# Each is a disc of radius 3 that emits smoke in every step. The plume of the last one is the target.
 
 grid = dp.Grid((32, 40))
 x, y = grid.centres()
@@ -44,8 +44,8 @@ wanted = disc(16, 5)
 # %%
 # The flow
 # --------
-# Smoke is carried with little smearing (MacCormack), wind by a plain scheme. Smoke lifts the air, and the projection
-# keeps the wind free of divergence.
+# Smoke is advected with little numerical diffusion (MacCormack), the wind by a semi-Lagrangian scheme. Smoke lifts the
+# air, and the projection keeps the wind free of divergence.
 
 carry_smoke = dp.transport(grid, "maccormack")
 carry_wind = dp.transport(grid, "semi_lagrangian", boundary=dp.dirichlet, of="faces")  # no wind beyond the walls
@@ -72,7 +72,7 @@ def run(wind, source, keep="last"):
 # %%
 # The loss
 # --------
-# The three winds :math:`w_1, w_2, w_3` are the unknowns, and all three plumes count:
+# The unknowns are the three initial winds :math:`w_1, w_2, w_3`, and the loss contains all three plumes:
 #
 # .. math:: J(w_1, w_2, w_3) = \sum_{k=1}^{3} \frac{1}{2} \, | \Phi_k(w_k) - s_{\text{goal}} |^2 .
 
@@ -86,7 +86,7 @@ def loss(winds):
 
 
 # %%
-# First we meet the published figures: the loss without wind, and after one small step down.
+# First we reproduce published figures: the loss without wind, and after one small step of gradient descent.
 
 loss_and_gradient = dp.value_and_grad(loss)
 still = np.zeros((3, grid.faces.size))
@@ -97,9 +97,9 @@ print(f"one step down, rate 0.001  {loss(still - 1e-3 * gradient):9.4f}  publish
 # %%
 # The search
 # ----------
-# MacCormack clamps what it computes to the values around, and a path that crosses from one cell to the next makes a
-# kink. So the loss is full of small kinks, which stall a line search. Adam steps over them: it divides a running mean
-# of gradients :math:`m` by the root of a running mean of their squares :math:`q`,
+# MacCormack limits its result to the range of the neighbouring values, and has a kink where a path crosses from one
+# cell to the next. So the loss has many small kinks, at which a line search stops. Adam uses no line search: it divides
+# a running mean of gradients :math:`m` by the root of a running mean of their squares :math:`q`,
 #
 # .. math:: w \leftarrow w - \rho_k \frac{m / (1 - 0.9^k)}{\sqrt{q / (1 - 0.999^k)} + 10^{-8}} ,
 #
@@ -127,7 +127,7 @@ print(f"{seconds:.2f} s for a gradient of three runs in {winds.size} unknowns")
 # %%
 # The picture
 # -----------
-# The first plume with the wind that was found, beside the plume that it had to imitate, and the way down.
+# The first plume with the wind that was found, the target, and the loss over the iterations.
 #
 # Exercises
 # ---------

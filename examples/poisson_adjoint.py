@@ -34,12 +34,12 @@ sizes = options.cells // 4, options.cells // 2, options.cells
 #
 # .. math:: dJ = w^T A^{-1} df = (A^{-T} w)^T df .
 #
-# The gradient is :math:`A^{-T} w`: a solve with the transposed operator, the **adjoint solve**. Nothing is taken
-# through the iterations of the solver; they are forgotten as soon as it has converged.
+# The gradient is :math:`A^{-T} w`: a solve with the transposed operator, the **adjoint solve**. The iterations of the
+# solver are not differentiated, and they need not be stored.
 #
-# With an even load the exact answers are known: the volume, and the height of the membrane in the middle. As
-# :math:`A` is symmetric here, the gradient divided by the area of a cell is the membrane itself, so that its middle
-# tells us the error of the gradient.
+# With a uniform load the exact results are known: the volume, and the height of the membrane in the middle. Since
+# :math:`A` is symmetric here, the gradient divided by the area of a cell is the membrane itself, so that the error in
+# the middle is the error of the gradient.
 
 VOLUME = 0.03514425373879
 MIDDLE = 0.07367135328151
@@ -73,8 +73,8 @@ def measure(method, cells):
 # %%
 # Every solver, three grids
 # -------------------------
-# All solve the same equations, so on one grid all have the same error. Twice as many cells along an axis make it four
-# times smaller. What differs is the time.
+# All solvers solve the same equations, so on one grid all have the same error. With twice as many cells along an axis
+# it is four times smaller. Only the run times differ.
 
 rows = {}
 print("method      cells  set-up s  forward s  adjoint s  error of J  error of dJ/df  iterations")
@@ -94,11 +94,11 @@ for method in ("direct", "multigrid", "structured", "separable", "krylov"):
 # %%
 # A corner that points inwards
 # ----------------------------
-# Not everything converges with order 2. Cut a quarter out of the square :math:`(-1, 1)^2`: the membrane is steep at the
-# corner that is left, like :math:`r^{2/3}`, and no even grid resolves that. We look at the lowest tone of an L-shaped
-# drum, the least eigenvalue of :math:`-\Delta`, which is known to many digits. An inverse is an operator like the
-# others, so that SciPy's Lanczos method takes it as it is: the largest eigenvalue of the inverse is one over the least
-# one.
+# Not everything converges with order 2. Without a quarter of the square :math:`(-1, 1)^2`, the membrane behaves like
+# :math:`r^{2/3}` at the new corner; its slope is infinite there, which a uniform grid does not resolve. We compute the
+# least eigenvalue of :math:`-\Delta`, the lowest frequency of an L-shaped drum, which is known to many digits. An
+# inverse is an operator, so SciPy's Lanczos method accepts it: the largest eigenvalue of the inverse is the reciprocal
+# of the least eigenvalue.
 
 LOWEST = 9.6397238440219
 
@@ -127,8 +127,8 @@ print(f"L-shape, lowest eigenvalue 9.63972384: errors {gaps[0]:.1e} {gaps[1]:.1e
 # %%
 # The picture
 # -----------
-# Left: what a gradient costs, set-up included, and how exact it is; the lower left is better. Right: the lowest tone of
-# the drum.
+# Left: run time of a gradient, including the set-up, and its error; the lower left is better. Right: the least
+# eigenvalue of the drum.
 #
 # Exercises
 # ---------

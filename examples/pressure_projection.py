@@ -26,8 +26,8 @@ options = parser.parse_args()
 # %%
 # The projection
 # --------------
-# Velocities live on the faces of cells, so that the divergence of a cell is what flows out through its own faces.
-# Pressure :math:`p` pushes any wind :math:`v` to an incompressible one:
+# Velocities have values on the faces of cells, so that the divergence of a cell is the flow out of its own faces. The
+# pressure :math:`p` changes any wind :math:`v` to an incompressible one:
 #
 # .. math:: P v = v - \nabla p \quad \text{with} \quad \Delta p = \nabla \cdot v .
 #
@@ -48,10 +48,10 @@ left_over = np.max(np.abs(dp.divergence(grid)(project(w))))
 print(f"symmetric: {asymmetry:.0e}, idempotent: {change:.0e}, divergence left: {left_over:.0e}")
 
 # %%
-# What is ours and what is wanted
-# -------------------------------
-# A mask is an operator, too: it keeps the faces that it names, and sets the others to zero. The wanted wind blows
-# upwards in the right half, most of all around the point (50, 10).
+# The unknown and the target
+# --------------------------
+# A mask is an operator as well: it keeps the values on some faces, and sets the others to zero. The wanted wind blows
+# upwards in the right half, and is strongest around the point (50, 10).
 
 x_faces, _ = grid.face_centres(0)
 x, y = grid.face_centres(1)
@@ -63,7 +63,8 @@ upwards = 2 * np.exp(-((x - 50) ** 2 + (y - 10) ** 2) / (2 * 32**2))
 target = right(grid.join(np.zeros_like(x_faces), upwards))
 
 # %%
-# Operators are composed with `@`. This one takes our half of the wind, makes it incompressible, and looks at the right.
+# Operators are composed with `@`. This one takes the wind in the left half, makes it incompressible, and returns its
+# right half.
 #
 # .. math:: J(v) = \frac{1}{2} \, | R \, P \, M \, v - w |^2
 
@@ -78,7 +79,7 @@ def loss(v):
 # %%
 # Gradient descent
 # ----------------
-# Rate 1, from rest, beside published figures. The loss falls fast, and then creeps.
+# Rate 1, from rest, beside published figures. The loss falls fast at first, and slowly later.
 
 loss_and_gradient = dp.value_and_grad(loss)
 v = np.zeros(grid.faces.size)
@@ -95,8 +96,8 @@ for steps, known in ((0, "2432.29"), (1, "1945.7"), (4, "1462"), (10, "1373.0"),
 # %%
 # Least squares
 # -------------
-# The loss is quadratic in :math:`v`, so this is linear least squares, and `reach` is a linear operator: LSQR of SciPy
-# takes it as it is, with its transpose. Each of its iterations needs one projection forward and one adjoint.
+# The loss is quadratic in :math:`v`, so this is linear least squares, and `reach` is a linear operator that SciPy's
+# LSQR accepts. Each of its iterations needs one forward and one adjoint projection.
 
 fitted = []
 print("LSQR: projections forward and adjoint")
@@ -109,14 +110,13 @@ for pairs in range(2, 7):  # the first adjoint only starts it
 # %%
 # The picture
 # -----------
-# Left: the wind that we set. Middle: what pressure makes of it; this one has no divergence. Right: what was wanted.
-# Most of it cannot be had: it has divergence, and it has eddies, while all that pressure makes on the right is a
-# gradient.
+# Left: the wind that we set. Middle: its projection, which has no divergence. Right: the wanted wind. Most of it cannot
+# be reached: it has divergence and vorticity, while in the right half every reachable wind is a gradient.
 #
 # Exercises
 # ---------
-# 1. Wish for a wind that can be had: take `project(target)` on the right as the target. How far down does the loss go?
-# 2. Open the upper wall: `dp.projection(grid, boundary={"y": (dp.no_slip, dp.outflow)})`. Is the wish nearer now?
+# 1. Use the right half of `project(target)` as the target. How small does the loss become?
+# 2. Open the upper wall: `dp.projection(grid, boundary={"y": (dp.no_slip, dp.outflow)})`. Does the loss become smaller?
 # 3. How many pairs does LSQR need on a grid of 320 cells? Compare with gradient descent.
 
 if options.out:

@@ -80,7 +80,7 @@ def calls_seen() -> Iterator[list[Node]]:
     calls: list[Node] = []
     running: list[Node] = []  # calls whose VJP is running, from outer to inner
 
-    def see(tape_node: Any, *call: Any) -> None:
+    def add_node(tape_node: Any, *call: Any) -> None:
         node = Node(*call)
         pull = tape_node.vjp
         if running:
@@ -89,16 +89,16 @@ def calls_seen() -> Iterator[list[Node]]:
             outer = calls
         outer.append(node)
 
-        def watched(*cotangents: Any) -> Any:
+        def pull_and_nest(*cotangents: Any) -> Any:
             running.append(node)
             try:
                 return pull(*cotangents)
             finally:
                 running.pop()
 
-        tape_node.vjp = watched
+        tape_node.vjp = pull_and_nest
 
-    with witnessed(see):
+    with witnessed(add_node):
         yield calls
 
 

@@ -77,11 +77,11 @@ def jacobians_of(fun: Callable, trees: Sequence, moving: Sequence[bool]) -> tupl
     """
     batched_calls: dict = {}  # node whose own pullback does not accept batched cotangents -> result of `_batched`
 
-    def witness(node: Any, fun: Any, *call: Any) -> None:
+    def add_batched_call(node: Any, fun: Any, *call: Any) -> None:
         if not (node.vjp in by_entry or (node.held and fun in PLACES)):
             batched_calls[node] = _batched(node, fun, *call)
 
-    tapes = [taped(fun, tree, moving, witness) for tree in trees]
+    tapes = [taped(fun, tree, moving, add_batched_call) for tree in trees]
     values = np.array([np.concatenate([*map(np.ravel, tape.values)]) for tape in tapes])
     sizes = [np.size(leaf) for leaf, moves in zip(leaves(trees[0]), moving, strict=True) if moves]
     rows = np.zeros((*values.shape, sum(sizes)))
