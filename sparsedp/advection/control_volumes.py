@@ -81,6 +81,8 @@ class Component(NamedTuple):
         One row of properties for each axis; see `sparsedp.kernels.fluxes`.
     tiles : int
         Number of tiles that the loops run over.
+    work : int
+        Number of values that the loops process: one pass for each axis. Two threads are faster from 512^2 cells on.
     """
 
     field: slice
@@ -90,6 +92,7 @@ class Component(NamedTuple):
     table: NDArray[np.float64]
     axes: NDArray[np.int64]
     tiles: int
+    work: int
 
     @property
     def points(self) -> int:
@@ -98,8 +101,7 @@ class Component(NamedTuple):
 
     def run(self, loop: Any, *args: Any) -> None:
         """Run a compiled loop, a `Kernel`, over all tiles."""
-        work = self.points * len(self.axes)  # one pass for each axis; two threads pay from 512^2 cells on
-        loop.run(self.tiles, work, kernels.threads(), *args)
+        loop.run_all(self.tiles, self.work, kernels.threads, args)
 
     def sides(self, axis: int) -> Sides:
         """Return the sides of all points along an axis."""
@@ -154,6 +156,7 @@ def components(settings: TransportSettings, limited: bool) -> list[Component]:
                 table=np.concatenate(tables).T.copy(),
                 axes=axes,
                 tiles=points // shape[-1] * -(-shape[-1] // TILE),
+                work=points * len(axes),
             )
         )
         field_start = result[-1].field.stop

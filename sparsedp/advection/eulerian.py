@@ -67,6 +67,7 @@ class Eulerian(TransportMethod):
         self.linear = first_order
         self.any_order = first_order
         self.accumulates = self.interpolation is None and _has_compiled_loops()
+        self._new_field = buffers.allocator((settings.space.size,))
 
     @cached_property
     def reference(self) -> SparseReference:
@@ -85,7 +86,7 @@ class Eulerian(TransportMethod):
             invalid = 0.0
             for keep in self.scheme.stages:
                 x = out
-                out = buffers.empty(u.shape, float)
+                out = self._new_field()
                 slopes = self._loops.slopes(x, inflow, partials=False)
                 invalid += self._loops.stage(x, slopes, w, dt, inflow, u, keep, out)
             must_check = invalid or not isfinite(self._unread_sum(v, inflow))
@@ -123,7 +124,8 @@ class Eulerian(TransportMethod):
         velocity_sum: NDArray | None = None,
     ) -> tuple[tuple[Any, ...], bool]:
         """Return the cotangents of the arguments `nums`; see `TransportMethod`."""
-        if not _has_compiled_loops() or any(map(isbox, (g, u, v, dt, inflow))):
+        plain_arrays = type(g) is type(u) is type(v) is type(inflow) is np.ndarray
+        if not _has_compiled_loops() or not plain_arrays or isbox(dt):
             return self.reference.vjp(nums, g, u, v, dt, inflow), False
         w = self.interpolate_velocity(v)
         of_field_wanted = FIELD in nums or INFLOW in nums
@@ -142,8 +144,8 @@ class Eulerian(TransportMethod):
             cotangents[VELOCITY] = self.interpolate_velocity_vjp(of_velocity)
         # The count of non-finite values in the loops omits the contributions of interpolation and slopes.
         counted = self.accumulates and not (self.scheme.limiter and of_field_wanted)
-        finite = counted and isfinite(of_inflow.sum()) and not invalid
-        return tuple(cotangents[num] for num in nums), finite
+        finite = counted and not invalid and (not of_inflow.size or isfinite(of_inflow.sum()))
+        return tuple([cotangents[num] for num in nums]), finite
 
     def _vjp_of_stages(
         self,
@@ -165,7 +167,7 @@ class Eulerian(TransportMethod):
             x = u
             if stages:
                 last = stages[-1]
-                x = buffers.empty(u.shape, float)
+                x = self._new_field()
                 self._loops.stage(last.x, last.slopes, w, dt, inflow, u, last.keep, x)
             stages.append(_Stage(x, self._loops.slopes(x, inflow, partials=True), keep))
         of_inflow = np.zeros(inflow.size)
@@ -181,7 +183,7 @@ class Eulerian(TransportMethod):
                     of_first_field = of_first_field + share
                 g = (1.0 - keep) * g
             if stages or of_field_wanted:
-                of_x = buffers.empty(u.shape, float)
+                of_x = self._new_field()
             else:
                 of_x = EMPTY
             invalid = self._loops.vjp(g, x, slopes, w, dt, inflow, of_x, of_inflow, of_velocity, of_velocity_is_set)
@@ -301,7 +303,7 @@ class CompiledLoops:
             invalid = np.empty(part.tiles)
             inputs = self._inputs(part, u, inflow, w, values, dt)
             part.run(fluxes.stage, *inputs, self.least_weight, first_field[part.field], keep, out[part.field], invalid)
-            total += invalid.sum()
+            total += invalid.sum() if part.tiles > 1 else invalid[0]
         return total
 
     def vjp(
@@ -345,7 +347,7 @@ class CompiledLoops:
                 partials,
                 invalid,
             )
-            total += invalid.sum()
+            total += invalid.sum() if part.tiles > 1 else invalid[0]
             if partials.size and of_u.size:
                 part.run(fluxes.slope_vjp, partials, part.free, part.axes, part_of_u, part_of_inflow)
         return total

@@ -73,6 +73,8 @@ def constant(value: Any) -> Any:
         return value
     if kind is tuple or kind is list:
         return kind(map(constant, value))
+    if kind is dict and not value:  # the options of nearly all calls
+        return {}
     if isinstance(value, dict):
         constants = copy(value)  # keep subclasses such as OrderedDict and defaultdict
         for name, entry in value.items():  # not `update`, because Counter.update adds the values
