@@ -288,7 +288,7 @@ def check_finite(
 def surely_finite(value: Any) -> bool:
     """Test cheaply whether all entries are finite, without a temporary array; may return False if sums overflow."""
     if type(value) is np.ndarray and value.size <= BLOCK and value.dtype == FLOAT:
-        if isfinite(np.vdot(value, value)):  # fast; if a square overflows, the sum below decides
+        if isfinite(np.vdot(value, value)):  # fast and without warnings; if a square overflows, the sum below decides
             return True
     elif type(value) is np.float64:
         return isfinite(value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import autograd.numpy as anp
@@ -43,18 +44,20 @@ def rule_of(method: TransportMethod) -> Rule:
 
         return bound_forward
 
-    flattened: dict[tuple, Any] = {}  # form of the arguments -> result of `_bound_flatten`
+    flatteners: dict[tuple, Callable] = {}  # form of the arguments -> function that flattens such arguments
 
     def vjp(nums, ans, *args):
         form = form_of(args)
-        if form not in flattened:
-            if len(flattened) >= MOST_BOUND:
-                flattened.clear()
-            flattened[form] = _bound_flatten(method, *args)
-        flatten = flattened[form]
+        flatten = flatteners.get(form)
+        if flatten is None:
+            flatten = _bound_flatten(method, *args) or partial(_flatten, method)
+            if len(flatteners) >= MOST_BOUND:
+                flatteners.clear()
+            flatteners[form] = flatten
+        args_are_plain = type(flatten) is not partial  # `_bound_flatten` accepts plain arguments only
 
         def pull(g, *sums):
-            return _pull(method, nums, args, g, sums, flatten)
+            return _pull(method, nums, args, g, sums, flatten, args_are_plain)
 
         return pull
 
@@ -81,18 +84,21 @@ def rule_of(method: TransportMethod) -> Rule:
 
 
 def _pull(
-    method: TransportMethod, nums: Sequence[int], args: tuple, g: Any, sums: tuple, flatten: Callable | None
+    method: TransportMethod,
+    nums: Sequence[int],
+    args: tuple,
+    g: Any,
+    sums: tuple,
+    flatten: Callable,
+    args_are_plain: bool,
 ) -> list:
     """Return the cotangents of the arguments `nums`, in the shapes of these arguments.
 
-    See `Rule` for `sums` and `_bound_flatten` for `flatten`.
+    See `Rule` for `sums`. `flatten` returns the arguments as `_flatten` does.
     """
-    if flatten is None:
-        flat = _flatten(method, *args)
-    else:
-        flat = flatten(*args)
+    flat = flatten(*args)
     g = _flatten_tangent(FIELD, method, g)
-    traced = type(g) is not np.ndarray or (flatten is None and any(map(isbox, flat)))
+    traced = type(g) is not np.ndarray or (not args_are_plain and any(map(isbox, flat)))
     velocity_sum = None
     if sums and not traced and STEP not in nums:
         velocity_sum = _velocity_sum(args, dict(zip(nums, sums)))
