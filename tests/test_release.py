@@ -229,8 +229,16 @@ def test_sdist_and_wheel_are_sound(built):
     assert packed == {path.relative_to(ROOT).as_posix() for path in sources}
     with tarfile.open(sdist) as archive:
         inside = {Path(*Path(name).parts[1:]).as_posix() for name in archive.getnames()}
-    tests = {path.relative_to(ROOT).as_posix() for path in (ROOT / "tests").rglob("*.py")}
-    assert packed | tests | {"README.md", "LICENSE", "CHANGELOG.md", ".ci/run", ".github/workflows/ci.yml"} <= inside
+    folders = ("tests", "examples", "docs", "benchmarks", "recipe", ".github")
+    kept = {
+        path.relative_to(ROOT).as_posix()
+        for folder in folders
+        for kind in ("py", "md", "rst", "yml", "yaml", "css", "png")
+        for path in (ROOT / folder).rglob(f"*.{kind}")
+        if not {"_build", "api", "gallery"} & set(path.relative_to(ROOT).parts)
+    }
+    names = ".gitignore .pre-commit-config.yaml CHANGELOG.md CITATION.cff CONTRIBUTING.md LICENSE README.md setup.cfg"
+    assert packed | kept | {".ci/run", *names.split()} <= inside  # all that the tests of a checkout read
 
 
 @pytest.mark.slow
