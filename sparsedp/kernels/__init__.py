@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import importlib
 import importlib.util
+import math
 import operator
 import os
 from typing import TYPE_CHECKING, Any
@@ -188,11 +189,11 @@ def summed(shape: tuple[int, int, int], axes: Sequence[Tridiagonal | None], shif
     bands = [np.zeros((3, n)) if axis is None else np.stack(axis) for n, axis in zip(shape, axes, strict=True)]
     inner = bands[2][:, 1:-1]
     uniform = (inner == inner[:, :1]).all()
-    rows = shape[0] * shape[1]
+    loop = bound("stencil", "kronecker_sum", shape[0] * shape[1], math.prod(shape))
 
-    def act(u, out, *_):
+    def act(u, out, accumulate=False):
         fields = u.reshape(shape), out.reshape(shape)
-        if u.size and not run("stencil", "kronecker_sum", rows, u.size, threads(), *fields, *bands, uniform, shift):
+        if u.size and not loop(*fields, *bands, uniform, shift):
             reference.kronecker_sum(*fields, axes, shift)
 
     return act

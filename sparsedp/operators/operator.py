@@ -178,7 +178,10 @@ class Operator(Frozen, Reconstructible):
             return self.bound(u)(u)
         lead = self._batch_shape(u)
         check_out(self, out, u, result_dtype(self.structure, u.dtype), lead + self.codomain.shape)
-        _apply_to_batch(self._acting, prod(lead), u, out)
+        count = prod(lead)
+        rows, columns = self.shape
+        for field, result in zip(u.reshape(count, columns), out.reshape(count, rows), strict=True):
+            self._acting.apply(field, result)
         return out
 
     def bound(self, u: Any) -> Callable[[Any], Any]:
@@ -212,10 +215,11 @@ class Operator(Frozen, Reconstructible):
 
     def _bind(self, lead, dtype):
         """Return the function for arrays of this dtype with leading axes of shape `lead`. It must not refer to self."""
-        acting = self._acting
         shape = lead + self.codomain.shape
-        write, zeros = acting.bound(dtype)
-        new_array = buffers.allocator(shape, result_dtype(self.structure, dtype), zeros and not lead)
+        count = prod(lead)
+        rows, columns = self.shape
+        write, zeros = self._acting.bound(dtype)
+        new_array = buffers.allocator(shape, result_dtype(self.structure, dtype), zeros)
 
         def apply_to_flat(u):
             out = new_array()
@@ -229,7 +233,8 @@ class Operator(Frozen, Reconstructible):
 
         def apply_to_batch(u):
             out = new_array()
-            _apply_to_batch(acting, prod(lead), u, out)
+            for field, result in zip(u.reshape(count, columns), out.reshape(count, rows), strict=True):
+                write(field, result)
             return out
 
         if lead:
@@ -469,13 +474,6 @@ class Operator(Frozen, Reconstructible):
             if matrix.nnz:
                 entries["where"] = spy(matrix)
         return facts(self.name, entries)
-
-
-def _apply_to_batch(structure, count, u, out):
-    """Apply a structure to an array of `count` fields, and write the results into `out`."""
-    rows, columns = structure.shape
-    for field, result in zip(u.reshape(count, columns), out.reshape(count, rows), strict=True):
-        structure.apply(field, result)
 
 
 def _with_matrix(matrix, *arguments):

@@ -71,6 +71,9 @@ def remainder(b: np.ndarray, out: np.ndarray, x: np.ndarray) -> tuple[float, flo
     residual_squares = 0.0
     solution_squares = 0.0
     with np.errstate(over="ignore", invalid="ignore"):  # the caller tests for NaN and infinity
+        if b.size <= BLOCK:
+            np.subtract(b, out, out=out)
+            return norm(out), norm(x)
         for start in range(0, b.size, BLOCK):
             block = slice(start, start + BLOCK)
             residual = out[block]

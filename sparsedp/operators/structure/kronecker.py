@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from sparsedp import kernels
 from sparsedp.grid.space import components
-from sparsedp.operators.structure.base import Structure, compact
+from sparsedp.operators.structure.base import BoundProduct, Structure, compact
 from sparsedp.operators.structure.factor import Factor
 
 if TYPE_CHECKING:
@@ -198,12 +198,30 @@ class Kronecker(Structure):
 
     def act(self, x: NDArray, out: NDArray) -> None:
         """Write A x into `out`: see `Structure.act`."""
+        if self._only_step is not None:
+            self._only_step(x, out, False)
+            return
         inputs = components(x, self.in_parts)
         for steps, target in zip(self._plan, components(out, self.out_parts)):
             if not steps:
                 target[...] = 0
             for number, (column, step) in enumerate(steps):
                 step(inputs[column], target, number > 0)
+
+    def bound(self, dtype: np.dtype) -> BoundProduct:
+        """Return the product with arrays of this dtype: see `Structure.bound`."""
+        if not dtype == self.dtype == float:
+            return super().bound(dtype)
+        if self._only_step is not None:
+            return BoundProduct(partial(self._only_step, accumulate=False))
+        return BoundProduct(self.act)
+
+    @cached_property
+    def _only_step(self):
+        """The function ``run(x, out, accumulate)`` of flat arrays that computes the whole product, or None."""
+        if len(self._plan) == len(self.in_parts) == 1 and len(self._plan[0]) == 1:
+            return self._plan[0][0][1]
+        return None
 
     @cached_property
     def _plan(self):
