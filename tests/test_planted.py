@@ -438,6 +438,37 @@ BUGS = {
         "        self.unclamped *= 1.0\n",
         "tests/advection/test_semi_lagrangian.py",
     ),
+    "a displacement with the time step of the call before": Bug(
+        "advection/index_coordinates.py",
+        "        if last_step != step:\n",
+        "        if last_step == 0.0:\n",
+        "tests/advection/test_bound_rules.py",
+    ),
+    "a bound rule that takes arguments of another shape": Bug(
+        "autodiff/tape.py",
+        "            form.append((value.shape, value.dtype, value.flags.c_contiguous))\n",
+        "            form.append((value.ndim, value.dtype, value.flags.c_contiguous))\n",
+        "tests/advection/test_bound_rules.py",
+    ),
+    "a bound rule that takes strided arguments": Bug(
+        "autodiff/tape.py",
+        "            form.append((value.shape, value.dtype, value.flags.c_contiguous))\n",
+        "            form.append((value.shape, value.dtype))\n",
+        "tests/advection/test_bound_rules.py",
+        compiled=True,
+    ),
+    "ghost cells added before the cell itself": Bug(
+        "advection/interpolant.py",
+        "order = np.concatenate([np.flatnonzero(~is_ghost), self._ghosts])",
+        "order = np.concatenate([self._ghosts, np.flatnonzero(~is_ghost)])",
+        "tests/advection/test_bound_rules.py",
+    ),
+    "a matrix product added to what the memory held": Bug(
+        "operators/operator.py",
+        "buffers.allocator(shape, result_dtype(self.structure, dtype), zeros)",
+        "buffers.allocator(shape, result_dtype(self.structure, dtype), False)",
+        "tests/operators/test_bound.py",
+    ),
     # ---- flow, integrators, trajectory
     "a flow step that forgets the acceleration before": Bug(
         "flow",

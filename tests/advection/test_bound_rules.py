@@ -51,6 +51,29 @@ def test_cotangents_do_not_depend_on_the_layout_of_arguments(scheme, rng):
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
+def test_other_forms_after_the_bound_one(scheme, rng):
+    """Other shapes are refused, other layouts and dtypes converted."""
+    move = dp.transport(GRIDS[1], scheme, velocity="cells")
+    u, v, dt, _ = arguments(move, rng)
+    wanted = move(u, v, dt)
+    with pytest.raises(dp.errors.ShapeError, match="takes u of shape"):
+        move(u.T.copy(), v, dt)
+    with pytest.raises(dp.errors.ShapeError, match="takes v of shape"):
+        move(u, v[:1], dt)
+    np.testing.assert_array_equal(move(np.asfortranarray(u), v, dt), wanted)
+    np.testing.assert_array_equal(move(u, np.asfortranarray(v), np.float64(dt)), wanted)
+    np.testing.assert_array_equal(move(u.astype(">f8"), v, dt), wanted)
+    assert move(u.astype("f4"), v, dt).dtype == np.float32
+    assert not np.shares_memory(move(u, 0.0 * v, dt), u)
+    move = dp.transport(GRIDS[0], scheme, velocity="cells")
+    u, v, dt, _ = arguments(move, rng)
+    wanted = move(u, v, dt)
+    np.testing.assert_array_equal(move(np.repeat(u, 2)[::2], np.repeat(v, 2, axis=-1)[..., ::2], dt), wanted)
+    np.testing.assert_array_equal(move(u, v[0], dt), wanted)
+    np.testing.assert_array_equal(move(u, np.repeat(v[0], 2)[::2], dt), wanted)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
 def test_values_are_checked_in_every_call(scheme, rng):
     move = dp.transport(GRIDS[1], scheme, dp.dirichlet, velocity="cells")
     u, v, dt, inflow = arguments(move, rng)

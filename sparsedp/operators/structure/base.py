@@ -222,6 +222,12 @@ class Transposable(Structure):
         self.shape = shape
         self.transposed = transposed
 
+    def bound(self, dtype: np.dtype) -> BoundProduct:
+        """Return the product with arrays of this dtype: see `Structure.bound`."""
+        if dtype == self.dtype == float:
+            return BoundProduct(self.act)
+        return super().bound(dtype)
+
     def transpose(self) -> Structure:
         """Return the plain transpose."""
         rows, columns = self.shape
