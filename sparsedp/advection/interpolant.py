@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 
 __all__ = ["InterpolatedComponent", "Interpolant"]
 
-GATHER_BELOW = 8192  # number of samples up to which one gather is faster than copies of blocks
+# Numbers of samples up to which gathers of single entries are faster than copies of blocks.
+GATHER_BELOW = 4096
+GATHER_SUMS_BELOW = 512
 
 
 class Interpolant:
@@ -66,8 +68,10 @@ class Interpolant:
         inflow_values = 0 if closed else wall_space(settings).size
         self.new_samples = buffers.allocator((self.points.samples + inflow_values,), filled=True)  # new zeros
         self._gathered = None
+        self._scattered: tuple[NDArray, NDArray] | None = None
         if self.points.samples <= GATHER_BELOW:
             self._gathered = self._indices_of_samples(inflow_values)
+        if self._gathered is not None and self.points.samples <= GATHER_SUMS_BELOW:
             is_ghost = np.zeros(self._gathered.size, bool)
             is_ghost[self._ghosts] = True
             order = np.concatenate([np.flatnonzero(~is_ghost), self._ghosts])
@@ -122,14 +126,14 @@ class Interpolant:
         The cotangent `samples` is overwritten.
         """
         cells = self.points.samples
-        if self._gathered is not None:  # the same sums in the same order: each sample after the one in its own place
+        if self._scattered is not None:  # the same sums in the same order: each sample after the one in its own place
             order, targets = self._scattered
             sums = np.bincount(targets, samples.take(order), of_u.size + of_inflow.size)
             of_u[:] = sums[: of_u.size]
             if of_inflow.size:
                 of_inflow += sums[of_u.size :]
             return
-        np.add.at(samples, self._sources, samples[self._ghosts])
+        np.add.at(samples, self._sources, samples.take(self._ghosts))
         of_u.reshape(self.points.shape)[...] = samples[:cells].reshape(self.points.padded)[self._inside]
         of_inflow += samples[cells:]
 

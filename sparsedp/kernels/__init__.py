@@ -132,10 +132,7 @@ def run(module: str, name: str, rows: int, work: int, threads: int, *args: Any) 
     if not compiled():
         return False
     loop = getattr(_import_module(f"{__name__}.{module}"), name)
-    if not loop.compiled:
-        return False
-    loop.run(rows, work, threads, *args)
-    return True
+    return loop.run_all(rows, work, threads, args)
 
 
 def bound(module: str, name: str, rows: int, work: int, most_threads: int | None = None) -> Callable[..., bool]:

@@ -97,6 +97,7 @@ def test_large_fields_are_padded_with_the_same_values(scheme, monkeypatch, rng):
         results = []
         for limit in (0, 10**6):
             monkeypatch.setattr("sparsedp.advection.interpolant.GATHER_BELOW", limit)
+            monkeypatch.setattr("sparsedp.advection.interpolant.GATHER_SUMS_BELOW", limit)
             move = dp.transport(grid, scheme, dp.dirichlet, velocity="cells", backtrace="midpoint")
             args = arguments(move, np.random.default_rng(1))
             results.append((move._rule(*args), *move._rule.vjp((0, 1, 3), None, *args)(np.cos(args[0]))))
