@@ -287,7 +287,7 @@ def test_a_traceback_shows_the_frames_of_the_user(name, monkeypatch):
     assert inside[-1].endswith("solve.py") and frames[0] == __file__
     monkeypatch.setenv("SPARSEDP_TRACEBACK", "full")
     whole = frames_of(call)
-    assert len(whole) >= len(frames) + 5
+    assert len(whole) >= len(frames) + 4  # the hidden frames of `solve`, whose path is the shortest
     assert [file for file in whole if file == __file__] == [file for file in frames if file == __file__]
 
 
