@@ -111,10 +111,12 @@ def _pull(
             # The sum may have been infinite before this step: check only the cotangent of this step.
             of_velocity = method.vjp((VELOCITY,), g, *flat)[0][0]
             _check_derivative(method, "the gradient in v", of_velocity, (g,))
+    if velocity_sum is None and (finite or all(map(surely_finite, map(plain, cotangents)))):
+        return [_unflatten(args[num], cotangent) for num, cotangent in zip(nums, cotangents, strict=True)]
     results = []
     for position, (num, cotangent) in enumerate(zip(nums, cotangents, strict=True)):
         accumulated = velocity_sum is not None and cotangent is velocity_sum
-        if not finite and not accumulated and not surely_finite(cotangent):
+        if not finite and not accumulated:
             _check_derivative(method, f"the gradient in {ARGUMENTS[num]}", cotangent, (g,))
         results.append(sums[position] if accumulated else _unflatten(args[num], cotangent))
     return results

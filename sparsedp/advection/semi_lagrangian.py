@@ -110,6 +110,8 @@ class SemiLagrangian(TransportMethod):
 
     def _split_velocity(self, w: NDArray) -> list[NDArray]:
         """Return, for each component, the velocities at its points as an array (axis, point)."""
+        if len(self._velocity_parts) == 1:
+            return [w.reshape(self._velocity_parts[0][1])]
         return [w[span].reshape(shape) for span, shape in self._velocity_parts]
 
     def _steps(self, u: NDArray, v: NDArray, dt: float, inflow: NDArray) -> Iterator[tuple[slice, Any]]:
@@ -117,10 +119,10 @@ class SemiLagrangian(TransportMethod):
 
         A generator, so that the memory of a step is free before the next one is computed.
         """
-        w = self.interpolate_velocity(v)
-        for component, (part, shape) in zip(self.components, self._velocity_parts):
+        velocities = self._split_velocity(self.interpolate_velocity(v))
+        for component, w in zip(self.components, velocities):
             span = component.span
-            yield span, self.component_step(component, w[part].reshape(shape), dt, u[span], inflow)
+            yield span, self.component_step(component, w, dt, u[span], inflow)
 
     def _keep_solid(self, result: NDArray, u: NDArray) -> NDArray:
         """Set the points of `result` inside the solid to the values of u, and return `result`."""
