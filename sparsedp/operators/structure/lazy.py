@@ -117,7 +117,8 @@ class Chain(Structure):
 
     def bound(self, dtype: np.dtype) -> BoundProduct:
         """Return the product with arrays of this dtype: see `Structure.bound`."""
-        if not dtype == self.dtype == float or self.shape[1] >= FUSED_FROM:
+        is_large = self.shape[1] >= FUSED_FROM
+        if not dtype == self.dtype == float or (is_large and self._fused is not None):
             return super().bound(dtype)
         inner = [_allocated(member) for member in self.members[:0:-1]]
         last = self.members[0].bound(dtype)
