@@ -10,6 +10,7 @@ from .autodiff.derivative import jvp as jvp
 from .autodiff.derivative import value_and_grad as value_and_grad
 from .autodiff.derivative import vjp as vjp
 from .autodiff.flattening import flatten as flatten
+from .autodiff.jit import jit as jit
 from .autodiff.tape import differentiable as differentiable
 from .flow.finite_volumes import conservation_law as conservation_law
 from .flow.flow_step import flow_step as flow_step

@@ -14,6 +14,8 @@ __all__ = [
     "DerivativeError",
     "GrowthWarning",
     "IncompatibleError",
+    "JitError",
+    "JitWarning",
     "NonFiniteError",
     "NonFiniteGradientWarning",
     "ShapeError",
@@ -40,6 +42,14 @@ class UnstableStepError(SparsedpError, ValueError):
 
 class DerivativeError(SparsedpError, TypeError):
     """A derivative does not exist, or a user-defined rule returned a derivative of the wrong shape or type."""
+
+
+class JitError(SparsedpError, TypeError):
+    """`dp.jit` cannot record a function, or its program differs from the function."""
+
+
+class JitWarning(UserWarning):
+    """A jitted function was recorded for many forms of its arguments, so that most of its time goes into recording."""
 
 
 class GrowthWarning(UserWarning):

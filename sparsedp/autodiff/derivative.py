@@ -38,6 +38,7 @@ from sparsedp.autodiff.tape import (
     isbox,
     new_trace,
     plain,
+    sample,
     split_boxes,
 )
 from sparsedp.autodiff.tape_constants import is_fixed
@@ -189,6 +190,9 @@ def value_and_grad(loss: Callable, argnum: int = 0) -> Callable[..., tuple[Any, 
 
 def _value_and_gradient(loss, argnum, args):
     """Return the value of a loss, and its gradient with respect to the argument at position `argnum`."""
+    jitted = getattr(loss, "jitted_value_and_grad", None)
+    if jitted is not None and not any(map(isbox, leaves(args))):
+        return _by_program(loss, jitted, argnum, args)
 
     def of_argument(x):
         return loss(*args[:argnum], x, *args[argnum + 1 :])
@@ -213,12 +217,23 @@ def _value_and_gradient(loss, argnum, args):
     return float(value), gradient
 
 
+def _by_program(loss, jitted, argnum, args):
+    """Return the value and the gradient of a jitted loss, see `jit`."""
+    value, gradient = jitted(argnum)(*args)
+
+    def again():
+        return _value_and_gradient(loss.function, argnum, args)
+
+    _warn_unless_finite("value_and_grad", gradient, again)
+    return float(value), mapped(_as_leaf, gradient, args[argnum])
+
+
 def check_loss(value: Any) -> None:
     """Raise ShapeError or DerivativeError if the value of a loss, traced or not, is not one real number."""
     if keys(value) is not None:
         raise ShapeError(f"the loss must be a scalar, got a {type(value).__name__}; return one number")
-    if np.shape(plain(value)) != ():
-        raise ShapeError(f"the loss must be a scalar, got an array of shape {np.shape(plain(value))}; sum it")
+    if np.shape(sample(value)) != ():
+        raise ShapeError(f"the loss must be a scalar, got an array of shape {np.shape(sample(value))}; sum it")
     if dtype_of(value).kind == "c":
         raise DerivativeError("the loss must be real, got a complex number; take its real part or its absolute value")
 
@@ -279,7 +294,7 @@ def vjp(fun: Callable, *x: Any) -> tuple[Any, Callable]:
     def back(g):
         check_precision("the cotangent", g)
         slopes = collectively("the function of vjp", (g,), pull, g)
-        if is_finite(g):
+        if not isbox(g) and is_finite(g):
             _warn_unless_finite("vjp", slopes, lambda: pullback(of_tuple, x)[1](g))
         if len(x) == 1:
             return slopes[0]
@@ -338,7 +353,7 @@ def pullback(fun: Callable, x: Any) -> tuple[Any, Callable]:
         raise DerivativeError(f"a gradient needs floating values, got {', '.join(kinds) or 'nothing'}; write {advice}")
     tape = taped(fun, rebuild(entries), moving)
     value = tape.rebuild(tape.values)
-    if not is_field(plain(value)):
+    if not is_field(sample(value)):
         raise DerivativeError(
             f"the function must return one array or number, got {type(value).__name__}; sum or join it"
         )
@@ -357,7 +372,7 @@ def pullback(fun: Callable, x: Any) -> tuple[Any, Callable]:
 def gradient_of(leaf: Any, cotangent: Any) -> Any:
     """Convert a cotangent to the shape, dtype and type of a leaf; return zeros if the cotangent is None."""
     if cotangent is None:
-        return _as_leaf(anp.zeros_like(plain(leaf)), leaf)
+        return _as_leaf(anp.zeros_like(sample(leaf)), leaf)
     check_shape("the gradient", cotangent, np.shape(leaf), SPREAD)
     return _as_leaf(fit("the gradient", leaf, cotangent, cotangent), leaf)
 
@@ -602,6 +617,9 @@ def hvp(loss: Callable, x: Any, tangent: Any) -> Any:
     >>> hvp(lambda x: x[0] ** 2 * x[1], (2.0, 5.0), (1.0, 0.0))
     (10.0, 4.0)
     """
+    jitted = getattr(loss, "jitted_hvp", None)
+    if jitted is not None and not any(map(isbox, leaves((x, tangent)))):
+        return mapped(_as_leaf, jitted(x, tangent), x)
     return mapped(_as_leaf, _jvp("hvp", grad(loss), x, tangent)[1], x)
 
 
@@ -617,7 +635,7 @@ def _jvp(name, fun, x, tangent):
         tape = taped(fun, x, [direction is not None for direction in tangents])
         tape.pull([np.ones_like(value) if is_variable(value) else None for value in tape.values])
 
-    if all(is_finite(direction) for direction in tangents if direction is not None):
+    if all(not isbox(direction) and is_finite(direction) for direction in tangents if direction is not None):
         _warn_unless_finite(name, results[1], again)
     return copied(results)  # the caller may write into x, the tangent and the results
 
@@ -648,7 +666,7 @@ def _directions(x, tangent):
             tangents[number] = None
             continue
         direction = tangents[number]
-        if not (is_field(plain(direction)) and np.shape(direction) == np.shape(leaf)):
+        if not (is_field(sample(direction)) and np.shape(direction) == np.shape(leaf)):
             path = labels(x, "tangent")[number]
             raise ShapeError(f"{path}: expected {described(leaf)}, got {described(direction)}; give a tangent like x")
     return tangents
@@ -701,7 +719,7 @@ def tangent_of(value: Any, slope: Any) -> Any:
 
 def zero_like(value: Any) -> Any:
     """Return plain zeros of the shape and dtype of a value, traced or not."""
-    return np.zeros(np.shape(plain(value)), dtype_of(value))[()]
+    return np.zeros(np.shape(sample(value)), dtype_of(value))[()]
 
 
 def _twice_reverse(fun, tree, tangents):
@@ -727,7 +745,7 @@ def _twice_reverse(fun, tree, tangents):
 
 def _random_like(value):
     """Return random numbers of the shape and dtype of a value, the same in every run."""
-    numbers = np.random.default_rng(0).uniform(0.5, 1.5, np.shape(plain(value)))
+    numbers = np.random.default_rng(0).uniform(0.5, 1.5, np.shape(sample(value)))
     return np.asarray(numbers, dtype_of(value))[()]
 
 

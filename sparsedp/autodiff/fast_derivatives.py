@@ -16,6 +16,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.autodiff.backend import BOX, as_field, formulas_of_kind
+from sparsedp.autodiff.program_trace import is_recorded, sample
 from sparsedp.errors import DerivativeError
 
 if TYPE_CHECKING:
@@ -192,14 +193,20 @@ def _entrywise(*slopes):
     by_entry.update(pull for pull, _ in pulls.values())
 
     def backward(value, nums, args):
+        forms = args
+        if type(value) is BOX:
+            if not is_recorded(value):
+                return None
+            value = value._value
+            forms = list(map(sample, args))
         if type(value) in SCALARS:
             for num in nums:
-                if type(args[num]) not in SCALARS:
+                if type(forms[num]) not in SCALARS:
                     return None
         elif type(value) is np.ndarray and value.dtype is FLOAT:
             shape = value.shape
             for num in nums:
-                arg = args[num]
+                arg = forms[num]
                 if type(arg) is not np.ndarray or arg.dtype is not FLOAT or arg.shape != shape:
                     return None
         else:
@@ -225,7 +232,9 @@ def _entrywise(*slopes):
 
 
 def _is_real(value):
-    """Return True for a float64 number or array."""
+    """Return True for a float64 number or array, plain or recorded in a program."""
+    if type(value) is BOX and is_recorded(value):
+        value = value._value
     return type(value) is np.float64 or (type(value) is np.ndarray and value.dtype is FLOAT)
 
 

@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import inspect
 from contextlib import contextmanager
-from functools import cached_property, wraps
+from functools import cached_property, partial, wraps
 from itertools import count as count_from
+from operator import getitem
 from typing import TYPE_CHECKING, Any
 
 import autograd.numpy as anp
@@ -23,7 +24,7 @@ import numpy as np
 from autograd.core import JVPNode, VJPNode, add_outgrads, primitive_jvps, primitive_vjps
 from autograd.extend import VSpace, defjvp, defjvp_argnums, defvjp, defvjp_argnums, primitive
 from autograd.numpy.numpy_vjps import match_complex, replace_zero, unbroadcast_f
-from autograd.tracer import Node, box_types, getval, isbox, new_box, notrace_primitives, trace_stack
+from autograd.tracer import Node, box_types, isbox, new_box, notrace_primitives, trace_stack
 
 from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.counters import active, count, note, thread, timed
@@ -54,8 +55,17 @@ from sparsedp.autodiff.fast_derivatives import (
     power_slope,
     refuse_options,
 )
+from sparsedp.autodiff.program_trace import (
+    ProgramNode,
+    is_recorded,
+    open_traces,
+    plain,
+    recorded_level,
+    recording_trace,
+    sample,
+)
 from sparsedp.autodiff.tape_constants import FIXED, constant, constant_args, frozen, sparing
-from sparsedp.errors import DerivativeError, ShapeError
+from sparsedp.errors import DerivativeError, JitError, ShapeError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -77,14 +87,20 @@ __all__ = [
     "cast",
     "differentiable",
     "dtype_of",
+    "executed_function",
     "fit",
     "forward_root",
     "innermost",
+    "is_fresh",
     "is_variable",
     "isbox",
     "linear",
     "new_trace",
+    "is_recorded",
     "plain",
+    "recorded_level",
+    "recording_trace",
+    "sample",
     "split_boxes",
     "through",
     "traces_of",
@@ -92,7 +108,6 @@ __all__ = [
     "untraced",
 ]
 
-plain = getval  # the value below all boxes
 # Function of autograd -> function whose derivatives are used instead of those of autograd, on traces of this module.
 underflow_safe: dict[Callable, Callable] = {}
 
@@ -312,7 +327,11 @@ class ReverseNode(VJPNode):
         if len(nums) < len(args) and function not in sparing:
             args = constant_args(args, nums)
         known = underflow_safe.get(function, function)
-        self.vjp = VJPNode(value, known, args, constant(options), nums, ()).vjp
+        options = constant(options)
+        if function not in (_primitive, _operator, through) and _is_program_level((value, *args)):
+            self.vjp = _recorded_pullback_of_autograd(value, known, args, options, nums)
+        else:
+            self.vjp = VJPNode(value, known, args, options, nums, ()).vjp
         self.held = ()
         if function is _primitive and args[0].adds:
             self.held = SUMS
@@ -328,7 +347,7 @@ class ReverseNode(VJPNode):
         pull = self.vjp
         is_real = []
         for num in nums:
-            x = plain(args[num])
+            x = sample(args[num])
             is_real.append(is_variable(x) and dtype_of(x).kind != "c")
 
         def real_pull(g):
@@ -390,7 +409,7 @@ def _kind(function, value, args, nums):
     autograd does not trace values inside a list. The result is then an array of objects or, as in a product of two
     vectors, one traced value.
     """
-    kind = getattr(plain(value), "dtype", FLOAT).kind
+    kind = getattr(sample(value), "dtype", FLOAT).kind
     hidden = kind == "O"
     if isbox(value) and not hidden:
         constants = [arg for num, arg in enumerate(args) if num not in nums and type(arg) in (list, tuple)]
@@ -409,7 +428,7 @@ untraced[UntapedNode] = untraced[VJPNode]
 untraced[ForwardNode] = untraced[JVPNode]
 untaped_root = UntapedNode.new_root
 forward_root = ForwardNode.new_root  # begins a forward-mode trace with its tangent
-OWN_NODES = {ReverseNode, UntapedNode, ForwardNode}
+OWN_NODES = {ReverseNode, UntapedNode, ForwardNode, ProgramNode}
 
 
 # Returns the number of a new trace, which is unique and larger than the numbers of the traces around it.
@@ -529,6 +548,8 @@ def backward(nodes: Sequence[ReverseNode], ends: Sequence, cotangents: Sequence,
                 sums[parent] = added(total, g)
 
 
+# Exceptions of pullbacks of autograd that use NumPy's own functions.
+UNTRACEABLE = (AttributeError, IndexError, JitError, TypeError, ValueError)
 # Value of `held` for a call whose pullback is called as ``pull(g, *sums)``, see `Rule.adds`.
 SUMS: tuple = Part()
 
@@ -567,6 +588,8 @@ def added(total: tuple | None, g: Any) -> tuple:
     kind = type(g)
     if kind is Part:
         return _add_part(total, g)
+    if open_traces and recording_trace((g, total and total[0])) is not None:
+        return _add_recorded(total, g)
     if total is None or kind is not type(total[0]) or kind not in NUMBERS or total[0].dtype != g.dtype:
         return add_outgrads(total, g)
     if kind is np.float64:
@@ -576,16 +599,40 @@ def added(total: tuple | None, g: Any) -> tuple:
     return np.add(total[0], g), True
 
 
+def _add_recorded(total, g):
+    """Add a cotangent to a sum of cotangents, one of which belongs to a program."""
+    if total is None:
+        return add_outgrads(None, g)[0], False
+    if type(g) is BOX:
+        return total[0] + g, True
+    return add_outgrads((total[0], False), g)[0], False
+
+
+def _add_at(total, g, index):
+    """Add g to the entries of an array at an index, in place."""
+    total[index] += g
+    return total
+
+
 def _add_part(total, part):
     """Add the cotangent of an entry or part of an array to a sum of cotangents of the array."""
     g, index, _ = part
+    if (
+        total is not None
+        and total[1]
+        and type(total[0]) is BOX
+        and is_recorded(total[0])
+        and not (isbox(g) and not is_recorded(g))
+    ):
+        trace = total[0]._node.trace
+        return trace.box(trace.call(_add_at, total[0]._node.slot, trace.unboxed(g), index)), True
     if total is not None and total[1] and type(total[0]) is np.ndarray and type(g) in REAL:
         total[0][index] += g
         return total
     whole = _whole(*part)
     if total is not None:
         whole = total[0] + whole
-    return whole, type(whole) is np.ndarray
+    return whole, type(whole) is np.ndarray or is_recorded(whole)
 
 
 def _whole(g, index, shape):
@@ -598,6 +645,9 @@ def _whole(g, index, shape):
 
     if not isbox(g):
         return around(g)
+    if is_recorded(g):
+        trace = g._node.trace
+        return trace.box(trace.call(around, g._node.slot))
     embed, _ = linear("entries", around, lambda whole: whole[index])
     return embed(g)
 
@@ -688,9 +738,15 @@ def _binary(function):
             nums = SECOND
             parents = (node,)
         if type(a) is BOX or type(b) is BOX:
-            return function(x, y)
-        answer = quick(a, b) if type(a) in NUMBERS or type(b) in NUMBERS else raw(a, b)
-        node = type(node)(answer, function, (a, b), {}, nums, parents)
+            answer = call(a, b)
+            executed = function
+        else:
+            executed = quick if type(a) in NUMBERS or type(b) in NUMBERS else raw
+            answer = executed(a, b)
+        if type(node) is ProgramNode:
+            node = ProgramNode(answer, executed, (a, b), {}, nums, parents)
+        else:
+            node = type(node)(answer, function, (a, b), {}, nums, parents)
         return BOX(answer, trace, node) if type(answer) in NUMBERS else new_box(answer, trace, node)
 
     return call
@@ -866,10 +922,13 @@ class Rule(Reconstructible):
     bind : callable or None
         ``bind(*values)`` returns the function for `bound`, which returns what `forward` returns, bit for bit. None
         stands for `forward` itself.
+    accepts_traced : bool
+        Whether the functions of the rule accept traced values of outer traces, see `through`.
     """
 
     adds = False
     bind: Callable | None = None
+    accepts_traced = False
 
     def __init__(
         self,
@@ -994,7 +1053,10 @@ def _call_vjp(argnums, ans, args, options):
     values = constant_args(args[1:], nums)
     if active:
         _note_not_asked(rule, nums, values)
-    pull = rule.vjp(nums, ans, *values)
+    if not rule.accepts_traced and _is_program_level((ans, *values)):
+        pull = _recorded_pullback(rule, nums, ans, values)
+    else:
+        pull = rule.vjp(nums, ans, *values)
 
     def checked_pull(g, *sums):
         cotangents = timed(rule.name, "vjp", pull, g, *sums)
@@ -1013,6 +1075,63 @@ def _call_vjp(argnums, ans, args, options):
     return checked_pull
 
 
+def _is_program_level(values):
+    """Return True if some values belong to a program, and none to a trace above it."""
+    levels = [is_recorded(value) for value in values if type(value) in box_types]
+    return bool(levels) and all(levels)
+
+
+def _recorded_pullback(rule, nums, ans, values):
+    """Return the pullback of a call of a rule while `dp.jit` records: a call of the program."""
+    trace = recording_trace((ans, *values))
+    pull = trace.call(partial(rule.vjp, nums), *map(trace.unboxed, (ans, *values)))
+
+    def recorded_pull(g, *sums):
+        if isbox(g) and not is_recorded(g):  # a derivative of the derivative
+            return rule.vjp(nums, ans, *values)(g, *sums)
+        cotangents = trace.call(_pulled, pull, trace.unboxed(g), *[None] * len(sums))
+        returned = trace.sample(cotangents)
+        if not isinstance(returned, (tuple, list)):
+            return returned
+        return [trace.box(trace.call(getitem, cotangents, place)) for place in range(len(returned))]
+
+    return recorded_pull
+
+
+def _pulled(pull, g, *sums):
+    return pull(g, *sums)
+
+
+def _recorded_pullback_of_autograd(value, function, args, options, nums):
+    """Return the pullback of a call of a function of autograd while `dp.jit` records.
+
+    The calls inside the pullback are recorded. If it cannot be traced, the whole pullback is one call of the program.
+    """
+    trace = recording_trace((value, *args))
+
+    def as_one_call(g):
+        slots = map(trace.unboxed, (g, value, *args))
+        cotangents = trace.call(partial(_pulled_by_autograd, function, options, tuple(nums)), *slots)
+        return [trace.box(trace.call(getitem, cotangents, place)) for place in range(len(nums))]
+
+    try:
+        pull = VJPNode(value, function, args, options, nums, ()).vjp
+    except UNTRACEABLE:
+        return as_one_call
+
+    def traced_pull(g):
+        try:
+            return pull(g)
+        except UNTRACEABLE:
+            return as_one_call(g)
+
+    return traced_pull
+
+
+def _pulled_by_autograd(function, options, nums, g, value, *args):
+    return tuple(VJPNode(value, function, args, options, nums, ()).vjp(g))
+
+
 def _note_not_asked(rule, nums, values):
     """Note in the counters which arguments of a rule could have a derivative, but are not traced."""
     names = list(rule._signature.parameters)
@@ -1029,10 +1148,21 @@ def _call_jvp(argnums, tangents, ans, args, options):
     if any(map(isbox, (*tangents, *args))):  # inside a reverse-mode trace: the pullback runs later and needs copies
         args = constant_args(args, argnums)
     count(rule.name, "jvp")
-    tangent = rule.jvp(tuple(num - 1 for num in argnums), tangents, ans, *args[1:])
-    if isinstance(plain(ans), tuple):  # rules with several results check the tangents themselves
+    nums = tuple(num - 1 for num in argnums)
+    given = (*tangents, ans, *args[1:])
+    if not rule.accepts_traced and _is_program_level(given):
+        trace = recording_trace(given)
+        tangent = trace.box(trace.call(partial(_pushed, rule, nums), *map(trace.unboxed, given)))
+    else:
+        tangent = rule.jvp(nums, tangents, ans, *args[1:])
+    if isinstance(sample(ans), tuple):  # rules with several results check the tangents themselves
         return tangent
     return fit(rule.name, ans, tangent, tangents[0])
+
+
+def _pushed(rule, nums, *given):
+    """Call the JVP of a rule with the tangents of the arguments `nums`, the result and the arguments."""
+    return rule.jvp(nums, given[: len(nums)], *given[len(nums) :])
 
 
 defvjp_argnums(_primitive, _call_vjp)
@@ -1067,11 +1197,11 @@ def fit(name: str, value: Any, cotangent: Any, g: Any) -> Any:
     if isinstance(cotangent, list):
         cotangent = np.asarray(cotangent)
     cotangent = match_value(cotangent, value)
-    shape = np.shape(plain(cotangent))
-    expected_shape = np.shape(plain(value))
+    shape = np.shape(sample(cotangent))
+    expected_shape = np.shape(sample(value))
     if shape != expected_shape:
         raise ShapeError(f"{name} returned a derivative of shape {shape} where {expected_shape} is needed")
-    if type(cotangent) is np.ndarray and not isinstance(plain(value), np.ndarray):
+    if type(cotangent) is np.ndarray and not isinstance(sample(value), np.ndarray):
         cotangent = cotangent[()]  # the value is a number, so return a NumPy scalar and not a 0-d array
     dtype = dtype_of(cotangent)
     precise = dtype_of(value)
@@ -1080,7 +1210,7 @@ def fit(name: str, value: Any, cotangent: Any, g: Any) -> Any:
     if dtype.kind == "c" != precise.kind:
         raise DerivativeError(f"{name} returned a complex derivative of a real value; take its real part")
     if dtype.kind not in "fc" or np.finfo(dtype).eps > max(
-        np.finfo(dtype_of(x)).eps for x in leaves((value, plain(g)))
+        np.finfo(dtype_of(x)).eps for x in leaves((value, sample(g)))
     ):
         raise DerivativeError(f"{name} returned a derivative of dtype {dtype} where {precise} is needed")
     return cast(cotangent, precise)
@@ -1088,7 +1218,7 @@ def fit(name: str, value: Any, cotangent: Any, g: Any) -> Any:
 
 def dtype_of(value: Any) -> np.dtype:
     """Return the dtype of a value, plain or traced."""
-    value = plain(value)
+    value = sample(value)
     if hasattr(value, "dtype"):
         return value.dtype
     return np.asarray(value).dtype
@@ -1181,3 +1311,28 @@ def called(function: Callable, args: Sequence) -> Any:
     if function in (_primitive, _operator, through):
         return args[0]
     return function
+
+
+def executed_function(function: Callable, args: Sequence, samples: Sequence) -> tuple[Callable, Sequence]:
+    """Return the function of plain values that executes a recorded call, and its arguments.
+
+    Parameters
+    ----------
+    function : callable
+        The recorded function: a primitive of autograd, the primitive of all rules or that of all Operators, or a
+        function of plain values.
+    args : sequence
+        The arguments of the call, in any form.
+    samples : sequence
+        Plain values with the shapes and dtypes of the arguments.
+    """
+    if function is _primitive:
+        return args[0].forward, args[1:]
+    if function is _operator:
+        return args[0].apply, args[1:]
+    return getattr(function, "fun", function), args
+
+
+def is_fresh(function: Callable) -> bool:
+    """Return whether the results of a recorded call are new arrays: those of rules and Operators are."""
+    return function is _primitive or function is _operator

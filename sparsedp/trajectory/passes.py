@@ -289,6 +289,7 @@ class RolloutRule(Rule):
 
     name = "rollout"
     jvp = None
+    accepts_traced = True
     keywords = ()
 
     def __init__(

@@ -161,7 +161,7 @@ def rollout(
     trees = {"state": state, "params": params}
     if inputs is not None:
         trees["inputs"] = inputs
-    forms = [ArgumentForm(tree, name) for name, tree in trees.items()]
+    forms = list(map(ArgumentForm, trees.values(), trees))
     _check_inputs(inputs, n)
     if inputs is None:
         check_takes("rollout", step, 2, "lambda state, params: ...")

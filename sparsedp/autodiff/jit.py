@@ -1,0 +1,781 @@
+"""jit(): a function whose calls are recorded once and then replayed as a program, without a tape."""
+
+from __future__ import annotations
+
+import warnings
+from contextlib import contextmanager
+from functools import partial, update_wrapper, wraps
+from operator import getitem
+from threading import RLock
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sparsedp._utils.calls import frames_inside
+from sparsedp._utils.counters import active, thread
+from sparsedp._utils.pytree import TreeStructure, child, flatten, keys, labels, leaves, placed
+from sparsedp._utils.reconstruction import Reconstructible
+from sparsedp._utils.validation import check_function, check_leaves, check_native
+from sparsedp.autodiff.backend import ARRAY_KINDS
+from sparsedp.autodiff.derivative import gradient_of, hvp, taped, value_and_grad, zero_like
+from sparsedp.autodiff.program import compile_program, free_slots, needed_calls
+from sparsedp.autodiff.program_trace import ProgramTrace, Slot, open_traces
+from sparsedp.autodiff.tape import (
+    Rule,
+    VJPNode,
+    dtype_of,
+    innermost,
+    is_fresh,
+    is_recorded,
+    is_variable,
+    isbox,
+    new_trace,
+    recording_trace,
+    sample,
+    through,
+)
+from sparsedp.autodiff.tape_constants import constant, constant_args
+from sparsedp.errors import JitError, JitWarning
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+__all__ = ["Jitted", "PullbackProgram", "form_of", "is_watched", "jit", "opaque"]
+
+FORMS_BEFORE_WARNING = 8
+MOST_FORMS = 64  # programs of one function that are kept
+# Parts of Python's and NumPy's messages for a traced value in a wrong place; the last one: in an index.
+OF_TRACED_VALUES = ("ArrayBox", "object array", "only integers, slices")
+# Largest accepted difference between a program and its function, relative to the largest entry, in units of eps.
+VALUE_TOLERANCE = 1e4
+
+
+def jit(function: Callable, check: bool = True) -> Jitted:
+    """Return a function that records its first call and replays it as a program, without Python's overhead.
+
+    The first call with arguments of a new form runs the function and records all calls of NumPy, rules, Operators and
+    solves. Later calls with arguments of the same form execute these calls again with the new numbers. The form
+    consists of the tree structure, the shapes and dtypes of floating arrays and numbers, and the values of all other
+    leaves (integers, booleans, strings, None).
+
+    Parameters
+    ----------
+    function : callable
+        A pure function of trees of arrays. Whatever it uses apart from its arguments is a constant: the program keeps
+        the value of the first call. It is written with autograd.numpy, Operators and other functions of this library;
+        values of arrays must not decide what it does (``if``, ``while``, ``float()``).
+    check : bool
+        Whether each program is compared with the function once, in its next call with other numbers.
+
+    Returns
+    -------
+    Jitted
+        A function with the same arguments and results. `value_and_grad`, `grad`, `vjp`, `hvp`, `minimize` and `rollout`
+        use its programs. On a tape each call is one node. In `jvp`, in nested derivatives and for distributed fields it
+        calls the function itself.
+
+    Raises
+    ------
+    TypeError
+        If `function` is not callable.
+    JitError
+        When the returned function is called: if the function makes a decision by values, or if its program differs from
+        it because it is not pure.
+
+    Warns
+    -----
+    JitWarning
+        If more than eight forms were recorded. The warning names the argument that changes.
+
+    See Also
+    --------
+    rollout, value_and_grad, check.jit
+
+    Notes
+    -----
+    **Cost.** A recording takes about as long as ten calls. It pays for small arrays, where Python takes most of the
+    time of a call. Use it for the step of a `rollout`, or for a whole loss.
+
+    **Numbers.** Values are equal bit for bit to those of the function, and derivatives up to rounding.
+
+    Examples
+    --------
+    >>> import sparsedp as dp
+    >>> loss = dp.jit(lambda x: np.sum(x**2))
+    >>> dp.value_and_grad(loss)(np.array([1.0, 2.0]))
+    (5.0, array([2., 4.]))
+    """
+    check_function("jit", function, "lambda x: ...")
+    return Jitted(function, bool(check))
+
+
+class Jitted(Reconstructible):
+    """A function that is recorded once for each form of its arguments; see `jit`.
+
+    Attributes
+    ----------
+    function : callable
+        The function itself.
+    forms : int
+        Number of forms that were recorded.
+    """
+
+    def __init__(self, function: Callable, check: bool = True, falls_back: bool = False) -> None:
+        self.function = function
+        self.check = check
+        self._falls_back = falls_back
+        self._recorded: dict[Any, Recorded] = {}
+        self._gradients: dict[int, Jitted] = {}
+        self._hessian_product: Jitted | None = None
+        self._lock = RLock()
+        self._warned = False
+        self._is_refused = False
+        self.forms = 0
+        update_wrapper(self, function, updated=())
+
+    def recipe(self) -> tuple[Callable, tuple]:
+        """Return the call that constructs this object again."""
+        return Jitted, (self.function, self.check, self._falls_back)
+
+    def __repr__(self) -> str:
+        return f"<jit of {_name(self.function)}: {self.forms} forms recorded>"
+
+    def __call__(self, *args: Any, **options: Any) -> Any:
+        """Call the function, by its program if there is one for arguments of this form."""
+        if self._is_refused or is_watched():
+            return self.function(*args, **options)
+        variables: list = []
+        form = form_of((args, options), variables)
+        nums = _differentiated(variables)
+        if form is None or nums is None:
+            return self.function(*args, **options)
+        try:
+            recorded = self.recorded(form, args, options, variables)
+            if not nums:
+                return recorded.value(variables)
+            program = recorded.pullback(nums, variables)
+        except JitError:
+            if not self._falls_back:
+                raise
+            self._is_refused = True
+            return self.function(*args, **options)
+        rule = JittedRule(recorded.name, program)
+        results = through(rule, nums, *variables)
+        if len(program.floating) == 1:
+            results = [results]
+        else:
+            results = [results[k] for k in range(len(program.floating))]
+        return program.build(results, rule.others)
+
+    def recorded(self, form: Any, args: tuple, options: dict, variables: list) -> Recorded:
+        """Return the programs for arguments of a form."""
+        recorded = self._recorded.get(form)
+        if recorded is None:
+            with self._lock:
+                recorded = self._recorded.get(form)
+                if recorded is None:
+                    recorded = Recorded(self.function, args, options, variables, self.check)
+                    self._add(form, recorded, (args, options))
+        return recorded
+
+    def _add(self, form: Any, recorded: Recorded, arguments: tuple) -> None:
+        """Store the programs of a new form; warn if there are many."""
+        if self.forms == FORMS_BEFORE_WARNING and not self._warned:
+            self._warned = True
+            last_form = next(reversed(self._recorded))
+            warnings.warn(
+                JitWarning(
+                    f"dp.jit recorded {_name(self.function)} for {self.forms} forms of its arguments, and "
+                    f"{_difference(last_form, form, arguments)}; pass it as a floating number, or leave out dp.jit"
+                ),
+                stacklevel=frames_inside() + 1,
+            )
+        if len(self._recorded) >= MOST_FORMS:
+            del self._recorded[next(iter(self._recorded))]
+        self._recorded[form] = recorded
+        self.forms += 1
+
+    def jitted_value_and_grad(self, argnum: int) -> Jitted:
+        """Return the jitted function ``value_and_grad(function, argnum)``, which `value_and_grad` calls."""
+        known = self._gradients.get(argnum)
+        if known is None:
+            known = self._gradients.setdefault(
+                argnum, Jitted(value_and_grad(self.function, argnum), self.check, self._falls_back)
+            )
+        return known
+
+    def jitted_hvp(self, x: Any, tangent: Any) -> Any:
+        """Return ``hvp(function, x, tangent)`` by a program."""
+        if self._hessian_product is None:
+            self._hessian_product = Jitted(partial(hvp, self.function), self.check, falls_back=True)
+        return self._hessian_product(x, tangent)
+
+
+# ---- forms -----------------------------------------------------------------------------------------------------------
+
+
+def form_of(tree: Any, variables: list) -> Any:
+    """Return the form of a tree as a hashable value, and append its floating leaves, plain or traced, to `variables`.
+
+    Returns
+    -------
+    (tuple, tuple) or None
+        The structure of the tree, and a form for each leaf. None for a tree with distributed fields.
+    """
+    structure: list = []
+    leaf_forms: list = []
+    if _append_form(tree, structure, leaf_forms, variables):
+        return tuple(structure), tuple(leaf_forms)
+    return None
+
+
+def _append_form(tree, structure, leaf_forms, variables):
+    """Append the forms of the branches and leaves of a tree; return False for a tree with distributed fields."""
+    value = sample(tree)
+    kind = type(value)
+    if kind is np.ndarray:
+        if value.dtype.kind in "fc":
+            variables.append(tree)
+            leaf_forms.append((value.shape, value.dtype, value.flags.c_contiguous or value.strides))
+        else:
+            leaf_forms.append((value.shape, value.dtype, value.tobytes()))
+        return True
+    if kind is float or kind is complex or isinstance(value, np.inexact):
+        variables.append(tree)
+        leaf_forms.append(kind)
+        return True
+    if kind in ARRAY_KINDS:
+        return False
+    names = keys(tree)
+    if names is None:
+        leaf_forms.append((kind, value if _is_hashable(value) else _Identity(value)))
+        return True
+    structure.append((kind, *names))
+    for name in names:
+        if not _append_form(child(tree, name), structure, leaf_forms, variables):
+            return False
+    return True
+
+
+def _is_hashable(value):
+    try:
+        hash(value)
+    except TypeError:
+        return False
+    return True
+
+
+class _Identity:
+    """An object that cannot be hashed, compared by its identity."""
+
+    def __init__(self, value: Any) -> None:
+        self.value = value
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Identity) and other.value is self.value
+
+    def __hash__(self) -> int:
+        return id(self.value)
+
+
+def _difference(earlier, later, arguments):
+    """Return words that say which leaf of the arguments makes two forms different."""
+    args, options = arguments
+    names = labels(args, "args") + labels(options, "options")
+    if earlier[0] == later[0]:
+        for name, before, after, leaf in zip(names, earlier[1], later[1], leaves(arguments), strict=True):
+            if before != after:
+                return f"{name} changes: now {_described(leaf)}"
+    return "their tree structure changes"
+
+
+def _described(leaf):
+    if isinstance(leaf, np.ndarray):
+        return f"an array of shape {leaf.shape} and dtype {leaf.dtype}"
+    return repr(leaf)
+
+
+def _name(function):
+    return getattr(function, "__name__", type(function).__name__)
+
+
+def _differentiated(variables):
+    """Return the positions of traced values whose calls can be one node on their tape.
+
+    Return an empty tuple if no value is traced. Return None where the function itself has to be called: in forward
+    mode, on nested traces, and while another program is recorded.
+    """
+    nums = []
+    trace = None
+    for num, value in enumerate(variables):
+        if not isbox(value):
+            continue
+        if isbox(value._value) or not isinstance(value._node, VJPNode) or trace not in (None, value._trace):
+            return None
+        trace = value._trace
+        nums.append(num)
+    return tuple(nums)
+
+
+def is_watched() -> bool:
+    """Return whether calls are counted or observed, which needs the calls inside the function."""
+    return bool(active or thread.witnesses or thread.solve_hooks or thread.loop_hooks)
+
+
+# ---- programs --------------------------------------------------------------------------------------------------------
+
+
+class Recorded:
+    """The programs of a function for arguments of one form.
+
+    Parameters
+    ----------
+    function : callable
+    args, options : tuple, dict
+        Arguments of this form.
+    variables : list
+        Their floating leaves, plain or traced.
+    check : bool
+        Whether each program is compared with the function once.
+    """
+
+    def __init__(self, function: Callable, args: tuple, options: dict, variables: Sequence, check: bool) -> None:
+        self.name = _name(function)
+        self._check = check
+        self._function = function
+        self.first = [_copied(sample(variable)) for variable in variables]
+        check_leaves("args", (args, options))
+        check_native("dp.jit", *self.first)
+        entries = leaves((args, options))
+        self.places = [place for place, leaf in enumerate(entries) if is_variable(leaf)]
+        self._statics = [None if is_variable(leaf) else constant(leaf) for leaf in entries]
+        self._rebuild = flatten(_without_leaves((args, options)))[1]
+        self._pullbacks: dict[tuple, PullbackProgram] = {}
+        self._value: Any = None
+        self._value_is_checked = False
+
+    def arguments(self, variables: Sequence) -> tuple[tuple, dict]:
+        """Return the arguments of the function with the given floating leaves."""
+        return self._rebuild(placed(self._statics, self.places, variables))
+
+    def call(self, arguments: tuple) -> Any:
+        """Call the function with a pair of its positional and keyword arguments."""
+        args, options = arguments
+        return self._function(*args, **options)
+
+    def begin(self) -> tuple[ProgramTrace, list[Slot]]:
+        """Return a new trace, and the slots of the variables."""
+        trace = ProgramTrace(new_trace())
+        return trace, [trace.slot(_copied(value)) for value in self.first]
+
+    def value(self, variables: Sequence) -> Any:
+        """Return the result of the function by its program."""
+        if self._value is None:
+            self._value = self._record_value()
+        run, outputs = self._value
+        result = outputs.build(run(*variables))
+        if not self._value_is_checked and self._is_to_be_checked(variables):
+            self._value_is_checked = True
+            check_program(self.name, self.call(self.arguments(variables)), result)
+        return result
+
+    def pullback(self, nums: tuple[int, ...], variables: Sequence) -> PullbackProgram:
+        """Return the program of the function and of its VJP in the variables `nums`, checked at some variables."""
+        program = self._pullbacks.get(nums)
+        if program is None:
+            program = self._pullbacks.setdefault(nums, PullbackProgram(self, nums))
+        if not program.is_checked and self._is_to_be_checked(variables):
+            program.is_checked = True
+            program.compare([sample(variable) for variable in variables])
+        return program
+
+    def _is_to_be_checked(self, variables):
+        """Return whether a program is compared at these variables.
+
+        It is not compared at the arguments of the recording, where a frozen value would not be noticed.
+        """
+        return self._check and not all(map(_same, variables, self.first))
+
+    def _record_value(self):
+        trace, inputs = self.begin()
+        boxes = list(map(trace.box, inputs))
+        with _recording(self.name):
+            result = self.call(self.arguments(boxes))
+        outputs = Outputs(trace, inputs, result)
+        return compile_program(trace, needed_calls(trace.calls, outputs.slots), inputs, outputs.slots), outputs
+
+
+def check_program(name: str, expected: Any, result: Any) -> None:
+    """Raise JitError if the result of a program differs from that of its function."""
+    for place, (a, b) in enumerate(zip(leaves(expected), leaves(result), strict=True)):
+        if not _agree(a, b):
+            raise JitError(
+                f"the program of {name} differs from the function in result {place}: the function uses something that "
+                "has changed, or random numbers, or values of traced arrays; pass what changes as an argument"
+            )
+
+
+def _agree(a, b):
+    if is_variable(a):
+        a = np.asarray(a)
+        b = np.asarray(b)
+        if a.shape != b.shape or a.dtype != b.dtype:
+            return a.shape == b.shape and a.ndim == 0 and np.array_equal(a, b, equal_nan=True)
+        if np.array_equal(a, b, equal_nan=True):
+            return True
+        finite = np.isfinite(a)
+        if not np.array_equal(finite, np.isfinite(b)):
+            return False
+        size = float(np.max(np.abs(a), where=finite, initial=0.0))
+        return bool(np.all(np.abs(a - b)[finite] <= VALUE_TOLERANCE * np.finfo(a.dtype).eps * size))
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        return np.array_equal(a, b)
+    return a is b or a == b
+
+
+def _same(a, b):
+    """Return True if two arrays have the same values."""
+    return np.array_equal(sample(a), b)
+
+
+def _copied(value):
+    if isinstance(value, np.ndarray):
+        return value.copy("K")
+    return value
+
+
+def _without_leaves(tree):
+    """Return a tree with None in place of all leaves."""
+    return flatten(tree)[1](iter(lambda: None, 0))
+
+
+class Outputs:
+    """The result of a recorded function: which of its leaves a program computes.
+
+    Parameters
+    ----------
+    trace : ProgramTrace
+    inputs : sequence of Slot
+    result : tree
+        The result of the function on the trace.
+
+    Attributes
+    ----------
+    slots : list of Slot
+        The leaves that the program computes. They share no memory with each other and with the inputs.
+    """
+
+    def __init__(self, trace: ProgramTrace, inputs: Sequence[Slot], result: Any) -> None:
+        ends = leaves(result)
+        self._rebuild = flatten(_without_leaves(result))[1]
+        self.slots: list[Slot] = []
+        self.places: list[int] = []
+        self._statics: list = []
+        for place, end in enumerate(ends):
+            if is_recorded(end):
+                slot = end._node.slot
+            elif isinstance(end, np.ndarray):
+                slot = trace.call(_copied, end)
+            else:
+                self._statics.append(constant(end))
+                continue
+            self._statics.append(None)
+            self.places.append(place)
+            self.slots.append(_own_array(trace, slot, (*inputs, *self.slots)))
+
+    def build(self, values: Sequence) -> Any:
+        """Return the result of the function from the values of the slots."""
+        return self._rebuild(placed(self._statics, self.places, values))
+
+
+def _own_array(trace, slot, others):
+    """Return a slot for an array that shares no memory with others: the same slot, or that of a copy."""
+    value = trace.samples[slot.number]
+    if not isinstance(value, np.ndarray):
+        return slot
+    producer = next((call for call in trace.calls if call.result is slot), None)
+    is_new = producer is not None and (value.base is None or is_fresh(producer.function))
+    if is_new and all(slot.number != other.number for other in others):
+        return slot
+    return trace.call(_copied, slot)
+
+
+class PullbackProgram:
+    """The program of a function, and that of its VJP.
+
+    Parameters
+    ----------
+    recorded : Recorded
+    nums : tuple of int
+        Positions of the variables that are differentiated.
+
+    Attributes
+    ----------
+    nums : tuple of int
+    floating : list of int
+        Positions of the floating leaves among the slots of the result.
+    is_checked : bool
+        Whether the program has been compared with the function.
+    """
+
+    def __init__(self, recorded: Recorded, nums: tuple[int, ...]) -> None:
+        self.nums = nums
+        self.is_checked = False
+        self._recorded = recorded
+        trace, inputs = recorded.begin()
+        boxes = list(map(trace.box, inputs))
+        arguments = recorded.arguments(boxes)
+        moving = [False] * len(leaves(arguments))
+        for num in nums:
+            moving[recorded.places[num]] = True
+        with _recording(recorded.name):
+            tape = taped(recorded.call, arguments, moving)
+            self.outputs = Outputs(trace, inputs, tape.rebuild(tape.values))
+            n_forward = len(trace.calls)
+            results = [trace.samples[slot.number] for slot in self.outputs.slots]
+            self.floating = [k for k, value in enumerate(results) if is_variable(value)]
+            given: list = [None] * len(tape.values)
+            cotangent_slots = []
+            for k in self.floating:
+                slot = trace.slot(_random_like(results[k]))
+                cotangent_slots.append(slot)
+                given[self.outputs.places[k]] = trace.box(slot)
+            pulled = tape.pull(given)
+            cotangents = []
+            for num in nums:
+                cotangent = pulled[recorded.places[num]]
+                if cotangent is not None:
+                    cotangent = trace.unboxed(gradient_of(boxes[num], cotangent))
+                cotangents.append(cotangent)
+        found = [cotangent for cotangent in cotangents if type(cotangent) is Slot]
+        backward_calls = needed_calls(trace.calls[n_forward:], found)
+        used = free_slots(backward_calls) | {slot.number for slot in found}
+        computed = {call.result.number for call in backward_calls}
+        of_cotangents = {slot.number for slot in cotangent_slots}
+        self._saved = [Slot(number) for number in sorted(used - of_cotangents - computed)]
+        self._n_results = len(self.outputs.slots)
+        results_and_saved = [*self.outputs.slots, *self._saved]
+        forward_calls = needed_calls(trace.calls[:n_forward], results_and_saved)
+        self._forward = compile_program(trace, forward_calls, inputs, results_and_saved)
+        self.backward = compile_program(trace, backward_calls, [*self._saved, *cotangent_slots], cotangents)
+
+    def forward(self, variables: Sequence) -> tuple[tuple, tuple]:
+        """Return the values of the result, and the values that `backward` needs before the cotangents."""
+        values = self._forward(*variables)
+        return values[: self._n_results], values[self._n_results :]
+
+    def compare(self, variables: Sequence) -> None:
+        """Raise JitError if the program and the function, or their pullbacks, differ at some plain variables."""
+        recorded = self._recorded
+        results, saved = self.forward(variables)
+        arguments = recorded.arguments(variables)
+        moving = [False] * len(leaves(arguments))
+        for num in self.nums:
+            moving[recorded.places[num]] = True
+        tape = taped(recorded.call, arguments, moving)
+        check_program(recorded.name, tape.rebuild(tape.values), self.outputs.build(results))
+        cotangents = [_random_like(results[k]) for k in self.floating]
+        given = placed([None] * len(tape.values), [self.outputs.places[k] for k in self.floating], cotangents)
+        pulled = tape.pull(given)
+        expected = [gradient_of(variables[num], pulled[recorded.places[num]]) for num in self.nums]
+        check_program(f"the gradient of {recorded.name}", expected, self.pull(saved, cotangents, variables))
+
+    def pull(self, saved: Sequence, cotangents: Sequence, variables: Sequence) -> list:
+        """Return the cotangents of the variables `nums`."""
+        pulled = self.backward(*saved, *cotangents)
+        return [
+            zero_like(variables[num]) if back is None else back for num, back in zip(self.nums, pulled, strict=True)
+        ]
+
+    def build(self, floating: Sequence, others: Sequence) -> Any:
+        """Return the result of the function from its floating leaves, which may be traced, and the other ones."""
+        values = placed([None] * self._n_results, self.floating, floating)
+        other_places = [k for k in range(self._n_results) if k not in self.floating]
+        return self.outputs.build(placed(values, other_places, others))
+
+
+def _random_like(value):
+    """Return random numbers of the shape and dtype of a value: zeros could be treated as a special case."""
+    numbers = np.random.default_rng(0).uniform(0.5, 1.5, np.shape(value))
+    return np.asarray(numbers, dtype_of(value))[()]
+
+
+@contextmanager
+def _recording(name):
+    """Record inside a `with` block; raise JitError for a traced value that a function does not accept."""
+    open_traces.append(None)
+    try:
+        yield
+    except (TypeError, ValueError, AttributeError, IndexError) as error:
+        texts = f"{error} {error.__cause__}"
+        if isinstance(error, JitError) or not any(words in texts for words in OF_TRACED_VALUES):
+            raise
+        raise JitError(
+            f"dp.jit cannot record {name}: a traced value was refused ({error}); write the function with "
+            "autograd.numpy, without float(), int(), item() and u[i] = ..."
+        ) from error
+    finally:
+        open_traces.pop()
+
+
+class JittedRule(Rule):
+    """A call of a jitted function on a tape, as one node.
+
+    Parameters
+    ----------
+    name : str
+        Name of the function.
+    program : PullbackProgram
+
+    Attributes
+    ----------
+    others : list
+        The leaves of the result that the program computes and that are not floating.
+    """
+
+    jvp = None
+    keywords = ()
+    accepts_traced = True
+
+    def __init__(self, name: str, program: PullbackProgram) -> None:
+        self.name = f"jit of {name}"
+        self._program = program
+        self._saved: tuple = ()
+        self.others: list = []
+
+    def forward(self, *variables: Any) -> Any:
+        """Return the floating leaves of the result."""
+        program = self._program
+        results, self._saved = program.forward(constant_args(variables, program.nums))
+        floating = [results[k] for k in program.floating]
+        self.others = [results[k] for k in range(len(results)) if k not in program.floating]
+        return floating[0] if len(floating) == 1 else tuple(floating)
+
+    def vjp(self, nums: Sequence[int], ans: Any, *variables: Any) -> Callable:
+        """Return the function that maps cotangents of the result to those of the differentiated variables."""
+        saved = self._saved
+        self._saved = ()
+
+        def pull(g):
+            n = len(self._program.floating)
+            cotangents = [g] if n == 1 else [g[k] for k in range(n)]
+            return self._program.pull(saved, cotangents, variables)
+
+        return pull
+
+
+# ---- functions that decide by values ---------------------------------------------------------------------------------
+
+
+def opaque(function: Callable) -> Callable:
+    """Decorate a function that makes decisions by values of arrays: `dp.jit` records it as one call.
+
+    The program calls the function itself. Derivatives come from a tape of this call.
+    """
+
+    @wraps(function)
+    def call(*args, **options):
+        if not open_traces or recording_trace(leaves((args, options))) is None:
+            return function(*args, **options)
+        structure = TreeStructure((args, options), "arguments", is_variable)
+        variables = structure.variables((args, options))
+        nums = innermost(variables)
+        rule = OpaqueCall(function, structure, nums)
+        return rule.build(through(rule, nums, *variables))
+
+    return call
+
+
+class OpaqueCall(Rule):
+    """A call of a function that makes decisions by values, while `dp.jit` records.
+
+    Parameters
+    ----------
+    function : callable
+    structure : TreeStructure
+        Structure of the pair of its positional and keyword arguments.
+    nums : sequence of int
+        Positions of the variables that are differentiated.
+    """
+
+    jvp = None
+    keywords = ()
+    accepts_traced = True
+
+    def __init__(self, function: Callable, structure: TreeStructure, nums: Sequence[int]) -> None:
+        self.name = _name(function)
+        self._function = function
+        self._structure = structure
+        self._nums = nums
+        self._result: Any = None  # structure of the result
+        self._call: Any = None  # slot of the call
+
+    def forward(self, *variables: Any) -> Any:
+        """Return the floating leaves of the result, as one value or a tuple."""
+        if any(isbox(value) and not is_recorded(value) for value in variables):
+            result = self._evaluate(self._structure.build(variables))
+            self._result = TreeStructure(result, "result", is_variable)
+            return _single(self._result.variables(result))
+        trace = recording_trace(variables)
+        self._call = trace.call(self._run, *map(trace.unboxed, variables))
+        results, _ = trace.sample(self._call)
+        return _single([trace.box(trace.call(_entry, self._call, 0, place)) for place in range(len(results))])
+
+    def _evaluate(self, arguments):
+        args, options = arguments
+        return self._function(*args, **options)
+
+    def _run(self, *variables):
+        """Call the function with plain values; return the floating leaves of its result, and a tape if it is needed."""
+        arguments = self._structure.build(variables)
+        if not self._nums:
+            result = self._evaluate(arguments)
+            self._result = TreeStructure(result, "result", is_variable)
+            return self._result.variables(result), None
+        moving = [False] * len(self._structure.statics)
+        for num in self._nums:
+            moving[self._structure.places[num]] = True
+        tape = taped(self._evaluate, arguments, moving)
+        result = tape.rebuild(tape.values)
+        self._result = TreeStructure(result, "result", is_variable)
+        return self._result.variables(result), tape
+
+    def build(self, results: Any) -> Any:
+        """Return the result of the function from its floating leaves."""
+        if len(self._result.places) != 1:
+            return self._result.build([results[k] for k in range(len(self._result.places))])
+        return self._result.build([results])
+
+    def vjp(self, nums: Sequence[int], ans: Any, *variables: Any) -> Callable:
+        """Return the function that maps cotangents of the result to those of the differentiated variables."""
+
+        def pull(g):
+            n = len(self._result.places)
+            cotangents = [g] if n == 1 else [g[k] for k in range(n)]
+            trace = recording_trace((ans, *cotangents, *variables))
+            plain_variables = [trace.unboxed(variable) for variable in variables]
+            pulled = trace.call(self._pull, self._call, *map(trace.unboxed, cotangents), *plain_variables)
+            return [trace.box(trace.call(getitem, pulled, place)) for place in range(len(self._nums))]
+
+        return pull
+
+    def _pull(self, call, *cotangents_and_variables):
+        """Return the cotangents of the differentiated variables, from the tape of a call."""
+        _, tape = call
+        n = len(self._result.places)
+        given = placed([None] * len(tape.values), self._result.places, cotangents_and_variables[:n])
+        variables = cotangents_and_variables[n:]
+        pulled = tape.pull(given)
+        return [gradient_of(variables[num], pulled[self._structure.places[num]]) for num in self._nums]
+
+
+def _single(values):
+    """Return the only entry of a list, or the list as a tuple."""
+    if len(values) == 1:
+        return values[0]
+    return tuple(values)
+
+
+def _entry(call, part, place):
+    """Return an entry of a part of the result of an opaque call."""
+    return call[part][place]

@@ -1,0 +1,290 @@
+"""The trace of `dp.jit`: it records the calls of a function of arrays as a list, which `program` turns into a program.
+
+A value on this trace stands for an array that differs from call to call. Its shape and dtype are the same in every
+call, so that code may use them freely; its entries are those of the first call and must not be used. `plain`, which
+returns the entries of a traced array, therefore raises `JitError` on this trace. Code of this library reads a traced
+value in one of three ways:
+
+=================  =====================================================================================================
+`sample`           for the shape or dtype only
+`check_values`     for a check, which becomes a call of the program
+`plain`            for a decision, which raises JitError here, unless the function is decorated by `jit.opaque`, so that
+                   it becomes one call of the program
+=================  =====================================================================================================
+
+Traces of derivatives lie above this trace: a gradient is recorded like any other function.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import autograd.numpy as anp
+import numpy as np
+from autograd.tracer import Box, Node, box_types, getval, isbox, new_box, notrace_primitives
+
+from sparsedp.autodiff.backend import BOX
+from sparsedp.autodiff.tape_constants import constant
+from sparsedp.errors import JitError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+__all__ = [
+    "ProgramCall",
+    "ProgramNode",
+    "ProgramTrace",
+    "Slot",
+    "check_values",
+    "is_recorded",
+    "open_traces",
+    "plain",
+    "recorded_level",
+    "recording_trace",
+    "sample",
+]
+
+sample = getval  # the value below all boxes, for its shape and dtype only
+
+open_traces: list[None] = []  # one entry for each function that any thread records, for a fast test
+
+# Functions whose result depends on the shape and dtype of their argument only: they are not recorded.
+OF_SHAPES = {
+    anp.shape,
+    anp.ndim,
+    anp.size,
+    anp.result_type,
+    anp.iscomplexobj,
+    anp.isscalar,
+    anp.zeros_like,
+    anp.ones_like,
+}
+# Functions whose result has a shape that depends on values.
+OF_VARIABLE_SHAPE = {anp.nonzero, anp.flatnonzero, anp.argwhere}
+
+
+class Slot:
+    """The number of a value of a program, in place of this value."""
+
+    __slots__ = ("number",)
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+    def __repr__(self) -> str:
+        return f"v{self.number}"
+
+
+class ProgramCall(NamedTuple):
+    """One call of a program.
+
+    Attributes
+    ----------
+    function : callable
+        A function of plain values.
+    args : tuple
+        A Slot for each value that differs from call to call; other arguments are constants.
+    options : dict
+    result : Slot
+    has_effect : bool
+        Whether the call is kept although nobody uses its result: a check.
+    """
+
+    function: Any
+    args: tuple
+    options: dict
+    result: Slot
+    has_effect: bool = False
+
+
+class ProgramTrace:
+    """A list of calls, and the values of one execution of them.
+
+    Parameters
+    ----------
+    number : int
+        Number of the trace.
+
+    Attributes
+    ----------
+    calls : list of ProgramCall
+    samples : list
+        The values in the execution that was recorded, in the order of the slots.
+    """
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        self.calls: list[ProgramCall] = []
+        self.samples: list[Any] = []
+
+    def slot(self, value: Any) -> Slot:
+        """Return the slot of a new value."""
+        self.samples.append(value)
+        return Slot(len(self.samples) - 1)
+
+    def sample(self, arg: Any) -> Any:
+        """Return the recorded value of an argument of a call."""
+        if type(arg) is Slot:
+            return self.samples[arg.number]
+        return arg
+
+    def add(self, function: Callable, args: Sequence, options: dict, value: Any, has_effect: bool = False) -> Slot:
+        """Record a call that returned a value; constants among the arguments are copied."""
+        name = None
+        if function in OF_VARIABLE_SHAPE:
+            name = function.__name__
+        elif getattr(function, "__name__", "") in ("__getitem__", "getitem") and type(args[1]) is Slot:
+            if np.asarray(self.sample(args[1])).dtype == bool:
+                name = "a traced mask as an index"
+        if name is not None:
+            raise JitError(
+                f"dp.jit cannot record {name}, because the shape of its result depends on values; "
+                "write np.where(condition, a, b)"
+            )
+        kept = tuple(arg if type(arg) is Slot else constant(arg) for arg in args)
+        slot = self.slot(value)
+        self.calls.append(ProgramCall(function, kept, constant(options), slot, has_effect))
+        return slot
+
+    def call(self, function: Callable, *args: Any) -> Slot:
+        """Call a function of plain values with the recorded values of some slots and constants, and record the call."""
+        return self.add(function, args, {}, function(*map(self.sample, args)))
+
+    def box(self, slot: Slot) -> Any:
+        """Return the traced value of a slot."""
+        node = ProgramNode.__new__(ProgramNode)
+        node.trace = self
+        node.slot = slot
+        return new_box(self.samples[slot.number], self.number, node)
+
+    def unboxed(self, value: Any) -> Any:
+        """Return the slot of a traced value, and any other value unchanged."""
+        if is_recorded(value):
+            return value._node.slot
+        return value
+
+
+class ProgramNode(Node):
+    """A value on a `ProgramTrace`."""
+
+    __slots__ = ("slot", "trace")
+    slot: Any
+    trace: Any
+
+    def __init__(self, value: Any, function: Callable, args: Any, options: dict, nums: Any, parents: Any) -> None:
+        self.trace = parents[0].trace
+        slots = list(args)
+        for num, parent in zip(nums, parents, strict=True):
+            slots[num] = parent.slot
+        _refuse_hidden(function, slots)
+        self.slot = self.trace.add(function, slots, options, value)
+
+
+def _refuse_hidden(function, args):
+    """Raise JitError for traced values inside a tuple or list, which would be stored as constants."""
+    for arg in args:
+        if type(arg) in (tuple, list) and any(map(isbox, arg)):
+            name = getattr(function, "__name__", type(function).__name__)
+            raise JitError(
+                f"dp.jit cannot record {name} with a traced value inside a {type(arg).__name__}; "
+                "write anp.array([...]) around values, and anp.where for entries chosen by a traced index"
+            )
+
+
+notrace_primitives[ProgramNode] = OF_SHAPES
+
+
+def is_recorded(value: Any) -> bool:
+    """Return True if the outermost box of a value belongs to a `ProgramTrace`."""
+    return type(value) in box_types and type(value._node) is ProgramNode
+
+
+def recorded_level(value: Any) -> Any:
+    """Return a value without the boxes above the `ProgramTrace`, and without any box if there is no such trace."""
+    while type(value) in box_types and type(value._node) is not ProgramNode:
+        value = value._value
+    return value
+
+
+def recording_trace(values: Sequence) -> ProgramTrace | None:
+    """Return the `ProgramTrace` below some values, or None."""
+    for value in values:
+        if type(value) in box_types:
+            value = recorded_level(value)
+            if type(value) in box_types:
+                return value._node.trace
+    return None
+
+
+def plain(value: Any) -> Any:
+    """Return the value below all boxes; raise JitError while `dp.jit` records it, as its entries decide something."""
+    while type(value) in box_types:
+        if type(value._node) is ProgramNode:
+            frame = sys._getframe(1)
+            name = frame.f_code.co_name.strip("<>")
+            raise JitError(
+                f"dp.jit cannot record a decision by the values of a traced array ({name} in "
+                f"{frame.f_globals.get('__name__')}); call the function without dp.jit"
+            )
+        value = value._value
+    return value
+
+
+def check_values(check: Callable, *args: Any) -> None:
+    """Call a function that checks some values, traced or not; while `dp.jit` records, add the check to the program.
+
+    Parameters
+    ----------
+    check : callable
+        ``check(*args)`` raises an error, or returns nothing.
+    *args
+        Arguments, without traced values inside containers.
+    """
+    if not any(map(isbox, args)):
+        check(*args)
+        return
+    check(*map(sample, args))
+    trace = recording_trace(args)
+    if trace is not None:
+        slots = [trace.unboxed(recorded_level(arg)) for arg in args]
+        trace.add(check, slots, {}, None, has_effect=True)
+
+
+def _truth(box):
+    """Return the truth value of a traced value, unless its trace is recorded."""
+    if type(box._node) is ProgramNode:
+        raise JitError(
+            "dp.jit cannot record a decision by a traced value (if, while, and, or); write np.where(condition, a, b), "
+            "or call the function without dp.jit"
+        )
+    return bool(box._value)
+
+
+def _scalar_box(value, trace, node):
+    """Return the box of an integer or boolean number, which only a `ProgramTrace` has."""
+    if type(node) is not ProgramNode and not isbox(value):
+        raise TypeError(f"Can't differentiate w.r.t. type {type(value)}")
+    return BOX(value, trace, node)
+
+
+def _refusing(convert):
+    """Return a conversion to an integer type of NumPy that does not read values while `dp.jit` records."""
+
+    def new(cls, *args, **options):
+        if open_traces and recording_trace(args) is not None:
+            raise JitError(f"dp.jit cannot convert a traced array by an integer type of NumPy; write u.astype(int)")
+        return convert(cls, *args, **options)
+
+    return new
+
+
+def _install():
+    BOX.__bool__ = _truth
+    for kind in (anp.int8, anp.int16, anp.int32, anp.int64):
+        kind.__new__ = _refusing(kind.__new__)
+    for kind in (np.bool_, np.int64, np.intp, bool, int):
+        Box.type_mappings.setdefault(kind, _scalar_box)
+
+
+_install()

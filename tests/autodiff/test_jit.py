@@ -1,0 +1,304 @@
+"""dp.jit: programs give the bits of their functions, and refuse what they cannot record."""
+
+import pickle
+import warnings
+from threading import Thread
+
+import autograd
+import autograd.numpy as anp
+import numpy as np
+import pytest
+
+import sparsedp as dp
+from sparsedp.autodiff.jit import FORMS_BEFORE_WARNING, opaque
+from sparsedp.autodiff.program_trace import check_values, plain
+
+RING = dp.Grid(16, periodic=True)
+LAPLACIAN = dp.laplacian(RING)
+TRANSPORT = dp.transport(RING, "upwind", velocity="cells")
+X = np.sin(np.arange(16.0))
+Y = np.cos(np.arange(16.0))
+
+
+def arithmetic(u):
+    """Sums, products and entries; some of them are read twice."""
+    first = u[0] * u[1] - u[3] / (2.0 + u[0] ** 2)
+    v = -u[2:10] * 3.0 + u[6:14] ** 2
+    return first + anp.sum(v * v) + v[0]
+
+
+def functions(u):
+    """Functions of autograd.numpy."""
+    v = anp.where(u > 0.1, anp.sin(u), anp.exp(u) - anp.floor(u))
+    pair = anp.array([v[0], anp.sum(v)])
+    return anp.mean(anp.abs(v)) + anp.dot(pair, pair) + anp.max(u) + anp.linalg.norm(anp.concatenate([u, v]))
+
+
+def physics(u):
+    """Operators, transport and a power of an array."""
+    for _ in range(3):
+        u = u + 0.01 * LAPLACIAN(u)
+        u = TRANSPORT(u, u, 0.02)
+    return anp.sum(u**3) + anp.sum(LAPLACIAN.T(u) * u)
+
+
+def of_indices(u):
+    """Entries chosen by a traced index, and by arrays with an entry twice."""
+    last = anp.argmax(u)
+    return u[last] ** 2 + anp.sum(u[np.array([1, 1, 2])] ** 2) + anp.sum(anp.sort(u)[:3])
+
+
+LOSSES = [arithmetic, functions, physics, of_indices]
+
+
+@pytest.mark.parametrize("loss", LOSSES, ids=lambda loss: loss.__name__)
+def test_value_and_gradient_at_other_numbers(loss):
+    jitted = dp.jit(loss)
+    for x in (X, Y, X + Y, 3.0 * X):
+        value, gradient = dp.value_and_grad(loss)(x)
+        found, slope = dp.value_and_grad(jitted)(x)
+        assert jitted(x) == loss(x) == value == found
+        np.testing.assert_allclose(slope, gradient, rtol=1e-15, atol=1e-15 * np.max(np.abs(gradient)))
+        np.testing.assert_array_equal(dp.vjp(jitted, x)[1](1.0), slope)
+    assert jitted.forms == 1
+
+
+@pytest.mark.parametrize("loss", [arithmetic, functions, physics], ids=lambda loss: loss.__name__)
+def test_second_order_and_forward_mode(loss):
+    jitted = dp.jit(loss)
+    for x in (X, Y):
+        expected = dp.hvp(loss, x, Y)
+        np.testing.assert_allclose(dp.hvp(jitted, x, Y), expected, rtol=1e-13, atol=1e-13 * np.max(np.abs(expected)))
+        np.testing.assert_allclose(dp.jvp(jitted, x, Y)[1], dp.jvp(loss, x, Y)[1], rtol=1e-14)
+        nested = dp.grad(lambda x: anp.sum(dp.grad(jitted)(x) ** 2))(x)
+        expected = dp.grad(lambda x: anp.sum(dp.grad(loss)(x) ** 2))(x)
+        np.testing.assert_allclose(nested, expected, rtol=1e-12, atol=1e-12 * np.max(np.abs(expected)))
+
+
+def test_on_the_tape_of_autograd():
+    jitted = dp.jit(physics)
+    np.testing.assert_allclose(autograd.grad(lambda x: 2.0 * jitted(x))(X), 2.0 * dp.grad(physics)(X), rtol=1e-14)
+
+
+def test_trees_options_and_other_leaves():
+    def function(state, n, *, scale):
+        u, more = state["u"], state["more"]
+        return {"u": n * scale * u + more[0], "sum": anp.sum(u) + more[1], "name": "x", "n": n, "order": anp.argsort(u)}
+
+    jitted = dp.jit(function)
+    for x in (X, Y):
+        state = {"u": x, "more": (2.0, 1.0)}
+        for n in (2, 3):
+            expected = function(state, n, scale=0.5)
+            found = jitted(state, n, scale=0.5)
+            assert list(found) == list(expected) and found["name"] == "x" and found["n"] == n
+            for name in ("u", "sum", "order"):
+                np.testing.assert_array_equal(found[name], expected[name])
+
+            def loss(function, state, n=n):
+                result = function(state, n, scale=0.5)
+                return anp.sum(result["u"] ** 2) * result["sum"] * result["n"]
+
+            both = [dp.grad(lambda state, function=f: loss(function, state))(state) for f in (function, jitted)]
+            assert both[0]["more"] == pytest.approx(both[1]["more"], rel=1e-14)
+            np.testing.assert_allclose(both[0]["u"], both[1]["u"], rtol=1e-14)
+    assert jitted.forms == 2
+
+
+@pytest.mark.parametrize("dtype", [np.float32, complex])
+def test_other_dtypes(dtype):
+    def loss(u):
+        return anp.sum(anp.abs(LAPLACIAN(u) + 0.5 * u * u) ** 2)
+
+    jitted = dp.jit(loss)
+    for x in (X, Y):
+        x = (x * (1 + 0.3j) if dtype is complex else x).astype(dtype)
+        value, gradient = dp.value_and_grad(loss)(x)
+        found, slope = dp.value_and_grad(jitted)(x)
+        assert found == value and slope.dtype == gradient.dtype == dtype
+        np.testing.assert_allclose(slope, gradient, rtol=1e-5 if dtype is np.float32 else 1e-13)
+
+
+def test_results_share_no_memory():
+    jitted = dp.jit(lambda u: (u, u, u[:2], 1.0 * u, X))
+    for x in (X.copy(), Y.copy()):
+        results = jitted(x)
+        for k, result in enumerate(results):
+            for other in (x, X, *results[k + 1 :]):
+                assert not np.shares_memory(result, other)
+        results[-1][:] = 7.0
+    np.testing.assert_array_equal(jitted(Y.copy())[-1], X)
+
+
+def test_large_arrays_are_overwritten_only_when_nobody_needs_them():
+    def function(u):
+        v = 2.0 * u
+        row = v.reshape(-1)[:5]  # a view of v
+        w = v + 1.0
+        w = w * w
+        return w - u, row
+
+    jitted = dp.jit(function)
+    for seed in range(3):
+        x = np.random.default_rng(seed).random((100, 100))
+        for found, expected in zip(jitted(x), function(x), strict=True):
+            np.testing.assert_array_equal(found, expected)
+        gradients = [dp.grad(lambda x, f=f: anp.sum(f(x)[0] ** 2) + anp.sum(f(x)[1]))(x) for f in (function, jitted)]
+        np.testing.assert_allclose(gradients[0], gradients[1], rtol=1e-14)
+
+
+def test_constants_are_copied():
+    constant = X.copy()
+    jitted = dp.jit(lambda u: anp.sum(constant * u), check=False)
+    assert jitted(Y) == X @ Y
+    constant[:] = 0.0
+    assert jitted(Y + 0.0) == X @ Y
+
+
+# ---- what is refused -------------------------------------------------------------------------------------------------
+
+
+def decides(u):
+    return u if u[0] > 0 else -u
+
+
+def converts(u):
+    return float(u[0]) * u
+
+
+def chooses(u):
+    return anp.sum(u[u > 0])
+
+
+def finds(u):
+    return anp.sum(u[anp.nonzero(u)])
+
+
+def indexes_with_a_tuple(u):
+    return u[(anp.argmax(u),)]
+
+
+def hides(u):
+    return anp.dot(u, [u[0]] * 16)
+
+
+def converts_to_an_integer(u):
+    return u * anp.int64(u[0])
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (
+            decides,
+            r"dp.jit cannot record a decision by a traced value \(if, while, and, or\); write np.where\(condition, a, "
+            r"b\), or call the function without dp.jit",
+        ),
+        (converts, r"dp.jit cannot record converts: a traced value was refused \(.*\); write the function with "),
+        (chooses, r"dp.jit cannot record a traced mask as an index, because the shape of its result depends on values; "),
+        (finds, r"dp.jit cannot record nonzero, because the shape of its result depends on values; "),
+        (indexes_with_a_tuple, "dp.jit cannot record indexes_with_a_tuple: a traced value was refused "),
+        (hides, r"dp.jit cannot record dot with a traced value inside a list; write anp.array\(\[...\]\) around val"),
+        (converts_to_an_integer, r"dp.jit cannot convert a traced array by an integer type of NumPy; write u.astype\(int\)"),
+    ],
+)
+def test_decisions_are_refused(function, message):
+    with pytest.raises(dp.errors.JitError, match=message):
+        dp.jit(function)(X)
+
+
+def test_a_function_that_is_not_pure_is_named():
+    rng = np.random.default_rng(0)
+
+    def noisy(u):
+        return u + rng.random()
+
+    jitted = dp.jit(noisy)
+    jitted(X)
+    with pytest.raises(dp.errors.JitError, match="the program of noisy differs from the function in result 0: the fun"):
+        jitted(Y)
+    unchecked = dp.jit(noisy, check=False)
+    assert unchecked(X)[0] - X[0] == pytest.approx(unchecked(Y)[0] - Y[0])
+
+
+def test_many_forms_are_reported():
+    jitted = dp.jit(lambda u, n: n * u)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for n in range(FORMS_BEFORE_WARNING):
+            jitted(X, n)
+    message = r"dp.jit recorded <lambda> for 8 forms of its arguments, and args\[1\] changes: now 8; pass it as a float"
+    with pytest.warns(dp.errors.JitWarning, match=message):
+        jitted(X, FORMS_BEFORE_WARNING)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert jitted(X, 100)[1] == 100 * X[1]
+
+
+def test_a_function_is_needed():
+    with pytest.raises(TypeError, match="jit takes a function, got int; write lambda x: ..."):
+        dp.jit(3)
+
+
+# ---- calls that decide by values -------------------------------------------------------------------------------------
+
+
+@opaque
+def iterated(u, p):
+    """Newton's method for x**2 = p, with a number of steps that depends on values."""
+    x = u
+    while np.max(np.abs(plain(x) ** 2 / plain(p) - 1.0)) > 1e-12:
+        x = 0.5 * (x + p / x)
+    return {"x": x, "n": 3}
+
+
+def test_opaque_calls_run_again():
+    def loss(p):
+        result = iterated(1.0 + 0.0 * p, p)
+        return anp.sum(result["x"] ** 3) * result["n"]
+
+    jitted = dp.jit(loss)
+    for p in (np.array([2.0, 3.0]), np.array([200.0, 1e-3]), np.array([1.0, 1.0])):
+        value, gradient = dp.value_and_grad(loss)(p)
+        assert jitted(p) == value
+        np.testing.assert_allclose(dp.value_and_grad(jitted)(p)[1], gradient, rtol=1e-15)
+    np.testing.assert_allclose(dp.hvp(jitted, p, p), dp.hvp(loss, p, p), rtol=1e-12)
+
+
+def positive(u):
+    if not np.all(u > 0):
+        raise dp.errors.NonFiniteError("not positive")
+
+
+def test_checks_are_calls_of_the_program():
+    def function(u):
+        check_values(positive, u)
+        return 2.0 * u
+
+    jitted = dp.jit(function)
+    jitted(X**2 + 1.0)
+    for f in (jitted, dp.grad(lambda u: anp.sum(jitted(u)))):
+        with pytest.raises(dp.errors.NonFiniteError, match="not positive"):
+            f(-1.0 - X**2)
+
+
+def test_threads_and_pickles():
+    jitted = dp.jit(physics)
+    expected = {seed: dp.value_and_grad(physics)(X * seed) for seed in range(1, 5)}
+    found = {}
+
+    def run(seed):
+        for _ in range(5):
+            found[seed] = dp.value_and_grad(jitted)(X * seed)
+
+    threads = [Thread(target=run, args=(seed,)) for seed in expected]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for seed, (value, gradient) in expected.items():
+        assert found[seed][0] == value
+        np.testing.assert_allclose(found[seed][1], gradient, rtol=1e-14)
+    again = pickle.loads(pickle.dumps(jitted))
+    assert again.forms == 0 and again(X) == physics(X)
+    assert repr(again) == "<jit of physics: 1 forms recorded>"
