@@ -40,7 +40,7 @@ from sparsedp.errors import JitError, JitWarning
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-__all__ = ["Jitted", "PullbackProgram", "form_of", "is_watched", "jit", "opaque"]
+__all__ = ["Jitted", "PullbackProgram", "tree_form", "is_watched", "jit", "opaque"]
 
 FORMS_BEFORE_WARNING = 8
 MOST_FORMS = 64  # programs of one function that are kept
@@ -145,7 +145,7 @@ class Jitted(Reconstructible):
         if self._is_refused or is_watched():
             return self.function(*args, **options)
         variables: list = []
-        form = form_of((args, options), variables)
+        form = tree_form((args, options), variables)
         nums = _differentiated(variables)
         if form is None or nums is None:
             return self.function(*args, **options)
@@ -214,7 +214,7 @@ class Jitted(Reconstructible):
 # ---- forms -----------------------------------------------------------------------------------------------------------
 
 
-def form_of(tree: Any, variables: list) -> Any:
+def tree_form(tree: Any, variables: list) -> Any:
     """Return the form of a tree as a hashable value, and append its floating leaves, plain or traced, to `variables`.
 
     Returns

@@ -273,7 +273,7 @@ def _refusing(convert):
 
     def new(cls, *args, **options):
         if open_traces and recording_trace(args) is not None:
-            raise JitError(f"dp.jit cannot convert a traced array by an integer type of NumPy; write u.astype(int)")
+            raise JitError("dp.jit cannot convert a traced array by an integer type of NumPy; write u.astype(int)")
         return convert(cls, *args, **options)
 
     return new

@@ -1327,9 +1327,11 @@ def executed_function(function: Callable, args: Sequence, samples: Sequence) -> 
         Plain values with the shapes and dtypes of the arguments.
     """
     if function is _primitive:
-        return args[0].forward, args[1:]
+        return args[0].bound(*samples[1:]), args[1:]
     if function is _operator:
-        return args[0].apply, args[1:]
+        op, u = samples
+        is_contiguous = type(u) is np.ndarray and u.flags.c_contiguous
+        return op.bound(u) if is_contiguous else op.apply, args[1:]
     return getattr(function, "fun", function), args
 
 

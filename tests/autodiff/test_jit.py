@@ -1,7 +1,6 @@
 """dp.jit: programs give the bits of their functions, and refuse what they cannot record."""
 
 import pickle
-import warnings
 from threading import Thread
 
 import autograd
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
-from sparsedp.autodiff.jit import FORMS_BEFORE_WARNING, opaque
+from sparsedp.autodiff.jit import opaque
 from sparsedp.autodiff.program_trace import check_values, plain
 
 RING = dp.Grid(16, periodic=True)
@@ -153,91 +152,6 @@ def test_constants_are_copied():
     assert jitted(Y) == X @ Y
     constant[:] = 0.0
     assert jitted(Y + 0.0) == X @ Y
-
-
-# ---- what is refused -------------------------------------------------------------------------------------------------
-
-
-def decides(u):
-    return u if u[0] > 0 else -u
-
-
-def converts(u):
-    return float(u[0]) * u
-
-
-def chooses(u):
-    return anp.sum(u[u > 0])
-
-
-def finds(u):
-    return anp.sum(u[anp.nonzero(u)])
-
-
-def indexes_with_a_tuple(u):
-    return u[(anp.argmax(u),)]
-
-
-def hides(u):
-    return anp.dot(u, [u[0]] * 16)
-
-
-def converts_to_an_integer(u):
-    return u * anp.int64(u[0])
-
-
-@pytest.mark.parametrize(
-    ("function", "message"),
-    [
-        (
-            decides,
-            r"dp.jit cannot record a decision by a traced value \(if, while, and, or\); write np.where\(condition, a, "
-            r"b\), or call the function without dp.jit",
-        ),
-        (converts, r"dp.jit cannot record converts: a traced value was refused \(.*\); write the function with "),
-        (chooses, r"dp.jit cannot record a traced mask as an index, because the shape of its result depends on values; "),
-        (finds, r"dp.jit cannot record nonzero, because the shape of its result depends on values; "),
-        (indexes_with_a_tuple, "dp.jit cannot record indexes_with_a_tuple: a traced value was refused "),
-        (hides, r"dp.jit cannot record dot with a traced value inside a list; write anp.array\(\[...\]\) around val"),
-        (converts_to_an_integer, r"dp.jit cannot convert a traced array by an integer type of NumPy; write u.astype\(int\)"),
-    ],
-)
-def test_decisions_are_refused(function, message):
-    with pytest.raises(dp.errors.JitError, match=message):
-        dp.jit(function)(X)
-
-
-def test_a_function_that_is_not_pure_is_named():
-    rng = np.random.default_rng(0)
-
-    def noisy(u):
-        return u + rng.random()
-
-    jitted = dp.jit(noisy)
-    jitted(X)
-    with pytest.raises(dp.errors.JitError, match="the program of noisy differs from the function in result 0: the fun"):
-        jitted(Y)
-    unchecked = dp.jit(noisy, check=False)
-    assert unchecked(X)[0] - X[0] == pytest.approx(unchecked(Y)[0] - Y[0])
-
-
-def test_many_forms_are_reported():
-    jitted = dp.jit(lambda u, n: n * u)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for n in range(FORMS_BEFORE_WARNING):
-            jitted(X, n)
-    message = r"dp.jit recorded <lambda> for 8 forms of its arguments, and args\[1\] changes: now 8; pass it as a float"
-    with pytest.warns(dp.errors.JitWarning, match=message):
-        jitted(X, FORMS_BEFORE_WARNING)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert jitted(X, 100)[1] == 100 * X[1]
-
-
-def test_a_function_is_needed():
-    with pytest.raises(TypeError, match="jit takes a function, got int; write lambda x: ..."):
-        dp.jit(3)
 
 
 # ---- calls that decide by values -------------------------------------------------------------------------------------

@@ -1,0 +1,144 @@
+"""Messages of dp.jit: what it cannot record, functions that are not pure, and many forms of arguments."""
+
+import re
+import warnings
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+
+import sparsedp as dp
+from sparsedp.autodiff.jit import FORMS_BEFORE_WARNING
+from sparsedp.autodiff.program_trace import plain
+
+X = np.sin(np.arange(16.0))
+Y = np.cos(np.arange(16.0))
+
+
+def decides(u):
+    return u if u[0] > 0 else -u
+
+
+def converts(u):
+    return float(u[0]) * u
+
+
+def chooses(u):
+    return anp.sum(u[u > 0])
+
+
+def finds(u):
+    return anp.sum(u[anp.nonzero(u)])
+
+
+def indexes_with_a_tuple(u):
+    return u[(anp.argmax(u),)]
+
+
+def hides(u):
+    return anp.dot(u, [u[0]] * 16)
+
+
+def converts_to_an_integer(u):
+    return u * anp.int64(u[0])
+
+
+def reads(u):
+    return u * plain(u)[0]
+
+
+REFUSED = [
+    (
+        decides,
+        "dp.jit cannot record a decision by a traced value (if, while, and, or); write np.where(condition, a, b), "
+        "or call the function without dp.jit",
+    ),
+    (
+        converts,
+        "dp.jit cannot record converts: a traced value was refused (float() argument must be a string or a real "
+        "number, not 'ArrayBox'); write the function with autograd.numpy, without float(), int(), item() and "
+        "u[i] = ...",
+    ),
+    (
+        chooses,
+        "dp.jit cannot record a traced mask as an index, because the shape of its result depends on values; "
+        "write np.where(condition, a, b)",
+    ),
+    (
+        finds,
+        "dp.jit cannot record nonzero, because the shape of its result depends on values; "
+        "write np.where(condition, a, b)",
+    ),
+    (
+        indexes_with_a_tuple,
+        "dp.jit cannot record indexes_with_a_tuple: a traced value was refused (only integers, slices (`:`), ellipsis "
+        "(`...`), numpy.newaxis (`None`) and integer or boolean arrays are valid indices); write the function with "
+        "autograd.numpy, without float(), int(), item() and u[i] = ...",
+    ),
+    (
+        hides,
+        "dp.jit cannot record dot with a traced value inside a list; write anp.array([...]) around values, and "
+        "anp.where for entries chosen by a traced index",
+    ),
+    (
+        converts_to_an_integer,
+        "dp.jit cannot convert a traced array by an integer type of NumPy; write u.astype(int)",
+    ),
+    (
+        reads,
+        "dp.jit cannot record a decision by the values of a traced array (reads in test_errors_jit); call the function "
+        "without dp.jit",
+    ),
+]
+
+
+@pytest.mark.parametrize(("function", "message"), REFUSED, ids=[function.__name__ for function, _ in REFUSED])
+def test_decisions_are_refused(function, message):
+    with pytest.raises(dp.errors.JitError, match=re.escape(message)):
+        dp.jit(function)(X)
+
+
+def test_integers_have_no_derivative():
+    message = "Can't differentiate w.r.t. type <class 'numpy.int64'>"
+    with pytest.raises(TypeError, match=re.escape(message)):
+        dp.grad(lambda u: anp.sum(u.astype(int)))(X)
+
+
+def test_a_function_that_is_not_pure_is_named():
+    rng = np.random.default_rng(0)
+
+    def noisy(u):
+        return u + rng.random()
+
+    jitted = dp.jit(noisy)
+    jitted(X)
+    message = (
+        "the program of noisy differs from the function in result 0: the function uses something that has changed, or "
+        "random numbers, or values of traced arrays; pass what changes as an argument"
+    )
+    with pytest.raises(dp.errors.JitError, match=message):
+        jitted(Y)
+    unchecked = dp.jit(noisy, check=False)
+    assert unchecked(X)[0] - X[0] == pytest.approx(unchecked(Y)[0] - Y[0])
+
+
+def test_many_forms_are_reported():
+    jitted = dp.jit(lambda u, n: n * u)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for n in range(FORMS_BEFORE_WARNING):
+            jitted(X, n)
+    message = (
+        "dp.jit recorded <lambda> for 8 forms of its arguments, and args[1] changes: now 8; pass it as a floating "
+        "number, or leave out dp.jit"
+    )
+    with pytest.warns(dp.errors.JitWarning, match=re.escape(message)):
+        jitted(X, FORMS_BEFORE_WARNING)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert jitted(X, 100)[1] == 100 * X[1]
+
+
+def test_a_function_is_needed():
+    with pytest.raises(TypeError, match="jit takes a function, got int; write lambda x: ..."):
+        dp.jit(3)
