@@ -161,7 +161,7 @@ def value_and_grad(loss: Callable, argnum: int = 0) -> Callable[..., tuple[Any, 
 
     See Also
     --------
-    grad, vjp, hvp, minimize, check.gradient
+    grad, vjp, hvp, jit, minimize, check.gradient
 
     Notes
     -----

@@ -14,7 +14,7 @@ import numpy as np
 from sparsedp._utils.calls import frames_inside
 from sparsedp._utils.counters import active, thread
 from sparsedp._utils.pytree import TreeStructure, child, flatten, keys, labels, leaves, placed
-from sparsedp._utils.reconstruction import Reconstructible
+from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.validation import check_function, check_leaves, check_native
 from sparsedp.autodiff.backend import ARRAY_KINDS
 from sparsedp.autodiff.derivative import gradient_of, hvp, taped, value_and_grad, zero_like
@@ -89,7 +89,7 @@ def jit(function: Callable, check: bool = True) -> Jitted:
 
     See Also
     --------
-    rollout, value_and_grad, check.jit
+    rollout, value_and_grad
 
     Notes
     -----
@@ -319,7 +319,7 @@ def _differentiated(variables):
 
 def is_watched() -> bool:
     """Return whether calls are counted or observed, which needs the calls inside the function."""
-    return bool(active or thread.witnesses or thread.solve_hooks or thread.loop_hooks)
+    return bool(active or thread.node_hooks or thread.solve_hooks or thread.loop_hooks)
 
 
 # ---- programs --------------------------------------------------------------------------------------------------------

@@ -207,7 +207,7 @@ def recorded_level(value: Any) -> Any:
     return value
 
 
-def recording_trace(values: Sequence) -> ProgramTrace | None:
+def recording_trace(values: Sequence) -> Any:
     """Return the `ProgramTrace` below some values, or None."""
     for value in values:
         if type(value) in box_types:

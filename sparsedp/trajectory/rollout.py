@@ -122,7 +122,7 @@ def rollout(
 
     See Also
     --------
-    flow_step, stepper, ensemble, explain
+    flow_step, stepper, ensemble, explain, jit
 
     Notes
     -----
