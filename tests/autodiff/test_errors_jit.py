@@ -86,7 +86,7 @@ REFUSED = [
     ),
     (
         reads,
-        "dp.jit cannot record a decision by the values of a traced array (reads in test_errors_jit); call the function "
+        f"dp.jit cannot record a decision by the values of a traced array (reads in {__name__}); call the function "
         "without dp.jit",
     ),
 ]
