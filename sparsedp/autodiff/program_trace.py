@@ -17,7 +17,6 @@ Traces of derivatives lie above this trace: a gradient is recorded like any othe
 
 from __future__ import annotations
 
-import sys
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import autograd.numpy as anp
@@ -39,7 +38,6 @@ __all__ = [
     "check_values",
     "is_recorded",
     "open_traces",
-    "plain",
     "recorded_level",
     "recording_trace",
     "sample",
@@ -215,20 +213,6 @@ def recording_trace(values: Sequence) -> Any:
             if type(value) in box_types:
                 return value._node.trace
     return None
-
-
-def plain(value: Any) -> Any:
-    """Return the value below all boxes; raise JitError while `dp.jit` records it, as its entries decide something."""
-    while type(value) in box_types:
-        if type(value._node) is ProgramNode:
-            frame = sys._getframe(1)
-            name = frame.f_code.co_name.strip("<>")
-            raise JitError(
-                f"dp.jit cannot record a decision by the values of a traced array ({name} in "
-                f"{frame.f_globals.get('__name__')}); call the function without dp.jit"
-            )
-        value = value._value
-    return value
 
 
 def check_values(check: Callable, *args: Any) -> None:

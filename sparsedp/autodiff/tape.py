@@ -13,6 +13,7 @@ Complex cotangents follow autograd, g = dL/dRe(y) - i dL/dIm(y): the VJP of y = 
 from __future__ import annotations
 
 import inspect
+import sys
 from contextlib import contextmanager
 from functools import cached_property, partial, wraps
 from itertools import count as count_from
@@ -59,7 +60,6 @@ from sparsedp.autodiff.program_trace import (
     ProgramNode,
     is_recorded,
     open_traces,
-    plain,
     recorded_level,
     recording_trace,
     sample,
@@ -107,6 +107,21 @@ __all__ = [
     "untaped_root",
     "untraced",
 ]
+
+
+def plain(value: Any) -> Any:
+    """Return the value below all boxes; raise JitError while `dp.jit` records it, as its entries decide something."""
+    while type(value) in box_types:
+        if type(value._node) is ProgramNode:
+            frame = sys._getframe(1)
+            name = frame.f_code.co_name.strip("<>")
+            raise JitError(
+                f"dp.jit cannot record a decision by the values of a traced array ({name} in "
+                f"{frame.f_globals.get('__name__')}); call the function without dp.jit"
+            )
+        value = value._value
+    return value
+
 
 # Function of autograd -> function whose derivatives are used instead of those of autograd, on traces of this module.
 underflow_safe: dict[Callable, Callable] = {}

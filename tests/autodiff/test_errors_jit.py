@@ -9,7 +9,7 @@ import pytest
 
 import sparsedp as dp
 from sparsedp.autodiff.jit import FORMS_BEFORE_WARNING
-from sparsedp.autodiff.program_trace import plain
+from sparsedp.autodiff.tape import plain
 
 X = np.sin(np.arange(16.0))
 Y = np.cos(np.arange(16.0))

@@ -10,7 +10,8 @@ import pytest
 
 import sparsedp as dp
 from sparsedp.autodiff.jit import opaque
-from sparsedp.autodiff.program_trace import check_values, plain
+from sparsedp.autodiff.program_trace import check_values
+from sparsedp.autodiff.tape import plain
 
 RING = dp.Grid(16, periodic=True)
 LAPLACIAN = dp.laplacian(RING)
