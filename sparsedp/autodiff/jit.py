@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.calls import frames_inside
 from sparsedp._utils.counters import active, thread
 from sparsedp._utils.pytree import TreeStructure, child, flatten, keys, labels, leaves, placed
-from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.validation import check_function, check_leaves, check_native
 from sparsedp.autodiff.backend import ARRAY_KINDS
 from sparsedp.autodiff.derivative import gradient_of, hvp, taped, value_and_grad, zero_like
