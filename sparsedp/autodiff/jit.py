@@ -123,7 +123,7 @@ class Jitted(Reconstructible):
     def __init__(self, function: Callable, check: bool = True, falls_back: bool = False) -> None:
         self.function = function
         self.check = check
-        self._falls_back = falls_back
+        self.falls_back = falls_back
         self._recorded: dict[Any, Recorded] = {}
         self._gradients: dict[int, Jitted] = {}
         self._hessian_product: Jitted | None = None
@@ -135,7 +135,7 @@ class Jitted(Reconstructible):
 
     def recipe(self) -> tuple[Callable, tuple]:
         """Return the call that constructs this object again."""
-        return Jitted, (self.function, self.check, self._falls_back)
+        return Jitted, (self.function, self.check, self.falls_back)
 
     def __repr__(self) -> str:
         return f"<jit of {_name(self.function)}: {self.forms} forms recorded>"
@@ -155,7 +155,7 @@ class Jitted(Reconstructible):
                 return recorded.value(variables)
             program = recorded.pullback(nums, variables)
         except JitError:
-            if not self._falls_back:
+            if not self.falls_back:
                 raise
             self._is_refused = True
             return self.function(*args, **options)
@@ -200,7 +200,7 @@ class Jitted(Reconstructible):
         known = self._gradients.get(argnum)
         if known is None:
             known = self._gradients.setdefault(
-                argnum, Jitted(value_and_grad(self.function, argnum), self.check, self._falls_back)
+                argnum, Jitted(value_and_grad(self.function, argnum), self.check, self.falls_back)
             )
         return known
 
@@ -370,14 +370,19 @@ class Recorded:
 
     def value(self, variables: Sequence) -> Any:
         """Return the result of the function by its program."""
+        outputs, results = self.results(variables)
+        return outputs.build(results)
+
+    def results(self, variables: Sequence) -> tuple[Outputs, tuple]:
+        """Return the outputs of the function, and their values by its program, checked once."""
         if self._value is None:
             self._value = self._record_value()
         run, outputs = self._value
-        result = outputs.build(run(*variables))
+        results = run(*variables)
         if not self._value_is_checked and self._is_to_be_checked(variables):
             self._value_is_checked = True
-            check_program(self.name, self.call(self.arguments(variables)), result)
-        return result
+            check_program(self.name, self.call(self.arguments(variables)), outputs.build(results))
+        return outputs, results
 
     def pullback(self, nums: tuple[int, ...], variables: Sequence) -> PullbackProgram:
         """Return the program of the function and of its VJP in the variables `nums`, checked at some variables."""
@@ -516,6 +521,8 @@ class PullbackProgram:
         Positions of the floating leaves among the slots of the result.
     is_checked : bool
         Whether the program has been compared with the function.
+    saved_bytes : int
+        Size of the values that `backward` needs, without those of the variables.
     """
 
     def __init__(self, recorded: Recorded, nums: tuple[int, ...]) -> None:
@@ -554,6 +561,7 @@ class PullbackProgram:
         of_cotangents = {slot.number for slot in cotangent_slots}
         self._saved = [Slot(number) for number in sorted(used - of_cotangents - computed)]
         self._n_results = len(self.outputs.slots)
+        self.saved_bytes = _bytes_of(trace, self._saved, inputs)
         results_and_saved = [*self.outputs.slots, *self._saved]
         forward_calls = needed_calls(trace.calls[:n_forward], results_and_saved)
         self._forward = compile_program(trace, forward_calls, inputs, results_and_saved)
@@ -592,6 +600,16 @@ class PullbackProgram:
         values = placed([None] * self._n_results, self.floating, floating)
         other_places = [k for k in range(self._n_results) if k not in self.floating]
         return self.outputs.build(placed(values, other_places, others))
+
+
+def _bytes_of(trace, slots, inputs):
+    """Return the bytes of the values of some slots; for the pullback of a rule those of the arguments of its call."""
+    wanted = {slot.number for slot in slots}
+    for call in trace.calls:
+        if call.result.number in wanted and not isinstance(trace.sample(call.result), (np.ndarray, np.generic)):
+            wanted.update(arg.number for arg in call.args if type(arg) is Slot)
+    wanted -= {slot.number for slot in inputs}
+    return sum(getattr(trace.samples[number], "nbytes", 0) for number in wanted)
 
 
 def _random_like(value):
@@ -713,9 +731,9 @@ class OpaqueCall(Rule):
     def forward(self, *variables: Any) -> Any:
         """Return the floating leaves of the result, as one value or a tuple."""
         if any(isbox(value) and not is_recorded(value) for value in variables):
-            result = self._evaluate(self._structure.build(variables))
-            self._result = TreeStructure(result, "result", is_variable)
-            return _single(self._result.variables(result))
+            raise JitError(
+                f"dp.jit cannot record tangents and second derivatives of {self.name}; call the function without dp.jit"
+            )
         trace = recording_trace(variables)
         self._call = trace.call(self._run, *map(trace.unboxed, variables))
         results, _ = trace.sample(self._call)

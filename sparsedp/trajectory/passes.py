@@ -17,23 +17,24 @@ import numpy as np
 from sparsedp._utils.counters import count
 from sparsedp._utils.progress import shown_steps
 from sparsedp.autodiff.derivative import checking_derivatives, is_finite, zero_like
-from sparsedp.autodiff.tape import Rule, backward, fit, innermost, through
+from sparsedp.autodiff.tape import Rule, fit, innermost, through
 from sparsedp.errors import DerivativeError, NonFiniteError
 from sparsedp.trajectory.record import Record, backward_record, largest
-from sparsedp.trajectory.specification import RolloutSpecification, refuse_foreign_trace, stacked
-from sparsedp.trajectory.step_runner import State, StepRunner
+from sparsedp.trajectory.recorded_steps import make_runner
+from sparsedp.trajectory.specification import RolloutSpecification, stacked
+from sparsedp.trajectory.step_runner import State
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from sparsedp.trajectory.checkpoint_plan import CheckpointPlan
     from sparsedp.trajectory.outputs import LastState
+    from sparsedp.trajectory.step_runner import StepRunner
 
 __all__ = ["RolloutRule"]
 
 SAMPLES = 32  # number of states of a long run at which the size of the cotangent is measured
 APART = 16  # least number of steps between two measurements, because each of them reads the whole cotangent
-NODE_BYTES = 800  # memory of a node with its closures and tuples; measured values lie between 350 and 1200
 
 
 # ---- forward ---------------------------------------------------------------------------------------------------------
@@ -65,8 +66,7 @@ def run_forward(
             return run_forward(runner, plan, outputs, stored, progress)
         if is_taped:
             if i < 2:  # estimate the memory of a tape from the first two steps
-                size = (recorder.bytes or 0) + len(start.tape[1]) * NODE_BYTES - runner.specification.state.nbytes
-                tape_bytes = max(size, 0)
+                tape_bytes = runner.tape_size(start)
             room -= tape_bytes
             if i == 0 and room < 0:
                 start.tape = None
@@ -170,7 +170,7 @@ def run_backward(
                 repeated_end = runner.step(state, True).fingerprint()
                 if not plan.is_reversing:
                     check_repeated(specification, repeated_end, fingerprint)
-            total = _pulled_back(total, runner, state, sums, rows)
+            total = runner.pulled_back(total, state, sums, rows)
             if not is_taped:
                 state.tape = None
         if i % interval == 0 and total is not None:
@@ -195,32 +195,6 @@ def run_backward(
         else:
             backs.append(None)
     return backs, norms, recomputed
-
-
-def _pulled_back(g: list, runner: StepRunner, state: State, sums: dict, rows: list[list]) -> list | None:
-    """Return the cotangents of a state with a tape, given those of the next state; None if no variable has one."""
-    roots, nodes, ends = state.tape
-    runner.current = state
-    backward(nodes, ends, g, sums)
-    backs: list = []
-    is_reached = False
-    for root, value in zip(roots, state.values):
-        if root in sums:
-            back = sums.pop(root)[0]
-        else:
-            back = None
-        if back is not None:
-            back = fit("the step", value, back, back)
-            is_reached = True
-        backs.append(back)
-    for row, root in zip(rows, roots[len(backs) :]):
-        if root in sums:
-            row[state.i] = sums.pop(root)[0]
-    if not sums.keys() <= runner.lasting_nodes:  # the step used a value that another step recorded
-        refuse_foreign_trace("the step")
-    if is_reached:
-        return backs
-    return None
 
 
 def _state_at(i: int, runner: StepRunner, plan: CheckpointPlan, kept: list[State]) -> tuple[State, int]:
@@ -316,7 +290,7 @@ class RolloutRule(Rule):
     def forward(self, *args: Any) -> Any:
         """Run all steps; return the array of the result, or the tuple of its arrays."""
         specification = self.specification
-        runner = StepRunner(specification, args)
+        runner = make_runner(specification, args)
         with runner.errors_named():
             last, kept = run_forward(runner, self.plan, self.outputs, self.stored, self.progress)
         for value in last.values:

@@ -12,7 +12,9 @@ from sparsedp._utils.counters import thread
 from sparsedp._utils.pytree import leaves
 from sparsedp._utils.validation import check_function, check_integer, check_takes, check_whole
 from sparsedp.autodiff.backend import collectively
-from sparsedp.autodiff.tape import dtype_of, innermost, is_variable, isbox, plain, through
+from sparsedp.autodiff.jit import Jitted, opaque
+from sparsedp.autodiff.program_trace import open_traces
+from sparsedp.autodiff.tape import dtype_of, innermost, is_variable, isbox, plain, recording_trace, through
 from sparsedp.autodiff.tape_constants import constant_args
 from sparsedp.errors import BudgetWarning, DerivativeError, ShapeError
 from sparsedp.trajectory.checkpoint_plan import (
@@ -158,6 +160,11 @@ def rollout(
     if isbox(n):
         raise DerivativeError("rollout needs n as a plain whole number, got a traced value; it has no derivative")
     n = check_integer("n of rollout", n, 0, "; for a time T write round(T / dt)")
+    if open_traces and recording_trace(leaves((state, params, inputs))) is not None:
+        jitted = step if isinstance(step, Jitted) else Jitted(step, falls_back=True)
+        return opaque(rollout)(
+            jitted, state, params, n, inputs, memory, keep, truncate, progress=progress, record=record
+        )
     trees = {"state": state, "params": params}
     if inputs is not None:
         trees["inputs"] = inputs

@@ -10,11 +10,22 @@ import numpy as np
 
 from sparsedp._utils.pytree import copied, flatten, leaves
 from sparsedp._utils.validation import advise
-from sparsedp.autodiff.tape import Recorder, boxed, dtype_of, isbox, new_trace, plain, traces_of, untaped_root
+from sparsedp.autodiff.tape import (
+    Recorder,
+    backward,
+    boxed,
+    dtype_of,
+    fit,
+    isbox,
+    new_trace,
+    plain,
+    traces_of,
+    untaped_root,
+)
 from sparsedp.autodiff.tape_constants import frozen
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, UnstableStepError
 from sparsedp.trajectory.record import largest
-from sparsedp.trajectory.specification import fingerprint, owned
+from sparsedp.trajectory.specification import fingerprint, owned, refuse_foreign_trace
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -23,6 +34,7 @@ if TYPE_CHECKING:
 
 __all__ = ["State", "StepRunner"]
 
+NODE_BYTES = 800  # memory of a node with its closures and tuples; measured values lie between 350 and 1200
 # Largest accepted error of the first state after reversed steps, relative to the size of each field, in double and in
 # single precision. The gradient by reversed steps has about the same relative error.
 DRIFT = 1e-8
@@ -177,6 +189,49 @@ class StepRunner:
         if self.copies or (is_taped and following.depends):
             return following.owned()
         return following
+
+    def tape_size(self, state: State) -> int:
+        """Return an estimate of the bytes that the tape of a state takes beside the state."""
+        nodes = state.tape[1]
+        size = (self.recorder.bytes or 0) + len(nodes) * NODE_BYTES - self.specification.state.nbytes
+        return max(size, 0)
+
+    def pulled_back(self, g: list, state: State, sums: dict, rows: list[list]) -> list | None:
+        """Return the cotangents of a state with a tape, given those of the next state; None if no variable has one.
+
+        Parameters
+        ----------
+        g : list
+            For each variable of the next state its cotangent, or None.
+        state : State
+        sums : dict
+            For each root of params the pair (sum of its cotangents, whether it may be modified in place). The
+            cotangents of the step are added.
+        rows : list of lists
+            For each array of inputs the cotangents of its rows. The row of the step is replaced.
+        """
+        roots, nodes, ends = state.tape
+        self.current = state
+        backward(nodes, ends, g, sums)
+        backs: list = []
+        is_reached = False
+        for root, value in zip(roots, state.values):
+            if root in sums:
+                back = sums.pop(root)[0]
+            else:
+                back = None
+            if back is not None:
+                back = fit("the step", value, back, back)
+                is_reached = True
+            backs.append(back)
+        for row, root in zip(rows, roots[len(backs) :]):
+            if root in sums:
+                row[state.i] = sums.pop(root)[0]
+        if not sums.keys() <= self.lasting_nodes:  # the step used a value that another step recorded
+            refuse_foreign_trace("the step")
+        if is_reached:
+            return backs
+        return None
 
     def _are_separate(self, nodes: list) -> bool:
         """Return True if no two variables of a state, and no variable and a parameter, share a node."""

@@ -1,0 +1,129 @@
+"""Run the steps of a rollout by the programs of a jitted step: see `jit`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from sparsedp.autodiff.derivative import zero_like
+from sparsedp.autodiff.jit import Jitted, is_watched, tree_form
+from sparsedp.autodiff.program_trace import Slot
+from sparsedp.autodiff.tape import added, isbox
+from sparsedp.errors import JitError
+from sparsedp.trajectory.step_runner import State, StepRunner
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from sparsedp.trajectory.specification import RolloutSpecification
+
+__all__ = ["make_runner"]
+
+
+def make_runner(specification: RolloutSpecification, args: Sequence) -> StepRunner:
+    """Return the object that runs the steps of a rollout: by programs if the step is jitted, else by calls of the step.
+
+    The step itself is called, too, if an outer trace follows its operations, if the calls inside it are observed, and
+    if leaves of the state or of the inputs are not floating, because they may change from step to step.
+    """
+    step = specification.step
+    if isinstance(step, Jitted) and specification.n and not is_watched() and not any(map(isbox, args)):
+        forms = [specification.state, specification.inputs]
+        if all(form is None or len(form.places) == len(form.statics) for form in forms):
+            try:
+                runner = RecordedStepRunner(specification, args, step)
+            except JitError:
+                if not step.falls_back:
+                    raise
+            else:
+                if runner.keeps_form:
+                    return runner
+    return StepRunner(specification, args)
+
+
+class RecordedStepRunner(StepRunner):
+    """Runs the steps of a rollout by the programs of a jitted step.
+
+    Parameters
+    ----------
+    specification : RolloutSpecification
+    args : list of arrays
+        Variables of state, params and inputs.
+    step : Jitted
+
+    Attributes
+    ----------
+    keeps_form : bool
+        Whether the step returns a state of the same form as its argument, so that no result has to be converted.
+    """
+
+    def __init__(self, specification: RolloutSpecification, args: Sequence, step: Jitted) -> None:
+        super().__init__(specification, args)
+        arguments = self._plain_arguments(self.first)
+        variables: list = []
+        form = tree_form((arguments, {}), variables)
+        self._n_state = len(self.first.values)
+        self._params = variables[self._n_state : self._n_state + len(self.params)]
+        self._recorded = step.recorded(form, arguments, {}, variables)
+        self._program: Any = None
+        if specification.differentiated:
+            roots = [True] * self._n_state + self.param_roots + self.input_roots
+            nums = tuple(num for num, root in enumerate(roots) if root)
+            self._program = self._recorded.pullback(nums, variables)
+            outputs = self._program.outputs
+            results, _ = self._program.forward(variables)
+        else:
+            outputs, results = self._recorded.results(variables)
+        # Raises an error if the result of the step does not have the form of the state.
+        taken, _, _, _ = specification.state.take(outputs.build(results), "the step", self.number, self.outer)
+        slots = specification.state.variables(outputs.build(outputs.slots))
+        self.keeps_form = taken is not None and all(type(slot) is Slot for slot in slots)
+        # For each variable of the state its position among the results of the program.
+        self._order = [outputs.slots.index(slot) for slot in slots] if self.keeps_form else []
+
+    def _variables(self, state: State) -> list:
+        """Return the variables of the arguments of the step that begins at a state."""
+        rows = [block[state.i] for block in self.inputs]
+        return [*state.values, *self._params, *rows]
+
+    def step(self, state: State, is_taped: bool) -> State:
+        """Return the state after one step; if `is_taped`, store what the backward pass needs in the given state."""
+        self.current = state
+        variables = self._variables(state)
+        if is_taped:
+            program = self._program
+            if not program.is_checked:
+                self._recorded.pullback(program.nums, variables)
+            results, saved = program.forward(variables)
+            state.tape = (saved,)
+        else:
+            _, results = self._recorded.results(variables)
+        return State(state.i + 1, [results[place] for place in self._order], state.statics)
+
+    def tape_size(self, state: State) -> int:
+        """Return an estimate of the bytes that the tape of a state takes beside the state."""
+        return self._program.saved_bytes
+
+    def pulled_back(self, g: list, state: State, sums: dict, rows: list[list]) -> list | None:
+        """Return the cotangents of a state with a tape, given those of the next state; None if no variable has one."""
+        self.current = state
+        (saved,) = state.tape
+        cotangents: list = [None] * len(g)
+        for place, cotangent, value in zip(self._order, g, state.values, strict=True):
+            cotangents[place] = zero_like(value) if cotangent is None else cotangent
+        pulled = iter(self._program.backward(*saved, *cotangents))
+        backs = [next(pulled) for _ in range(self._n_state)]
+        for root in self.param_roots:
+            if root:
+                back = next(pulled)
+                if back is not None:
+                    sums[root] = added(sums.get(root), back)
+        for row, root in zip(rows, self.input_roots, strict=True):
+            if root:
+                back = next(pulled)
+                if back is not None:
+                    row[state.i] = back
+        if state.i < self.specification.first_traced or state.i in self.specification.cuts:
+            return None
+        if all(back is None for back in backs):
+            return None
+        return backs
