@@ -17,10 +17,10 @@ import numpy as np
 from sparsedp._utils.counters import count
 from sparsedp._utils.progress import shown_steps
 from sparsedp.autodiff.derivative import checking_derivatives, is_finite, zero_like
+from sparsedp.autodiff.jit import Jitted
 from sparsedp.autodiff.tape import Rule, fit, innermost, through
 from sparsedp.errors import DerivativeError, NonFiniteError
 from sparsedp.trajectory.record import Record, backward_record, largest
-from sparsedp.trajectory.recorded_steps import make_runner
 from sparsedp.trajectory.specification import RolloutSpecification, stacked
 from sparsedp.trajectory.step_runner import State
 
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
     from sparsedp.trajectory.checkpoint_plan import CheckpointPlan
     from sparsedp.trajectory.outputs import LastState
-    from sparsedp.trajectory.step_runner import StepRunner
 
 __all__ = ["RolloutRule"]
 
@@ -290,7 +289,11 @@ class RolloutRule(Rule):
     def forward(self, *args: Any) -> Any:
         """Run all steps; return the array of the result, or the tuple of its arrays."""
         specification = self.specification
-        runner = make_runner(specification, args)
+        runner = None
+        if isinstance(specification.step, Jitted):
+            runner = recorded_runner(specification, args)
+        if runner is None:
+            runner = StepRunner(specification, args)
         with runner.errors_named():
             last, kept = run_forward(runner, self.plan, self.outputs, self.stored, self.progress)
         for value in last.values:

@@ -16,28 +16,31 @@ if TYPE_CHECKING:
 
     from sparsedp.trajectory.specification import RolloutSpecification
 
-__all__ = ["make_runner"]
+__all__ = ["recorded_runner"]
 
 
-def make_runner(specification: RolloutSpecification, args: Sequence) -> StepRunner:
-    """Return the object that runs the steps of a rollout: by programs if the step is jitted, else by calls of the step.
+def recorded_runner(specification: RolloutSpecification, args: Sequence) -> RecordedStepRunner | None:
+    """Return the object that runs the steps of a rollout by the programs of its jitted step.
 
-    The step itself is called, too, if an outer trace follows its operations, if the calls inside it are observed, and
-    if leaves of the state or of the inputs are not floating, because they may change from step to step.
+    Return None if the step itself has to be called: if an outer trace follows its operations, if the calls inside it
+    are observed, and if leaves of the state or of the inputs are not floating, because they may change from step to
+    step.
     """
-    step = specification.step
-    if isinstance(step, Jitted) and specification.n and not is_watched() and not any(map(isbox, args)):
-        forms = [specification.state, specification.inputs]
-        if all(form is None or len(form.places) == len(form.statics) for form in forms):
-            try:
-                runner = RecordedStepRunner(specification, args, step)
-            except JitError:
-                if not step.falls_back:
-                    raise
-            else:
-                if runner.keeps_form:
-                    return runner
-    return StepRunner(specification, args)
+    step: Any = specification.step
+    if not specification.n or is_watched() or any(map(isbox, args)):
+        return None
+    for form in (specification.state, specification.inputs):
+        if form is not None and len(form.places) < len(form.statics):
+            return None
+    try:
+        runner = RecordedStepRunner(specification, args, step)
+    except JitError:
+        if not step.falls_back:
+            raise
+        return None
+    if runner.keeps_form:
+        return runner
+    return None
 
 
 class RecordedStepRunner(StepRunner):

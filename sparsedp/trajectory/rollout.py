@@ -181,7 +181,10 @@ def rollout(
         args += variables
         if form is not forms[0]:
             memory_beside += (1 + any(map(isbox, variables))) * form.nbytes
-    traced = [position for position, arg in enumerate(args) if isbox(arg)]
+    traced = []
+    for position, arg in enumerate(args):
+        if isbox(arg):
+            traced.append(position)
     if traced:  # copy the constants: the caller may change them before the backward pass
         args = constant_args(args, traced)
     if truncate is not None:

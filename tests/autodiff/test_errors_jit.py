@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
-from sparsedp.autodiff.jit import FORMS_BEFORE_WARNING
+from sparsedp.autodiff.jit import FORMS_BEFORE_WARNING, opaque
 from sparsedp.autodiff.tape import plain
 
 X = np.sin(np.arange(16.0))
@@ -100,6 +100,13 @@ def test_values_are_not_read():
         r"call the function without dp.jit",
     ):
         dp.jit(reads)(X)
+
+
+def test_tangents_of_calls_that_decide():
+    twice = opaque(lambda u: 2.0 * u)
+    message = "dp.jit cannot record tangents and second derivatives of <lambda>; call the function without dp.jit"
+    with pytest.raises(dp.errors.JitError, match=message):
+        dp.jit(lambda u: dp.jvp(twice, u, u)[1])(X)
 
 
 def test_integers_have_no_derivative():

@@ -76,7 +76,7 @@ def assert_close(found, expected):
 
 
 @pytest.mark.filterwarnings("ignore::sparsedp.errors.BudgetWarning")
-@pytest.mark.parametrize("options", OPTIONS, ids=str)
+@pytest.mark.parametrize("options", OPTIONS, ids=["none", "much", "little", "all", "list", "function", "truncate"])
 @pytest.mark.parametrize("case", CASES)
 def test_values_and_gradients(case, options):
     step, state, params, inputs = CASES[case]
