@@ -22,7 +22,7 @@ from sparsedp.autodiff.tape import Rule, fit, innermost, through
 from sparsedp.errors import DerivativeError, NonFiniteError
 from sparsedp.trajectory.record import Record, backward_record, largest
 from sparsedp.trajectory.specification import RolloutSpecification, stacked
-from sparsedp.trajectory.step_runner import State
+from sparsedp.trajectory.step_runner import State, StepRunner
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
