@@ -21,6 +21,7 @@ from sparsedp.autodiff.jit import Jitted
 from sparsedp.autodiff.tape import Rule, fit, innermost, through
 from sparsedp.errors import DerivativeError, NonFiniteError
 from sparsedp.trajectory.record import Record, backward_record, largest
+from sparsedp.trajectory.recorded_steps import recorded_runner
 from sparsedp.trajectory.specification import RolloutSpecification, stacked
 from sparsedp.trajectory.step_runner import State, StepRunner
 
