@@ -89,7 +89,7 @@ def jit(function: Callable, check: bool = True) -> Jitted:
 
     See Also
     --------
-    rollout, value_and_grad
+    rollout, value_and_grad, check.jit
 
     Notes
     -----

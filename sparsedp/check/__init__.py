@@ -1,4 +1,4 @@
-"""Checks of operators and gradients.
+"""Checks of operators, gradients and recorded programs.
 
 No other part of sparsedp imports this package. Every check returns a result object. Its `.verdict` is "agrees",
 "disagrees" or "inconclusive", bool(result) is True only for "agrees", and print(result) shows a table.
@@ -6,9 +6,10 @@ No other part of sparsedp imports this package. Every check returns a result obj
 
 from sparsedp._utils.calls import describe_module
 from sparsedp.check.gradient_check import gradient
+from sparsedp.check.jit_check import jit
 from sparsedp.check.operators import operator, transpose, twin
 from sparsedp.check.refinement import order
 
-__all__ = ["gradient", "operator", "order", "transpose", "twin"]
+__all__ = ["gradient", "jit", "operator", "order", "transpose", "twin"]
 
 describe_module(__name__, "dp.check.gradient(loss, x)")

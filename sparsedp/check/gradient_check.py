@@ -87,7 +87,7 @@ def gradient(
 
     See Also
     --------
-    value_and_grad, differentiable, certify, stress, v_curve, check.order
+    value_and_grad, differentiable, certify, stress, v_curve, check.order, check.jit
 
     Notes
     -----

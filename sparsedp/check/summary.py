@@ -144,7 +144,7 @@ class Summary(Result):
         It is "inconclusive" if nothing could be tested.
     """
 
-    _plain = ("title", "verdict", "limit", "worst", "rows")
+    _plain: tuple[str, ...] = ("title", "verdict", "limit", "worst", "rows")
 
     limit = 10.0
 
