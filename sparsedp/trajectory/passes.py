@@ -290,7 +290,7 @@ class RolloutRule(Rule):
     def forward(self, *args: Any) -> Any:
         """Run all steps; return the array of the result, or the tuple of its arrays."""
         specification = self.specification
-        runner = None
+        runner: StepRunner | None = None
         if isinstance(specification.step, Jitted):
             runner = recorded_runner(specification, args)
         if runner is None:
