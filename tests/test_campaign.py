@@ -18,9 +18,11 @@ from campaign import physics, script
 from campaign.boxes import Box
 from campaign.ingredients import Discarded
 from campaign.scene import (
+    TREES,
     Mismatch,
     Outcome,
     Scene,
+    Twin,
     attempt,
     check_close,
     check_gradient,
@@ -100,6 +102,66 @@ def test_many_scenes(number, record_property):
     tally = run(PER_TEST, 1_000_003 * (SEED + 1) + number, PER_TEST * number)
     record_property("campaign", tally)
     assert tally["refused"] + tally["discarded"] <= 0.25 * PER_TEST, tally
+
+
+# ---- the same scenes, jitted ---------------------------------------------------------------------------------------
+
+
+def run_jitted(count, seed):
+    """Record random scenes at other numbers, and compare value and gradient with those of the function itself.
+
+    Returns
+    -------
+    dict
+        How many scenes were compared, and how many the recording refused by name.
+    """
+    tally = {"compared": 0, "refused": 0}
+
+    @hypothesis.settings(
+        max_examples=count,
+        database=None,
+        deadline=None,
+        suppress_health_check=list(hypothesis.HealthCheck),
+        phases=[hypothesis.Phase.generate],
+    )
+    @hypothesis.seed(seed)
+    @hypothesis.given(scenes())
+    def one(scene):
+        values = scene.leaves()
+        x = TREES[scene.tree][0](values)
+        vector, build = dp.flatten(x)
+        try:
+            with np.errstate(all="ignore"):
+                Twin(scene, values, scene.tangents())  # discards scenes whose numbers grow
+            loss = scene.library()
+            value, gradient = dp.value_and_grad(loss)(x)
+        except (Discarded, ValueError, TypeError, RuntimeError, ArithmeticError):
+            return  # what the library refuses is counted by the other tests
+        jitted = dp.jit(loss, check=False)
+        try:
+            dp.value_and_grad(jitted)(build(0.9 * vector))
+        except dp.errors.JitError:
+            tally["refused"] += 1
+            return
+        found, slopes = dp.value_and_grad(jitted)(x)
+        expected = dp.flatten(gradient)[0]
+        gap = np.abs(dp.flatten(slopes)[0] - expected)
+        assert found == value, scene
+        assert np.all(gap <= scene.tolerance * np.max(np.abs(expected), initial=0.0)), scene
+        tally["compared"] += 1
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        one()
+    return tally
+
+
+@pytest.mark.parametrize(
+    "count", [pytest.param(60, marks=pytest.mark.whole), pytest.param(2000, marks=pytest.mark.campaign)]
+)
+def test_jitted_scenes(count):
+    tally = run_jitted(count, seed=7)
+    assert tally["compared"] > count // 2, tally
 
 
 # ---- scenes that once failed, as they were shrunk ------------------------------------------------------------------

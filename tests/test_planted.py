@@ -27,6 +27,67 @@ class Bug(NamedTuple):
 
 
 BUGS = {
+    "constants of a program that the caller can still change": Bug(
+        "autodiff/program_trace.py",
+        "        kept = tuple(arg if type(arg) is Slot else constant(arg) for arg in args)\n",
+        "        kept = tuple(args)\n",
+        "tests/autodiff/test_jit.py::test_constants_are_copied",
+    ),
+    "a decision frozen in a program": Bug(
+        "autodiff/program_trace.py",
+        "    if type(box._node) is ProgramNode:\n        raise JitError(\n"
+        '            "dp.jit cannot record a decision by a traced value',
+        '    if False:\n        raise JitError(\n            "dp.jit cannot record a decision by a traced value',
+        "tests/autodiff/test_errors_jit.py",
+    ),
+    "values read from a program's recording": Bug(
+        "autodiff/tape.py",
+        "        if type(value._node) is ProgramNode:\n            frame",
+        "        if False:\n            frame",
+        "tests/autodiff/test_errors_jit.py",
+    ),
+    "an array of a program overwritten while a view of it is in use": Bug(
+        "autodiff/program.py",
+        "            self._private -= used  # the result may be a view of an argument\n",
+        "",
+        "tests/autodiff/test_jit.py",
+    ),
+    "a check dropped from a program because nobody uses its result": Bug(
+        "autodiff/program.py",
+        "        if call.result.number in wanted or call.has_effect:\n",
+        "        if call.result.number in wanted:\n",
+        "tests/autodiff/test_jit.py::test_checks_are_calls_of_the_program",
+    ),
+    "results of a program that share memory": Bug(
+        "autodiff/jit.py",
+        "    if is_new and all(slot.number != other.number for other in others):\n",
+        "    if is_new:\n",
+        "tests/autodiff/test_jit.py::test_results_share_no_memory",
+    ),
+    "a sum of cotangents added in place while a program of second order is recorded": Bug(
+        "autodiff/tape.py",
+        "    if open_traces and recording_trace((g, total and total[0])) is not None:\n",
+        "    if open_traces and is_recorded(g):\n",
+        "tests/autodiff/test_jit.py::test_second_order_and_forward_mode",
+    ),
+    "cotangents of a jitted step in the order of its result": Bug(
+        "trajectory/recorded_steps.py",
+        "            cotangents[place] = zero_like",
+        "            cotangents[len(cotangents) - 1 - place] = zero_like",
+        "tests/trajectory/test_rollout_jit.py",
+    ),
+    "a state before a cut of truncation that gets a cotangent from a jitted step": Bug(
+        "trajectory/recorded_steps.py",
+        "        if state.i < self.specification.first_traced or state.i in self.specification.cuts:\n",
+        "        if state.i < self.specification.first_traced:\n",
+        "tests/trajectory/test_rollout_jit.py",
+    ),
+    "a program that is not compared with its function": Bug(
+        "autodiff/jit.py",
+        "        return self._check and not all(map(_same, variables, self.first))\n",
+        "        return self._check and all(map(_same, variables, self.first))\n",
+        "tests/autodiff/test_errors_jit.py",
+    ),
     "a cotangent added to an array that others hold": Bug(
         "autodiff/tape.py",
         "    if total is not None and total[1] and type(total[0]) is np.ndarray:\n        return total[0]\n",

@@ -40,8 +40,8 @@ def pair_of_bounds(bounds: Any) -> Any:
     Examples
     --------
     >>> from scipy.optimize import Bounds
-    >>> pair_of_bounds(Bounds([0.0, 2.0], np.inf))
-    (array([0., 2.]), inf)
+    >>> pair_of_bounds(Bounds([0.0, 2.0], [1.0, 3.0]))
+    (array([0., 2.]), array([1., 3.]))
     """
     if bounds is None or (isinstance(bounds, (tuple, list)) and len(bounds) == 2):
         return bounds

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from sparsedp.autodiff.derivative import zero_like
 from sparsedp.autodiff.jit import Jitted, is_watched, tree_form
 from sparsedp.autodiff.program_trace import Slot
@@ -77,9 +79,10 @@ class RecordedStepRunner(StepRunner):
         else:
             outputs, results = self._recorded.results(variables)
         # Raises an error if the result of the step does not have the form of the state.
-        taken, _, _, _ = specification.state.take(outputs.build(results), "the step", self.number, self.outer)
+        _, values, _, _ = specification.state.take(outputs.build(results), "the step", self.number, self.outer)
         slots = specification.state.variables(outputs.build(outputs.slots))
-        self.keeps_form = taken is not None and all(type(slot) is Slot for slot in slots)
+        returned = specification.state.variables(outputs.build(results))
+        self.keeps_form = all(map(_is_same_kind, returned, values)) and all(type(slot) is Slot for slot in slots)
         # For each variable of the state its position among the results of the program.
         self._order = [outputs.slots.index(slot) for slot in slots] if self.keeps_form else []
 
@@ -130,3 +133,10 @@ class RecordedStepRunner(StepRunner):
         if all(back is None for back in backs):
             return None
         return backs
+
+
+def _is_same_kind(returned: Any, converted: Any) -> bool:
+    """Return whether a result of a step needs no conversion to a number or contiguous array of the state's dtype."""
+    if type(returned) is not type(converted) or returned.dtype != converted.dtype:
+        return False
+    return not isinstance(returned, np.ndarray) or returned.flags.c_contiguous

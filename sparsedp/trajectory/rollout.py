@@ -161,7 +161,9 @@ def rollout(
         raise DerivativeError("rollout needs n as a plain whole number, got a traced value; it has no derivative")
     n = check_integer("n of rollout", n, 0, "; for a time T write round(T / dt)")
     if open_traces and recording_trace(leaves((state, params, inputs))) is not None:
-        jitted = step if isinstance(step, Jitted) else Jitted(step, falls_back=True)
+        jitted = step
+        if memory != "reverse" and not isinstance(step, Jitted):
+            jitted = Jitted(step, falls_back=True)
         return opaque(rollout)(
             jitted, state, params, n, inputs, memory, keep, truncate, progress=progress, record=record
         )

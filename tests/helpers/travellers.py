@@ -291,6 +291,7 @@ def travellers():
     yield "brinkman", "", dp.brinkman(GRID), lambda friction: bits(friction, v)
     yield "harmonic_average", "", dp.harmonic_average(GRID), lambda f: bits(f, np.exp(numbers(GRID.shape)))
     yield "value_and_grad", "", dp.value_and_grad(loss), of_pair
+    yield "jit", "", dp.jit(loss), lambda f: [f(numbers((5, 4))).tobytes()]
     yield "grad", "", dp.grad(loss), lambda f: [f(numbers(7)).tobytes()]
     yield "differentiable", "", dp.differentiable("cube", cube, cube_vjp, cube_jvp), lambda f: bits(f, numbers(7))
     yield "physical_gradient", "", dp.physical_gradient(cube, root_of_cube), of_physical

@@ -99,6 +99,22 @@ def scaled(tree, factor):
     return build(factor * vector)
 
 
+@pytest.mark.parametrize("case", CASES)
+def test_the_step_is_called_for_recordings_and_comparisons_only(case):
+    step, state, params, inputs = CASES[case]
+    calls = []
+
+    def counted(*args):
+        calls.append(None)
+        return step(*args)
+
+    jitted = dp.jit(counted)
+    for _ in range(3):
+        gradient(jitted, state, params, inputs)
+        dp.rollout(jitted, state, params, 9, inputs)
+    assert len(calls) == 4  # each of the two programs is recorded and compared once
+
+
 def test_only_some_arguments_are_differentiated():
     for loss_of in (
         lambda step: lambda p: total(dp.rollout(step, STATES, {**PARAMS, "rate": p}, 5)),
