@@ -1,19 +1,30 @@
-"""What a gradient costs where the arrays are small and Python is what takes time, beside jax where that is at hand.
+"""Time of value and gradient for small arrays, where the calls of Python are the cost, beside jax if it is installed.
 
-Three cases: Burgers' equation composed from an operator and a transport (case A7), smoke that rises in a closed box,
-and a Runge-Kutta step of two unknowns. Each is written twice: with the library, and as a user of slices would, a twin
-that runs under autograd and under jax (float64, jitted, warm; a scan of single steps or of ten, whichever is faster).
-All rows of a case run in turn, the smallest time counts. The column beside it is the largest difference from the
-gradient of the twin under autograd, relative to the largest entry.
+Each case is written twice: with the library, and with slices (the twin), which runs under autograd and under jax
+(float64, jitted, warm; a scan of single steps or of ten, whichever is faster). The rows of a case are
 
-Run ``python -m benchmarks.small`` in the root of the repository.
+- the twin under autograd,
+- a loop of steps, and a rollout of the step,
+- the same with ``dp.jit(step)``, and ``dp.jit(loss)`` of the loss with the plain loop,
+- the twin under ``jax.jit``.
+
+All rows of a case run in turn. The columns are the time of the value, median and minimum of the time of value and
+gradient, these two divided by those of jax, the limit of the last but one, the first call (it records or compiles; the
+kernels of the library are compiled before), the peak memory of a call, and the largest difference from the gradient of
+the twin under autograd, relative to its largest entry.
+
+Run ``python -m benchmarks.small`` in the root of the repository, or ``python -m benchmarks.small Lorenz smoke`` for the
+cases whose names contain one of these words.
 """
 
 import subprocess
 import sys
+import time
+import tracemalloc
 from collections.abc import Callable
 from functools import partial
 from importlib.util import find_spec
+from statistics import median
 from typing import Any, NamedTuple
 
 import autograd
@@ -21,7 +32,7 @@ import autograd.numpy as anp
 import numpy as np
 
 import sparsedp as dp
-from benchmarks.triad import best_times
+from benchmarks.triad import best_times, times_in_turn
 from sparsedp import kernels
 
 FIRST = """
@@ -38,9 +49,10 @@ print(time.process_time() - begun)
 
 
 class Case(NamedTuple):
-    """What is differentiated: measure(np, end) where n steps lead from state and params, begin(x), to the end.
+    """A loss of x: measure(np, end), where `n` steps lead from the state and params of begin(x) to the end.
 
-    ``step(state, params)`` is ours, ``twin(np)`` makes that of slices, of autograd.numpy or jax.numpy.
+    ``step(state, params)`` is that of the library, ``twin(np)`` returns that of slices, with autograd.numpy or
+    jax.numpy.
     """
 
     name: str
@@ -50,7 +62,9 @@ class Case(NamedTuple):
     step: Callable
     twin: Callable[[Any], Callable]
     measure: Callable
-    limit: float | None  # of value and gradient, in a rollout and as a loop [ms]
+    limit: float | None  # of the plain loop and rollout, value and gradient [ms]
+    share: float | None  # limit of the rows with dp.jit, as a multiple of the time of jax
+    repeats: int
 
 
 # ---- cases -----------------------------------------------------------------------------------------------------------
@@ -78,7 +92,7 @@ def burgers():
         return step
 
     miss = lambda np, u: np.mean((u - 0.5 * start) ** 2)
-    return Case("Burgers composed, 128 cells", 16, start, lambda u: (u, 0.5 * start), step, twin, miss, 1.0)
+    return Case("Burgers composed, 128 cells", 16, start, lambda u: (u, 0.5 * start), step, twin, miss, 1.0, 4.0, 200)
 
 
 def donor_cell():
@@ -93,7 +107,7 @@ def donor_cell():
         return step
 
     step = lambda u, v: move(u, v, share)
-    return burgers()._replace(name="one rule, 128 cells", step=step, twin=twin, limit=0.13)
+    return burgers()._replace(name="one rule, 128 cells", step=step, twin=twin, limit=0.13, share=3.0)
 
 
 def smoke(n=32, dt=0.05):
@@ -112,7 +126,9 @@ def smoke(n=32, dt=0.05):
     begin = lambda smoke: ((smoke, np.zeros(room.faces.size)), None)
     height = lambda np, end: np.sum(y * end[0]) / np.sum(end[0])
     puff = np.exp(-((x - 0.45) ** 2 + (y - 0.3) ** 2) / 0.01)
-    return Case(f"smoke, {n} x {n} cells", 20, puff, begin, step, lambda np: sliced_smoke(np, n, dt), height, 6.0)
+    return Case(
+        f"smoke, {n} x {n} cells", 20, puff, begin, step, lambda np: sliced_smoke(np, n, dt), height, 6.0, 1.3, 40
+    )
 
 
 def sliced_smoke(np, n, dt):
@@ -159,27 +175,92 @@ def sliced_smoke(np, n, dt):
     return step
 
 
+def rk4(rate, h):
+    """Return the step of the classical Runge-Kutta method, written out."""
+
+    def step(u, p):
+        a = rate(u, p)
+        b = rate(u + h / 2 * a, p)
+        c = rate(u + h / 2 * b, p)
+        d = rate(u + h * c, p)
+        return u + h / 6 * (a + 2 * b + 2 * c + d)
+
+    return step
+
+
 def predators(h=0.05):
     """200 steps of rk4 with two unknowns: the sum of squares at the end, derivatives in three rates."""
 
     def rate(np):
         return lambda u, p: np.array([p[0] * u[0] - p[1] * u[0] * u[1], p[1] * u[0] * u[1] - p[2] * u[1]])
 
-    def twin(np):
-        f = rate(np)
+    start, p = np.array([1.0, 0.5]), np.array([1.0, 0.8, 0.9])
+    total = lambda np, u: np.sum(u**2)
+    step, twin = dp.stepper("rk4", rate(anp), h), lambda np: rk4(rate(np), h)
+    return Case("rk4, two unknowns", 200, p, lambda p: (start, p), step, twin, total, None, 5.0, 7)
 
-        def step(u, p):
-            a = f(u, p)
-            b = f(u + h / 2 * a, p)
-            c = f(u + h / 2 * b, p)
-            d = f(u + h * c, p)
-            return u + h / 6 * (a + 2 * b + 2 * c + d)
+
+def lorenz(n=40, h=0.05):
+    """Lorenz-96: 20 steps of rk4, the sum of squares at the end, derivatives in the start."""
+
+    def rate(np):
+        return lambda u, force: (np.roll(u, -1) - np.roll(u, 2)) * np.roll(u, 1) - u + force
+
+    start = 8.0 + np.sin(np.arange(n))
+    total = lambda np, u: np.sum(u**2)
+    step, twin = dp.stepper("rk4", rate(anp), h), lambda np: rk4(rate(np), h)
+    return Case("Lorenz-96, 40 variables", 20, start, lambda u: (u, 8.0), step, twin, total, None, 5.0, 50)
+
+
+def eigenvectors(grid, boundary):
+    """Return the eigenvalues of the Laplacian, an array (n, n), and the eigenvectors along one axis."""
+    line = dp.laplacian(dp.Grid(grid.shape[0], size=1.0), boundary).matrix.toarray()
+    values, vectors = np.linalg.eigh(line)
+    return values[:, None] + values, vectors
+
+
+def poisson(n=64):
+    """A solve on 64 x 64 cells with u = 0 at the walls: the sum of squares, derivatives in the source."""
+    room = dp.Grid((n, n), size=1.0)
+    solve = dp.inverse(-dp.laplacian(room, dp.dirichlet))
+    values, vectors = eigenvectors(room, dp.dirichlet)
+
+    def twin(np):
+        return lambda b, _: vectors @ ((vectors.T @ b @ vectors) / -values) @ vectors.T
+
+    x, y = room.centres()
+    total = lambda np, u: np.sum(u**2)
+    source = np.exp(-((x - 0.4) ** 2 + (y - 0.3) ** 2) / 0.02)
+    return Case("Poisson, 64 x 64", 1, source, lambda b: (b, None), lambda b, _: solve(b), twin, total, None, 1.5, 200)
+
+
+def reaction_diffusion(n=64, h=0.1, nu=1e-3):
+    """100 imex steps of u' = nu Laplacian u + u - u^3: the mean of u^4 at the end, derivatives in the start."""
+    room = dp.Grid((n, n), size=1.0)
+    react = lambda u, _: u - u**3
+    step = dp.stepper("imex", react, h, linear=(dp.laplacian(room, dp.neumann), nu))
+    values, vectors = eigenvectors(room, dp.neumann)
+    gamma = 1 - np.sqrt(0.5)
+    delta = 1 - 1 / (2 * gamma)
+
+    def twin(np):
+        """Return the two-stage IMEX Runge-Kutta step of second order (Ascher, Ruuth and Spiteri, 1997)."""
+        apply = lambda f, u: vectors @ (f * (vectors.T @ u @ vectors)) @ vectors.T
+        solve = 1 / (1 - gamma * h * nu * values)
+
+        def step(u, _):
+            first = react(u, None)
+            v = apply(solve, u + gamma * h * first)
+            slope = apply(nu * values, v)
+            second = react(v, None)
+            return apply(solve, u + h * (delta * first + (1 - delta) * second) + (1 - gamma) * h * slope)
 
         return step
 
-    start, p = np.array([1.0, 0.5]), np.array([1.0, 0.8, 0.9])
-    total = lambda np, u: np.sum(u**2)
-    return Case("rk4, two unknowns", 200, p, lambda p: (start, p), dp.stepper("rk4", rate(anp), h), twin, total, None)
+    x, y = room.centres()
+    start = 0.3 * np.cos(5 * x) * np.cos(7 * y) + 0.1
+    size = lambda np, u: np.mean(u**4)
+    return Case("reaction-diffusion, 64 x 64", 100, start, lambda u: (u, None), step, twin, size, None, None, 10)
 
 
 # ---- forms -----------------------------------------------------------------------------------------------------------
@@ -207,12 +288,27 @@ def written(case):
     return lambda x: case.measure(anp, run(step, *case.begin(x), case.n))
 
 
+def forms(case):
+    """Return the losses of the rows with the library, by name."""
+    recorded = case._replace(step=dp.jit(case.step))
+    losses = {"plain loop": looped(case), "rollout": rolled(case)}
+    losses["jit step in a loop"] = looped(recorded)
+    losses["jit step in rollout"] = rolled(case._replace(step=dp.jit(case.step)))
+    losses["jit loss"] = dp.jit(looped(case))
+    if case.n == 1:
+        del losses["rollout"], losses["jit step in rollout"]
+    return losses
+
+
 def gradient(loss):
     return lambda x: dp.value_and_grad(loss)(x)[1]
 
 
 def compiled_by_jax(case):
-    """(value, value and gradient) of jax, each a function of x, or None where jax is not installed."""
+    """Return two functions for jax, of the value and of value and gradient, and the seconds of the first call.
+
+    Return None if jax is not installed.
+    """
     if find_spec("jax") is None:
         return None
     import jax  # optional: only this benchmark looks at it
@@ -226,35 +322,75 @@ def compiled_by_jax(case):
         return case.measure(jax.numpy, end)
 
     found = []
+    seconds = 0.0
     for transform in (lambda f: f, jax.value_and_grad):
         ways = [jax.jit(transform(partial(loss, unroll=many))) for many in (1, 10)]
         runs = {k: partial(lambda way: jax.block_until_ready(way(case.x)), way) for k, way in enumerate(ways)}
+        firsts = {k: first_seconds(run) for k, run in runs.items()}
         best = best_times(runs, 30)
-        found.append(runs[min(best, key=best.get)])
-    return found
+        fastest = min(best, key=best.get)
+        seconds = firsts[fastest]
+        found.append(runs[fastest])
+    return *found, seconds
 
 
-def table(case, repeats):
+def first_seconds(task):
+    """Return the seconds of a call."""
+    begun = time.perf_counter()
+    task()
+    return time.perf_counter() - begun
+
+
+def peak_megabytes(task):
+    """Return the peak memory that Python and NumPy take during a call."""
+    tracemalloc.start()
+    task()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return peak / 1e6
+
+
+def table(case):
     """Print the rows of a case."""
-    error = lambda g: np.max(np.abs(np.asarray(g) - wanted)) / np.max(np.abs(wanted))
     x, theirs = case.x, autograd.value_and_grad(written(case))
     wanted = theirs(x)[1]
     rows = {"slices, tape of autograd": (lambda: written(case)(x), lambda: theirs(x))}
-    for name, form in (("loop by hand", looped(case)), ("rollout", rolled(case))):
-        rows[name] = lambda form=form: form(x), lambda form=form: dp.value_and_grad(form)(x)
-    if jitted := compiled_by_jax(case):
-        rows["slices, jax"] = jitted
-    best = best_times({(name, k): task for name, row in rows.items() for k, task in enumerate(row)}, repeats)
-    print(f"\n{case.name}, {case.n} steps")
-    print(f"{'':26} {'value ms':>9} {'and gradient':>13} {'over value':>11} {'limit ms':>9} {'x jax':>7} {'error':>9}")
+    for name, loss in forms(case).items():
+        rows[name] = partial(loss, x), partial(dp.value_and_grad(loss), x)
+    gradient(looped(case))(x)  # kernels are compiled
+    first = {name: first_seconds(both) for name, (_, both) in rows.items()}
+    jitted = compiled_by_jax(case)
+    if jitted:
+        *rows["slices, jax"], first["slices, jax"] = jitted
+    times = times_in_turn({(name, k): task for name, row in rows.items() for k, task in enumerate(row)}, case.repeats)
+    print(f"\n{case.name}, {case.n} step{'s' * (case.n > 1)}")
+    print(
+        f"{'':24} {'value ms':>9} {'gradient ms':>12} {'minimum':>8} {'x jax':>6} {'minimum':>8} {'limit':>8}"
+        f" {'first s':>8} {'MB':>6} {'error':>8}"
+    )
     for name, (_, both) in rows.items():
-        value, seconds = best[name, 0], best[name, 1]
-        limit = "" if name.startswith("slices") else case.limit or ""
-        beside = f"{seconds / best['slices, jax', 1]:7.2f}" if jitted else f"{'-':>7}"
+        seconds = times[name, 1]
+        beside = " " * 15
+        if jitted:
+            reference = times["slices, jax", 1]
+            beside = f"{median(seconds) / median(reference):6.2f} {min(seconds) / min(reference):8.2f}"
+        megabytes = f"{peak_megabytes(both):6.2f}"
+        if name == "slices, jax":
+            megabytes = f"{'-':>6}"  # jax allocates outside Python
+        error = np.max(np.abs(np.asarray(both()[1]) - wanted)) / np.max(np.abs(wanted))
         print(
-            f"{name:26} {1e3 * value:9.3f} {1e3 * seconds:13.3f} {seconds / value:11.1f} {limit:>9} {beside}"
-            f" {error(both()[1]):9.1e}"
+            f"{name:24} {1e3 * median(times[name, 0]):9.3f} {1e3 * median(seconds):12.3f} {1e3 * min(seconds):8.3f}"
+            f" {beside} {limit(case, name):>8} {first[name]:8.3f} {megabytes} {error:8.1e}"
         )
+
+
+def limit(case, name):
+    """Return the limit of a row as text."""
+    if name in ("plain loop", "rollout") and case.limit:
+        return f"{case.limit:g} ms"
+    if name in ("jit step in rollout", "jit loss") and case.share:
+        return f"{case.share:g} x"
+    return ""
 
 
 def descents(loss, x):
@@ -281,10 +417,17 @@ def of_autograd():
     return 1e6 * (best[120] - best[20]) / 100
 
 
-def main():
+CASES = (burgers, donor_cell, predators, lorenz, smoke, poisson, reaction_diffusion)
+
+
+def main(words):
     print(f"value and gradient, kernels: {'numba' if kernels.compiled() else 'NumPy'}")
-    for case, repeats in ((burgers(), 300), (donor_cell(), 300), (smoke(), 40), (predators(), 10)):
-        table(case, repeats)
+    for build in CASES:
+        case = build()
+        if not words or any(word in case.name for word in words):
+            table(case)
+    if words:
+        return
     case = burgers()
     tasks = {form.__name__: partial(descents, form(case), case.x) for form in (looped, rolled)}
     print()
@@ -296,4 +439,4 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

@@ -50,16 +50,21 @@ def triad(shape):
     return lambda: run(a, b, c, 3.0)
 
 
-def best_times(tasks, repeats):
-    """Run functions in turn `repeats` times, and return the smallest time [s] of each, by name."""
-    best = dict.fromkeys(tasks, float("inf"))
+def times_in_turn(tasks, repeats):
+    """Run functions in turn `repeats` times, and return the times [s] of each as a list, by name."""
+    times = {name: [] for name in tasks}
     for lap in range(repeats + 1):
         for name, task in tasks.items():
             start = time.perf_counter()
             task()
             if lap:  # the first lap compiles and touches the pages
-                best[name] = min(best[name], time.perf_counter() - start)
-    return best
+                times[name].append(time.perf_counter() - start)
+    return times
+
+
+def best_times(tasks, repeats):
+    """Run functions in turn `repeats` times, and return the smallest time [s] of each, by name."""
+    return {name: min(times) for name, times in times_in_turn(tasks, repeats).items()}
 
 
 def triad_bandwidth(shape, repeats=10):
