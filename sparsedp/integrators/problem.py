@@ -20,6 +20,7 @@ import numpy as np
 
 from sparsedp._utils.pytree import branches_mapped, child, copied, flatten, keys, leaves, mapped, paired, subscript
 from sparsedp._utils.validation import check_function, check_number, check_takes
+from sparsedp.autodiff.program_trace import check_values
 from sparsedp.autodiff.tape import cast, dtype_of, is_variable, isbox, plain
 from sparsedp.autodiff.tape_constants import frozen
 from sparsedp.errors import ShapeError
@@ -126,7 +127,11 @@ def real_number(value: Any, name: str, sign: str = "", advice: str = "", kind: s
 
     A Python float does not widen a float32 state to float64. For the last three arguments see `check_number`.
     """
-    check_number(name, plain(value), sign, advice, kind)
+
+    def check(number: Any) -> None:
+        check_number(name, number, sign, advice, kind)
+
+    check_values(check, value)
     if isbox(value):
         return value
     return float(value)

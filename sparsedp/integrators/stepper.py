@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from sparsedp._utils.validation import (
     rounded_down,
 )
 from sparsedp.autodiff.derivative import is_finite
+from sparsedp.autodiff.program_trace import check_values, recording_trace, sample
 from sparsedp.autodiff.tape import is_variable, plain
 from sparsedp.errors import NonFiniteError, UnstableStepError
 from sparsedp.integrators.problem import Problem, check_pair, like, real_number
@@ -466,7 +468,8 @@ class Step(Reconstructible):
         if self.problem.stiff:
             self.problem.terms(u)  # raise an error for a state of another structure before anything is solved
         for term, largest in self.limits:
-            self._check_stable(float(plain(h)), float(plain(term.coefficient(params))), term.op.name, largest)
+            check = partial(self._check_stable, term.op.name, largest)
+            check_values(check, h, term.coefficient(params))
         end = None
         try:
             new = self.scheme(u, params, t, h)
@@ -482,7 +485,11 @@ class Step(Reconstructible):
         except TypeError as error:
             advise(error, params, "step(state, params)")
             raise
-        if not all(is_finite(leaf) for leaf in leaves(new) if is_variable(leaf)):
+        ends = [leaf for leaf in leaves(new) if is_variable(leaf)]
+        if recording_trace(ends) is not None:
+            names, values = self._named_variables(state, params)
+            check_values(partial(self._check_finite_ends, len(ends), names), h, *ends, *values)
+        elif not all(map(is_finite, ends)):
             self._refuse_nonfinite(state, params)
             raise NonFiniteError(self._overflow(h))
         if self.method == "leapfrog" and self.arguments["unstable"] == "raise":
@@ -508,7 +515,7 @@ class Step(Reconstructible):
 
     def _overflow(self, h: Any) -> str:
         return (
-            f"{self.name} got NaN or infinity from a finite state with dt = {float(plain(h)):.6g}; "
+            f"{self.name} got NaN or infinity from a finite state with dt = {float(sample(h)):.6g}; "
             "take smaller steps or an implicit method"
         )
 
@@ -523,8 +530,10 @@ class Step(Reconstructible):
             raise ValueError(f"{self.name} cannot be reversed; write 'leapfrog'")
         self.scheme.check_reversible()
 
-    def _check_stable(self, h: float, c: float, name: str, largest: float) -> None:
+    def _check_stable(self, name: str, largest: float, h: Any, c: Any) -> None:
         """Raise UnstableStepError if repeated steps of length h would grow without bound."""
+        h = float(h)
+        c = float(c)
         if h * c > largest * (1 + ROUNDING):
             most = rounded_down(largest / c)
             shown = number_beside(h, float(most), digits=12)
@@ -539,12 +548,32 @@ class Step(Reconstructible):
             return state, None
         return check_pair(f"the state of {self.name}, whose rate takes a time,", state, "(u, t)")
 
-    def _refuse_nonfinite(self, state: Any, params: Any) -> None:
-        """Raise NonFiniteError for a leaf of state or params that is not finite."""
+    def _named_variables(self, state: Any, params: Any) -> tuple[list[str], list[Any]]:
+        """Return the names and the values of the floating leaves of state and params."""
+        names = []
+        values = []
         for what, tree in (("state", state), ("params", params)):
             for place, leaf in zip(labels(tree, what), leaves(tree), strict=True):
                 if is_variable(leaf):
-                    check_finite(f"{place} of {self.name}", np.asarray(plain(leaf)))
+                    names.append(place)
+                    values.append(leaf)
+        return names, values
+
+    def _refuse_nonfinite(self, state: Any, params: Any) -> None:
+        """Raise NonFiniteError for a leaf of state or params that is not finite."""
+        for name, value in zip(*self._named_variables(state, params), strict=True):
+            check_finite(f"{name} of {self.name}", np.asarray(sample(value)))
+
+    def _check_finite_ends(self, n_ends: int, names: Sequence[str], h: Any, *values: Any) -> None:
+        """Raise NonFiniteError if one of the first `n_ends` values, those of the new state, is not finite.
+
+        The other values are those of state and params, with their names. If one of them is not finite, it is named.
+        """
+        if all(map(is_finite, values[:n_ends])):
+            return
+        for name, value in zip(names, values[n_ends:], strict=True):
+            check_finite(f"{name} of {self.name}", np.asarray(value))
+        raise NonFiniteError(self._overflow(h))
 
     def __repr__(self) -> str:
         if callable(self.dt):
