@@ -51,6 +51,29 @@ def test_ensemble():
     assert after < before / 2
 
 
+@example("predator_prey.py")
+def test_predator_prey():
+    """The recorded step has the gradient of the plain one, and all searches find the same rates."""
+    printed = run("predator_prey.py")
+    assert "program of the step: agrees" in printed
+    errors = [float(error) for error in re.findall(r"^(?:diff|rev).* (\S+)$", printed, re.MULTILINE)]
+    assert len(errors) == 3 and errors[0] < 1e-5 and errors[2] < 1e-13
+    found = re.findall(r"^(?:least_squares|minimize).* (\d+\.\d+) +(\d+\.\d+) %$", printed, re.MULTILINE)
+    assert len(found) == 4 and len({misfit for misfit, _ in found}) == 1
+    assert all(float(error) < 5.0 for _, error in found)
+
+
+@example("pendulums.py")
+def test_pendulums():
+    """A motion for all lengths leaves a tenth of the swing of a motion for one length."""
+    printed = run("pendulums.py")
+    assert "program of the step: agrees" in printed and "gradient: agrees" in printed
+    found = re.findall(r"^(?:one length|all lengths) .* (\S+) m +(\S+) +(\S+)$", printed, re.MULTILINE)
+    (place, mean, _), (all_place, all_mean, _) = [tuple(map(float, figures)) for figures in found]
+    assert abs(place - 10.0) < 0.01 and abs(all_place - 10.0) < 0.01
+    assert all_mean < mean / 10
+
+
 @example("torch_training.py")
 def test_torch_training():
     """The network has the law, though it has seen temperatures alone."""

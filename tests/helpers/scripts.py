@@ -48,6 +48,7 @@ SMALL = {
     "ensemble.py": "5",
     "mesh_design.py": "3",
     "pylops_exchange.py": "32",
+    "pendulums.py": "10",
 }  # cells, the end time, or gradients; the others run with 16
 NEEDS = {
     "torch_training.py": "torch",
