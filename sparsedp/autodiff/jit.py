@@ -344,6 +344,7 @@ class Recorded:
         self._check = check
         self._function = function
         self.first = [_copied(sample(variable)) for variable in variables]
+        self._strided = [num for num, variable in enumerate(variables) if _is_strided(sample(variable))]
         check_leaves("args", (args, options))
         check_native("dp.jit", *self.first)
         entries = leaves((args, options))
@@ -368,6 +369,12 @@ class Recorded:
         trace = ProgramTrace(new_trace())
         return trace, [trace.slot(_copied(value)) for value in self.first]
 
+    def dense(self, variables: Sequence) -> Sequence:
+        """Return the variables with copies of arrays that are not contiguous, in the layout of the recording."""
+        if not self._strided:
+            return variables
+        return placed(variables, self._strided, [_copied(variables[num]) for num in self._strided])
+
     def value(self, variables: Sequence) -> Any:
         """Return the result of the function by its program."""
         outputs, results = self.results(variables)
@@ -378,7 +385,7 @@ class Recorded:
         if self._value is None:
             self._value = self._record_value()
         run, outputs = self._value
-        results = run(*variables)
+        results = run(*self.dense(variables))
         if not self._value_is_checked and self._is_to_be_checked(variables):
             self._value_is_checked = True
             check_program(self.name, self.call(self.arguments(variables)), outputs.build(results))
@@ -441,6 +448,10 @@ def _agree(a, b):
 def _same(a, b):
     """Return True if two arrays have the same values."""
     return np.array_equal(sample(a), b)
+
+
+def _is_strided(value):
+    return isinstance(value, np.ndarray) and not value.flags.c_contiguous
 
 
 def _copied(value):
@@ -569,7 +580,7 @@ class PullbackProgram:
 
     def forward(self, variables: Sequence) -> tuple[tuple, tuple]:
         """Return the values of the result, and the values that `backward` needs before the cotangents."""
-        values = self._forward(*variables)
+        values = self._forward(*self._recorded.dense(variables))
         return values[: self._n_results], values[self._n_results :]
 
     def compare(self, variables: Sequence) -> None:

@@ -119,6 +119,23 @@ def test_other_dtypes(dtype):
         np.testing.assert_allclose(slope, gradient, rtol=1e-5 if dtype is np.float32 else 1e-13)
 
 
+@pytest.mark.parametrize(
+    "view", [lambda u: u[::-1], lambda u: u[::2], lambda u: np.broadcast_to(u[:1], (50, 40)), np.asfortranarray]
+)
+def test_layouts(view):
+    def loss(u):
+        v = anp.reshape(u * u, (-1,))
+        return anp.sum(anp.sin(v)) + anp.sum(LAPLACIAN(v[:16]) ** 2)
+
+    jitted = dp.jit(loss, check=False)
+    for seed in range(3):
+        x = view(np.random.default_rng(seed).random((50, 40)))
+        value, gradient = dp.value_and_grad(loss)(x)
+        found, slope = dp.value_and_grad(jitted)(x)
+        assert found == value
+        np.testing.assert_allclose(slope, gradient, rtol=1e-13)
+
+
 def test_results_share_no_memory():
     def function(u):
         v = 3.0 * u
