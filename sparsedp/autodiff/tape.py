@@ -226,6 +226,8 @@ class Recorder:
         The recorded calls.
     bytes : int or None
         If it is a number, the sizes in bytes of results and of arguments that are not traced are added to it.
+    entries : dict
+        While `dp.jit` records: (node of an array, index) -> entry that was taken from it.
     ended : bool
         Whether the traced function has returned. Its values cannot be differentiated any more, so that using one of
         them raises a DerivativeError.
@@ -235,6 +237,7 @@ class Recorder:
         self.nodes: list[ReverseNode] = []
         self.witnesses = (*thread.node_hooks, *witnesses)
         self.bytes: Any = None
+        self.entries: dict[tuple, Any] = {}
         self.ended = False
 
     def root(self) -> ReverseNode:
@@ -260,6 +263,7 @@ class Recorder:
         """Return and clear the recorded nodes; this breaks a reference cycle."""
         nodes = self.nodes
         self.nodes = []
+        self.entries = {}
         return nodes
 
     def check_open(self) -> None:
@@ -753,6 +757,8 @@ def _binary(function):
             nums = SECOND
             parents = (node,)
         if type(a) is BOX or type(b) is BOX:
+            if function is ITEM and type(node) is ReverseNode and type(b) is int and is_recorded(a):
+                return _entry_of_program(x, a, b, call)
             answer = call(a, b)
             executed = function
         else:
@@ -765,6 +771,21 @@ def _binary(function):
         return BOX(answer, trace, node) if type(answer) in NUMBERS else new_box(answer, trace, node)
 
     return call
+
+
+def _entry_of_program(box, array, index, take):
+    """Return an entry of an array while `dp.jit` records; the same value for each use of an entry.
+
+    Its cotangents are then added as numbers, and put into the cotangent of the array once.
+    """
+    node = box._node
+    known = node.recorder.entries
+    entry = known.get((node, index))
+    if entry is None:
+        answer = take(array, index)
+        entry = new_box(answer, box._trace, ReverseNode(answer, ITEM, (array, index), {}, FIRST, (node,)))
+        known[node, index] = entry
+    return entry
 
 
 def _reflected(act):
@@ -792,8 +813,9 @@ def _install():
 
     @wraps(COPY)
     def copy_of(args, options, value):
-        if type(value) in box_types and type(value._value) is np.float64 and type(value._node) in OWN_NODES:
-            if not (args or options):
+        if type(value) in box_types and not (args or options) and type(value._node) in OWN_NODES:
+            number = value._value
+            if type(number) is np.float64 or (is_recorded(number) and type(number._value) is np.float64):
                 return value  # a number needs no copy
         return copy(args, options, value)
 
