@@ -16,7 +16,7 @@ from sparsedp.advection.method import Identity, TransportMethod
 from sparsedp.advection.rule import rule_of
 from sparsedp.advection.semi_lagrangian import SemiLagrangian
 from sparsedp.advection.settings import TransportSettings
-from sparsedp.autodiff.tape import isbox, plain
+from sparsedp.autodiff.tape import isbox, sample
 from sparsedp.errors import DerivativeError
 from sparsedp.grid.boundary_conditions import dirichlet, neumann, resolve
 from sparsedp.grid.grid import check_grid
@@ -266,8 +266,8 @@ class Transport(Frozen, Reconstructible):
         """Raise ValueError if no side uses the inflow values. Constant zeros and empty arrays are accepted."""
         if any(condition == dirichlet for pair in self.settings.sides for condition in pair or ()):
             return
-        values = plain(inflow)
-        if np.any(values) or (isbox(inflow) and np.size(values)):
+        values = sample(inflow)
+        if np.size(values) and (isbox(inflow) or np.any(values)):
             raise ValueError(
                 f"{self.method.name} uses inflow values at sides of dp.dirichlet only, and boundary= has none; write "
                 "boundary=dp.dirichlet, or leave the inflow out"

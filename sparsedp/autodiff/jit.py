@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from contextlib import contextmanager
-from functools import partial, update_wrapper, wraps
+from functools import partial, update_wrapper
 from operator import getitem
 from threading import RLock
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,7 @@ from sparsedp._utils.validation import check_function, check_leaves, check_nativ
 from sparsedp.autodiff.backend import ARRAY_KINDS
 from sparsedp.autodiff.derivative import gradient_of, hvp, taped, value_and_grad, zero_like
 from sparsedp.autodiff.program import compile_program, free_slots, needed_calls
-from sparsedp.autodiff.program_trace import ProgramTrace, Slot, open_traces
+from sparsedp.autodiff.program_trace import ProgramTrace, Slot, opaque, open_traces
 from sparsedp.autodiff.tape import (
     Rule,
     VJPNode,
@@ -366,7 +366,7 @@ class Recorded:
 
     def begin(self) -> tuple[ProgramTrace, list[Slot]]:
         """Return a new trace, and the slots of the variables."""
-        trace = ProgramTrace(new_trace())
+        trace = ProgramTrace(new_trace(), opaque_call)
         return trace, [trace.slot(_copied(value)) for value in self.first]
 
     def dense(self, variables: Sequence) -> Sequence:
@@ -696,23 +696,13 @@ class JittedRule(Rule):
 # ---- functions that decide by values ---------------------------------------------------------------------------------
 
 
-def opaque(function: Callable) -> Callable:
-    """Decorate a function that makes decisions by values of arrays: `dp.jit` records it as one call.
-
-    The program calls the function itself. Derivatives come from a tape of this call.
-    """
-
-    @wraps(function)
-    def call(*args, **options):
-        if not open_traces or recording_trace(leaves((args, options))) is None:
-            return function(*args, **options)
-        structure = TreeStructure((args, options), "arguments", is_variable)
-        variables = structure.variables((args, options))
-        nums = innermost(variables)
-        rule = OpaqueCall(function, structure, nums)
-        return rule.build(through(rule, nums, *variables))
-
-    return call
+def opaque_call(function: Callable, args: tuple, options: dict) -> Any:
+    """Record a call of a function that makes decisions by values as one call of the program; see `opaque`."""
+    structure = TreeStructure((args, options), "arguments", is_variable)
+    variables = structure.variables((args, options))
+    nums = innermost(variables)
+    rule = OpaqueCall(function, structure, nums)
+    return rule.build(through(rule, nums, *variables))
 
 
 class OpaqueCall(Rule):

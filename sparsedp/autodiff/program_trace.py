@@ -8,7 +8,7 @@ value in one of three ways:
 =================  =====================================================================================================
 `sample`           for the shape or dtype only
 `check_values`     for a check, which becomes a call of the program
-`plain`            for a decision, which raises JitError here, unless the function is decorated by `jit.opaque`, so that
+`plain`            for a decision, which raises JitError here, unless the function is decorated by `opaque`, so that
                    it becomes one call of the program
 =================  =====================================================================================================
 
@@ -17,12 +17,14 @@ Traces of derivatives lie above this trace: a gradient is recorded like any othe
 
 from __future__ import annotations
 
+from functools import wraps
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import autograd.numpy as anp
 import numpy as np
 from autograd.tracer import Box, Node, box_types, getval, isbox, new_box, notrace_primitives
 
+from sparsedp._utils.pytree import leaves
 from sparsedp.autodiff.backend import BOX
 from sparsedp.autodiff.tape_constants import constant
 from sparsedp.errors import JitError
@@ -37,6 +39,7 @@ __all__ = [
     "Slot",
     "check_values",
     "is_recorded",
+    "opaque",
     "open_traces",
     "recorded_level",
     "recording_trace",
@@ -103,6 +106,8 @@ class ProgramTrace:
     ----------
     number : int
         Number of the trace.
+    opaque_call : callable
+        ``opaque_call(function, args, options)`` calls a function, and records it as one call: see `opaque`.
 
     Attributes
     ----------
@@ -111,8 +116,9 @@ class ProgramTrace:
         The values in the execution that was recorded, in the order of the slots.
     """
 
-    def __init__(self, number: int) -> None:
+    def __init__(self, number: int, opaque_call: Callable) -> None:
         self.number = number
+        self.opaque_call = opaque_call
         self.calls: list[ProgramCall] = []
         self.samples: list[Any] = []
 
@@ -233,6 +239,23 @@ def check_values(check: Callable, *args: Any) -> None:
     if trace is not None:
         slots = [trace.unboxed(recorded_level(arg)) for arg in args]
         trace.add(check, slots, {}, None, has_effect=True)
+
+
+def opaque(function: Callable) -> Callable:
+    """Decorate a function that makes decisions by values of arrays: `dp.jit` records it as one call.
+
+    The program calls the function itself. Derivatives come from a tape of this call.
+    """
+
+    @wraps(function)
+    def call(*args, **options):
+        if open_traces:
+            trace = recording_trace(leaves((args, options)))
+            if trace is not None:
+                return trace.opaque_call(function, args, options)
+        return function(*args, **options)
+
+    return call
 
 
 def _truth(box):

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sparsedp._utils.validation import check_number, number_beside, rounded_down
-from sparsedp.autodiff.tape import plain
+from sparsedp.autodiff.program_trace import check_values
 from sparsedp.errors import UnstableStepError
 from sparsedp.operators.masks_and_lift import identity
 from sparsedp.solvers.inverse import inverse
@@ -98,8 +98,7 @@ class Diffusion:
         coefficient = self.coefficient
         if callable(coefficient):
             coefficient = coefficient(params)
-            check_number("the viscosity of flow_step", plain(coefficient), ">= 0")
-            self._check_stable(float(plain(coefficient)))
+            check_values(self._check_coefficient, coefficient)
         return rate + coefficient * self._laplacian(u, wall_part())
 
     def step_implicit(self, explicit: Any, u: Any, wall_part: Any) -> Any:
@@ -121,6 +120,10 @@ class Diffusion:
         if wall_part is None:
             return self.op(u)
         return self.op(u) + wall_part
+
+    def _check_coefficient(self, coefficient: Any) -> None:
+        """Raise an error if the coefficient that a function returned is negative, or makes the term unstable."""
+        self._check_stable(check_number("the viscosity of flow_step", coefficient, ">= 0"))
 
     def _check_stable(self, coefficient: float) -> None:
         """Raise UnstableStepError if the explicit term is unstable."""

@@ -29,6 +29,7 @@ flux, speed and source have them. The limiter is one differentiation rule with f
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import autograd.numpy as anp
@@ -48,7 +49,8 @@ from sparsedp._utils.validation import (
     is_whole,
 )
 from sparsedp.autodiff.derivative import entrywise
-from sparsedp.autodiff.tape import cast, dtype_of, isbox, plain
+from sparsedp.autodiff.program_trace import check_values
+from sparsedp.autodiff.tape import cast, dtype_of, isbox, plain, sample
 from sparsedp.autodiff.tape_constants import constant, frozen
 from sparsedp.errors import ShapeError
 from sparsedp.grid.boundary_conditions import free_slip, outflow, resolve
@@ -303,12 +305,12 @@ class ConservationLaw(Reconstructible):
                 equilibrium = equilibrium(params)
             e = _checked_result("equilibrium", equilibrium, u)
             rate = self._rate(u, e, params) - self._rate(e, e, params, with_inflow=False)
-        check_finite("the rate of a conservation_law", plain(rate))
+        check_values(_check_rate, rate)
         return cast(rate, dtype_of(u))
 
     def _checked_state(self, u: Any) -> Any:
         """Return the state as a floating-point array; raise if its shape or dtype is wrong."""
-        values = field_array(self, plain(u), batch=True)
+        values = field_array(self, sample(u), batch=True)
         fields = values.shape[: values.ndim - self.grid.dim]
         if len(fields) > 1:
             expected = ", ".join(map(str, ("fields", *self.grid.shape)))
@@ -355,7 +357,7 @@ class ConservationLaw(Reconstructible):
         slowest, fastest = self._wave_speeds(axis.number, both, params)
         a = anp.minimum(anp.minimum(*axis.halves(slowest)), 0.0)
         b = anp.maximum(anp.maximum(*axis.halves(fastest)), 0.0)
-        no_waves = plain(a) == plain(b)  # a = b = 0: the flux is the mean of both fluxes
+        no_waves = a == b  # a = b = 0: the flux is the mean of both fluxes
         width = b - a + no_waves
         share = (b + 0.5 * no_waves) / width
         return share * f_lower + (1.0 - share) * f_upper + a * b / width * (upper - lower)
@@ -366,14 +368,9 @@ class ConservationLaw(Reconstructible):
         if not isinstance(speeds, tuple):
             speeds = (-speeds, speeds)
         first_field = u[(0,) * (u.ndim - self.grid.dim)]
-        for speed in map(plain, speeds):
-            _checked_result("speed", speed, first_field)
-            check_finite(f"the speed of a conservation_law along {AXES[axis]}", speed, advice=IF_NOT_FINITE)
-        if np.any(plain(speeds[0]) > plain(speeds[1])):  # the flux would not be upwind
-            raise ValueError(
-                "the speed of a conservation_law must be >= 0, or a pair, the slowest before the fastest; write abs(u) "
-                "for u, or (u - c, u + c)"
-            )
+        for speed in speeds:
+            _checked_result("speed", sample(speed), first_field)
+        check_values(partial(_check_speeds, axis), *speeds)
         return speeds
 
     def time_step(self, u: Any, params: Any = None, cfl: float = 0.4) -> float:
@@ -393,7 +390,8 @@ class ConservationLaw(Reconstructible):
             Infinite if all speeds are 0. Not differentiated.
         """
         check_number("cfl of time_step", cfl, "> 0", "; write cfl=0.4")
-        u, params = mapped(plain, (self._checked_state(u), params))
+        u = plain(self._checked_state(u))
+        params = mapped(plain, params)
         rates = sum(self._fastest_waves(axis, u, params) / axis.widths for axis in self.axes)
         largest = np.max(rates, initial=0.0)
         if largest:
@@ -413,6 +411,21 @@ class ConservationLaw(Reconstructible):
 
     def __repr__(self) -> str:
         return f"<conservation_law {self.scheme}: {self.grid.cells}>"
+
+
+def _check_rate(rate):
+    check_finite("the rate of a conservation_law", rate)
+
+
+def _check_speeds(axis, slowest, fastest):
+    """Raise an error for wave speeds that are not finite or in the wrong order."""
+    for speed in (slowest, fastest):
+        check_finite(f"the speed of a conservation_law along {AXES[axis]}", speed, advice=IF_NOT_FINITE)
+    if np.any(slowest > fastest):  # the flux would not be upwind
+        raise ValueError(
+            "the speed of a conservation_law must be >= 0, or a pair, the slowest before the fastest; write abs(u) "
+            "for u, or (u - c, u + c)"
+        )
 
 
 def _checked_result(name: str, value: Any, u: Any) -> Any:
@@ -505,7 +518,7 @@ class AxisFluxes:
             value = value(params, self.number, upper)
         if np.ndim(value) == 1 and u.ndim > self.dim:
             value = self._per_field(value)
-        return _checked_result("inflow", value + 0.0 * plain(ghosts), ghosts)
+        return _checked_result("inflow", value + np.zeros(ghosts.shape, dtype_of(ghosts)), ghosts)
 
     def _per_field(self, numbers: Any) -> Any:
         """Reshape an array with one number for each field, so that it broadcasts to the fields."""

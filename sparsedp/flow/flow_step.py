@@ -47,7 +47,8 @@ from sparsedp._utils.validation import (
     number_beside,
     rounded_down,
 )
-from sparsedp.autodiff.tape import cast, dtype_of, isbox, plain
+from sparsedp.autodiff.program_trace import check_values
+from sparsedp.autodiff.tape import cast, dtype_of, isbox, sample
 from sparsedp.autodiff.tape_constants import frozen
 from sparsedp.errors import DerivativeError, ShapeError, UnstableStepError
 from sparsedp.flow.diffusion import Diffusion, wave_growth
@@ -404,7 +405,7 @@ class FlowStep(Reconstructible):
         p = state["p"]
         s = state.get("s", {})
         if self.convect is not None and self.settings.strict:
-            self._check_convection(v)
+            check_values(self._check_convection, v)
         friction = self._friction(params)
         walls = state.get("walls", self.walls.constant)
         walls_after = self.walls.velocities(params, dtype_of(v))
@@ -458,7 +459,7 @@ class FlowStep(Reconstructible):
         """Return the force as an array on faces; a force that is one number applies to all faces."""
         fields = [v, s] if self.scalars else [v]
         force = self.settings.force(*mapped(frozen, fields), params)
-        if np.shape(plain(force)) == ():
+        if np.shape(sample(force)) == ():
             return force * np.ones(v.shape, dtype_of(v))
         check_on("flow_step, as force,", force, self.grid.faces, "; join its components with grid.join")
         return force
@@ -471,10 +472,7 @@ class FlowStep(Reconstructible):
         if callable(friction):
             friction = friction(params)
         check_on("flow_step, as friction,", friction, self.grid.faces, "; write one number for each face")
-        values = plain(friction)
-        check_finite("flow_step", values, "takes a finite friction")
-        if np.any(values != np.abs(values)):  # also raises for complex values
-            raise ValueError(f"flow_step takes a friction >= 0, got {np.min(values)}; write abs(friction)")
+        check_values(_check_friction, friction)
         return self._free_faces(friction)
 
     def _set_inflow(self, v: Any, params: Any) -> Any:
@@ -492,7 +490,7 @@ class FlowStep(Reconstructible):
 
     def _check_convection(self, v: Any) -> None:
         """Raise UnstableStepError if convection would amplify a wave by more than MAX_GROWTH."""
-        total_flow = self._total_flow.apply(np.abs(plain(v)).astype(float))  # in each cell, 2 * sum of |v| / h
+        total_flow = self._total_flow.apply(np.abs(v).astype(float))  # in each cell, 2 * sum of |v| / h
         fastest = 0.5 * float(np.max(total_flow, initial=0.0))
         courant = self.dt * fastest
         if not SAFE_COURANT < courant < np.inf:
@@ -517,3 +515,10 @@ class FlowStep(Reconstructible):
         }
         names = ["pressure", *(name for name, term in terms.items() if term is not None)]
         return f"<flow step on {self.grid}: {', '.join(names)}>"
+
+
+def _check_friction(friction):
+    """Raise an error for a friction that is not finite, negative or complex."""
+    check_finite("flow_step", friction, "takes a finite friction")
+    if np.any(friction != np.abs(friction)):  # also raises for complex values
+        raise ValueError(f"flow_step takes a friction >= 0, got {np.min(friction)}; write abs(friction)")

@@ -11,14 +11,15 @@ They are given in one of two forms:
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.autodiff.backend import gathered
-from sparsedp.autodiff.tape import cast, plain
+from sparsedp.autodiff.program_trace import check_values
+from sparsedp.autodiff.tape import cast
 from sparsedp.flow.momentum import check_walls, face_lift, free_faces, wall_sides, wall_stresses, wall_velocities
 from sparsedp.grid.boundary_conditions import inflow
 from sparsedp.operators.masks_and_lift import mask
@@ -51,12 +52,18 @@ def moving_walls(settings: FlowSettings, sides: tuple) -> WallsAtRest:
         return WallsAtRest()
     if callable(settings.walls):
         return ChangingWalls(settings)
-    if not wall_velocities(settings.grid, sides).size and np.any(gathered(plain(settings.walls))):
+    if not wall_velocities(settings.grid, sides).size:
+        check_values(_check_zero, settings.walls)
+    return ConstantWalls(settings, sides)
+
+
+def _check_zero(walls):
+    """Raise ValueError for wall velocities other than 0 where no wall has a tangential velocity."""
+    if np.any(gathered(walls)):
         raise ValueError(
             "flow_step takes velocities along sides of dp.no_slip and dp.inflow as walls=, and boundary= has no such "
             "side; leave walls out, or write boundary=dp.no_slip"
         )
-    return ConstantWalls(settings, sides)
 
 
 class WallsAtRest:
@@ -160,14 +167,19 @@ def velocities_from_lift(lifted: Any, grid: Grid, sides: tuple) -> Any:
     wanted = np.repeat(is_inflow, np.diff(walls.offsets))  # mask of the wall velocities at inflow boundaries
     wall_count = np.diff(lift.indptr)  # number of wall velocities that each face depends on
     at_inflow = abs(lift) @ wanted > 0
-    if np.any(gathered(plain(lifted))[at_inflow & (wall_count > 1)]):
-        raise ValueError(
-            "walls of flow_step got an array in which the velocities of walls that meet at an inflow are summed; write "
-            "walls=lambda params: values, with values on face_lift(grid, boundary).domain"
-        )
+    check_values(partial(_check_separate, at_inflow & (wall_count > 1)), lifted)
     # If a face depends on a single wall velocity, this velocity is the value on the face divided by the coefficient.
     face, wall = lift.nonzero()
     invertible = (wall_count[face] == 1) & wanted[wall]
     coefficients = 1.0 / lift.data[invertible]
     inverse = sp.csr_array((coefficients, (wall[invertible], face[invertible])), shape=lift.shape[::-1])
     return Operator(Matrix(inverse), grid.faces, walls, "wall velocities")(lifted)
+
+
+def _check_separate(is_shared, lifted):
+    """Raise ValueError if a result of `face_lift` is nonzero on faces that depend on several wall velocities."""
+    if np.any(gathered(lifted)[is_shared]):
+        raise ValueError(
+            "walls of flow_step got an array in which the velocities of walls that meet at an inflow are summed; write "
+            "walls=lambda params: values, with values on face_lift(grid, boundary).domain"
+        )

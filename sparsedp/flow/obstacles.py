@@ -32,7 +32,7 @@ from sparsedp._utils.base_classes import Reconstructible, ReconstructibleFunctio
 from sparsedp._utils.calls import public
 from sparsedp._utils.pytree import copied
 from sparsedp._utils.validation import check_finite, check_kind, check_number, field_array
-from sparsedp.autodiff.tape import plain
+from sparsedp.autodiff.program_trace import check_values, recorded_level, sample
 from sparsedp.flow.momentum import (
     MomentumFluxes,
     face_laplacian,
@@ -202,10 +202,11 @@ def brinkman(grid: Grid) -> Callable[[Any], Any]:
     domain_operator = differences[0][0]
 
     def friction(level):
-        values = field_array(domain_operator, plain(level), batch=True)
+        values = field_array(domain_operator, sample(level), batch=True)
         check_kind("the level of brinkman", values.dtype, "real numbers", "; write level.real")
-        check_finite("brinkman", values, "takes a finite level")
-        level = level / (np.max(np.abs(values), initial=0.0) or 1.0)
+        check_values(_check_level, level)
+        largest = anp.max(anp.abs(recorded_level(level)), initial=0.0)  # not differentiated
+        level = level / (largest + (largest == 0))
         changes = [(ahead(level), behind(level)) for ahead, behind in differences]
         mean_squares = [0.5 * (ahead**2 + behind**2) for ahead, behind in changes]
         unit = SHARPNESS / anp.sqrt(reduce(add, mean_squares) + FLAT**2)
@@ -214,9 +215,21 @@ def brinkman(grid: Grid) -> Callable[[Any], Any]:
         for (ahead, behind), inverse_square in zip(changes, inverse_squares, strict=True):
             mean_cosh = 0.5 * (anp.cosh(unit * ahead) + anp.cosh(unit * behind))
             terms.append(anp.log1p((mean_cosh - 1) / (1 + anp.cosh(s))) * inverse_square)
-        return anp.where(plain(s) <= DEEPEST, in_obstacle, reduce(add, terms) / anp.log1p(anp.exp(s)))
+        return anp.where(s <= DEEPEST, in_obstacle, reduce(add, terms) / anp.log1p(anp.exp(s)))
 
     return ReconstructibleFunction(friction, brinkman, grid)
+
+
+def _check_level(level):
+    check_finite("brinkman", level, "takes a finite level")
+
+
+def _check_viscosity(viscosity):
+    check_number("the viscosity of forces", viscosity, ">= 0")
+
+
+def _check_forces(total):
+    check_finite("the result of forces", total)
 
 
 def _difference(grid: Grid, axis: int, back: bool) -> Operator:
@@ -288,13 +301,13 @@ class Forces(Reconstructible):
     @public("dp.forces(grid, solid)")
     def __call__(self, v: Any, p: Any, viscosity: Any, walls: Any = None) -> Any:
         """Return the force and the torque; see `forces`."""
-        check_number("the viscosity of forces", plain(viscosity), ">= 0")  # an array would broadcast over the torque
+        check_values(_check_viscosity, viscosity)  # an array would broadcast over the torque
         stress = viscosity * self.viscous(v) + self.pressure(p)
         momentum = self._gain(self._fluxes.carried(v, walls) * self._fluxes.carrier(v, walls))
         total = stress - momentum
         if walls is not None:
             total = total + viscosity * self.wall_friction(walls)
-        check_finite("the result of forces", plain(total))
+        check_values(_check_forces, total)
         return total
 
 

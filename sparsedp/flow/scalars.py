@@ -17,7 +17,7 @@ import numpy as np
 
 from sparsedp._utils.pytree import mapped
 from sparsedp._utils.validation import check_finite
-from sparsedp.autodiff.tape import plain
+from sparsedp.autodiff.program_trace import check_values, sample
 from sparsedp.autodiff.tape_constants import frozen
 from sparsedp.errors import ShapeError
 from sparsedp.flow.diffusion import Diffusion
@@ -82,14 +82,14 @@ class Scalar:
         rate = -self._divergence(v * (self._average(u) + self._wall_values))
         if self.source is not None:
             source = self.source(mapped(frozen, scalars), params)
-            if np.shape(plain(source)) not in ((), u.shape):
+            if np.shape(sample(source)) not in ((), u.shape):
                 raise ShapeError(
                     f"flow_step takes a source of {self.name!r} of shape {u.shape}, or a number, got an array of shape "
-                    f"{np.shape(plain(source))}; write one number for each cell"
+                    f"{np.shape(sample(source))}; write one number for each cell"
                 )
             rate = rate + source
         rate = self.diffusion.add_explicit(rate, u, params, lambda: self._wall_part)
-        check_finite(f"the rate of {self.name!r}", plain(rate))
+        check_values(partial(check_finite, f"the rate of {self.name!r}"), rate)
         return rate
 
     def step(self, u: Any, rate: Any, previous_rate: Any) -> Any:

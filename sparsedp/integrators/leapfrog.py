@@ -37,7 +37,8 @@ from sparsedp._utils.pytree import flatten, is_uniform, leaves, mapped, paired
 from sparsedp._utils.validation import check_function, check_number, is_whole, number_beside, rounded_down
 from sparsedp.autodiff.backend import replicated
 from sparsedp.autodiff.derivative import push
-from sparsedp.autodiff.tape import is_variable, plain
+from sparsedp.autodiff.program_trace import check_values
+from sparsedp.autodiff.tape import is_variable
 from sparsedp.errors import UnstableStepError
 from sparsedp.grid.grid import AXES, check_grid
 from sparsedp.integrators.adaptive import FlatDeviation
@@ -62,6 +63,13 @@ SAFE = 0.98  # fraction of the largest stable dt that the error message recommen
 POWER = 2  # the rate in a sponge grows with this power of the depth; of 1 to 4 it had the least echo for echo=1e-3
 
 
+def _check_damping(*rates):
+    """Raise ValueError for damping rates that are negative or not finite."""
+    for rate in rates:
+        if rate is not None and not (np.all(np.isfinite(rate)) and np.all(rate >= 0)):
+            raise ValueError("damping needs finite rates >= 0 [1 / time]; take dp.sponge(grid, cells, speed)")
+
+
 class Leapfrog(Scheme):
     """Steps of dp/dt = f(q, params), dq/dt = g(p, params): see the docstring of this module.
 
@@ -83,9 +91,7 @@ class Leapfrog(Scheme):
             check_function("a rate of leapfrog", rate, "lambda field, params: ...", 2)
         if damping is not None:
             check_pair("damping, for both fields of the state,", damping, "(s, None)")
-        for rate in map(plain, leaves(damping)):
-            if rate is not None and not (np.all(np.isfinite(rate)) and np.all(rate >= 0)):
-                raise ValueError("damping needs finite rates >= 0 [1 / time]; take dp.sponge(grid, cells, speed)")
+        check_values(_check_damping, *leaves(damping))
         self.rates = rates
         self.damping = damping
         self._fastest_squares = Cache()

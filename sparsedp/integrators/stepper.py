@@ -11,7 +11,7 @@ from scipy.sparse.linalg import ArpackError, eigsh
 
 from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.calls import advice_near, public
-from sparsedp._utils.pytree import copied, labels, leaves
+from sparsedp._utils.pytree import copied, flatten, labels, leaves
 from sparsedp._utils.validation import (
     advise,
     check_choice,
@@ -22,7 +22,7 @@ from sparsedp._utils.validation import (
     rounded_down,
 )
 from sparsedp.autodiff.derivative import is_finite
-from sparsedp.autodiff.program_trace import check_values, recording_trace, sample
+from sparsedp.autodiff.program_trace import check_values, opaque, open_traces, recording_trace, sample
 from sparsedp.autodiff.tape import is_variable, plain
 from sparsedp.errors import NonFiniteError, UnstableStepError
 from sparsedp.integrators.problem import Problem, check_pair, like, real_number
@@ -429,6 +429,8 @@ class Step(Reconstructible):
         self.name = f"stepper({method})"
         self.order: int = scheme.order
         self.info = scheme.info
+        # Whether values decide about the computation, as in error control and Newton's method.
+        self.decides = arguments["tolerance"] is not None or method == "radau" or isinstance(scheme, Nonlinear)
         self.is_interrupted = arguments["breaks"] is not None or arguments["events"] is not None
         self.constructor_call = _reconstruct_step, (arguments,)
 
@@ -458,6 +460,12 @@ class Step(Reconstructible):
         tree
             The new state, with the structure, shapes and dtypes of the old one.
         """
+        if open_traces and self.decides:
+            return opaque(self._advance)(state, params, *inputs)
+        return self._advance(state, params, *inputs)
+
+    def _advance(self, state: Any, params: Any, *inputs: Any) -> Any:
+        """Take one step."""
         first_params = params
         if inputs:
             params = (params, *inputs)
@@ -493,7 +501,8 @@ class Step(Reconstructible):
             self._refuse_nonfinite(state, params)
             raise NonFiniteError(self._overflow(h))
         if self.method == "leapfrog" and self.arguments["unstable"] == "raise":
-            self.scheme.check_stable(u, params, h, first_params)
+            entries, rebuild = flatten((u, params, h, first_params))
+            check_values(lambda *values: self.scheme.check_stable(*rebuild(values)), *entries)
         if not self.problem.timed:
             return new
         return new, end if self.is_interrupted else t + h

@@ -19,7 +19,7 @@ from jax.custom_derivatives import SymbolicZero
 from sparsedp._utils.base_classes import ReconstructibleFunction
 from sparsedp._utils.pytree import placed
 from sparsedp._utils.validation import check_function, check_precision
-from sparsedp.autodiff.tape import Rule, dtype_of, plain
+from sparsedp.autodiff.tape import Rule, dtype_of, sample
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.interop.recording import owned, parts, recorded
 
@@ -304,7 +304,7 @@ def from_jax(function: Callable) -> Callable:
         entries, structure = jax.tree.flatten(args)
         for entry in entries:
             check_precision("an argument of from_jax", entry)
-        key = structure, tuple((np.shape(plain(entry)), dtype_of(entry)) for entry in entries)
+        key = structure, tuple((np.shape(sample(entry)), dtype_of(entry)) for entry in entries)
         if key not in rules:
             form = _ResultStructure("result of from_jax")
 
@@ -349,7 +349,7 @@ class _JaxRule:
 
     def _derivative(self, make, nums, ans, entries):
         """Return the rule of a derivative, and the positions of the floating results."""
-        used = tuple(k for k, y in enumerate(plain(ans)) if dtype_of(y).kind in "fc")
+        used = tuple(k for k, y in enumerate(sample(ans)) if dtype_of(y).kind in "fc")
         key = make, nums, used, len(entries)
         if key not in self._derivatives:
             self._derivatives[key] = _JaxRule(partial(make, self.function, *key[1:]))

@@ -20,7 +20,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp._utils.validation import check_choice
-from sparsedp.autodiff.tape import Rule, plain
+from sparsedp.autodiff.tape import Rule, sample
 from sparsedp.errors import ShapeError
 from sparsedp.network.correlation import PADDINGS, correlate, filter_gradient, pad, pad_transposed
 
@@ -69,7 +69,7 @@ def convolution(p: dict[str, Any], x: Any, padding: str = "periodic") -> Any:
     array([[[0.5, 2. , 4. , 2.5]]])
     """
     weight, bias = weight_and_bias(p, "convolution")
-    _check(np.shape(plain(weight)), np.shape(plain(bias)), np.shape(plain(x)), padding)
+    _check(np.shape(sample(weight)), np.shape(sample(bias)), np.shape(sample(x)), padding)
     bias_on_cells = anp.reshape(bias, anp.shape(bias) + (1,) * (anp.ndim(x) - 2))
     return _trilinear(x, weight, Y, anp.shape(weight), padding) + bias_on_cells
 

@@ -8,7 +8,7 @@ from typing import Any
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp.autodiff.tape import Rule, plain
+from sparsedp.autodiff.tape import Rule, sample
 from sparsedp.errors import ShapeError
 from sparsedp.network.convolution_layer import convolution, weight_and_bias
 
@@ -44,9 +44,9 @@ def dense(p: dict[str, Any], x: Any) -> Any:
     array([[3., 6.]])
     """
     weight, bias = weight_and_bias(p, "dense")
-    weight_shape = np.shape(plain(weight))
-    bias_shape = np.shape(plain(bias))
-    x_shape = np.shape(plain(x))
+    weight_shape = np.shape(sample(weight))
+    bias_shape = np.shape(sample(bias))
+    x_shape = np.shape(sample(x))
     copies = weight_shape[:-2]
     inputs_fit = len(x_shape) == 2 and weight_shape[-2:-1] == x_shape[1:]
     if not inputs_fit or bias_shape != (*copies, *weight_shape[-1:]) or copies not in ((), x_shape[:1]):

@@ -20,7 +20,7 @@ from sparsedp._utils.base_classes import ReconstructibleFunction
 from sparsedp._utils.validation import check_finite, check_kind, check_native, check_on
 from sparsedp.autodiff.backend import as_field
 from sparsedp.autodiff.derivative import entrywise
-from sparsedp.autodiff.tape import plain
+from sparsedp.autodiff.program_trace import check_values, sample
 from sparsedp.grid.grid import Grid, check_grid
 from sparsedp.operators.stencils import adjacent_cell, to_faces
 
@@ -69,15 +69,21 @@ def harmonic_average(grid: Grid) -> Callable:
 
     def average(k):
         check_native("harmonic_average", k)
-        values = as_field(plain(k))
+        values = as_field(sample(k))
         check_on("harmonic_average", values, grid.cells)
         check_kind("k of harmonic_average", values.dtype, "real numbers", "; write k.real")
-        check_finite("harmonic_average", values, "takes a finite coefficient")
-        if np.any(np.less(values, 0)):
-            raise ValueError(f"harmonic_average needs a coefficient >= 0, got {np.min(values):g}")
+        check_values(_check_coefficient, k)
         return pair(below(k), above(k))
 
     return ReconstructibleFunction(average, harmonic_average, grid)
+
+
+def _check_coefficient(k):
+    """Raise an error for a coefficient that is not finite or negative."""
+    values = as_field(k)
+    check_finite("harmonic_average", values, "takes a finite coefficient")
+    if np.any(np.less(values, 0)):
+        raise ValueError(f"harmonic_average needs a coefficient >= 0, got {np.min(values):g}")
 
 
 def _lower_share(grid, axis):
@@ -94,7 +100,7 @@ def _pair_rule(share):
 
     def ratios(low, high):
         total = share * high + (1 - share) * low
-        empty = plain(total) == 0
+        empty = total == 0
         total = anp.where(empty, 1.0, total)
         return anp.where(empty, 1.0, low / total), anp.where(empty, 1.0, high / total)
 

@@ -27,7 +27,6 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp._utils.validation import EPS, check_finite, check_shape, place
-from sparsedp.autodiff.tape import plain
 from sparsedp.grid.space import Space
 from sparsedp.operators.given import from_matrix
 from sparsedp.operators.stencils import along, pick
@@ -101,7 +100,7 @@ def _eliminated(K, closed):
 
 def check_tensor(name: str, K: Any, grid: Grid) -> None:
     """Raise ValueError if the symmetric real part of a tensor is not positive definite in every cell."""
-    values = np.asarray(plain(K))
+    values = np.asarray(K)
     check_shape(f"{name}, a tensor for each cell,", values, (grid.dim, grid.dim, *grid.shape))
     check_finite(name, values)
     rest = 0.5 * (values + values.swapaxes(0, 1)).real

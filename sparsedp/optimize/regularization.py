@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import autograd.numpy as anp
@@ -12,6 +13,7 @@ import scipy.sparse as sp
 from sparsedp._utils.base_classes import ReconstructibleFunction
 from sparsedp._utils.pytree import power_of_two
 from sparsedp._utils.validation import check_finite, check_kind, check_native, is_number
+from sparsedp.autodiff.program_trace import check_values, opaque
 from sparsedp.autodiff.tape import dtype_of, plain
 from sparsedp.autodiff.tape_constants import constant
 from sparsedp.grid.grid import Grid, check_grid
@@ -87,6 +89,7 @@ def total_variation(grid: Grid, eps: float, solid: ArrayLike | None = None) -> C
         raise ValueError(f"total_variation needs eps > 0, a slope that counts as small, got {eps!r}")
     squared_slope, volumes = _squared_slope(grid, "total_variation", solid)
 
+    @opaque  # the unit depends on values
     def integral(u):
         square, unit = squared_slope(u, eps)
         scaled_eps = eps / unit
@@ -179,7 +182,7 @@ def _squared_slope(grid, name, solid):
         if unit != 1:
             slopes = slopes / unit
         square = mean(slopes**2)
-        check_finite(f"the squared slope in {name}", plain(square))
+        check_values(partial(check_finite, f"the squared slope in {name}"), square)
         return square, unit
 
     return squared_slope, volumes

@@ -18,7 +18,8 @@ import numpy as np
 from sparsedp._utils.pytree import placed
 from sparsedp._utils.validation import check_finite
 from sparsedp.autodiff.derivative import of_argument, push
-from sparsedp.autodiff.tape import Rule, plain
+from sparsedp.autodiff.program_trace import check_values
+from sparsedp.autodiff.tape import Rule
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -94,5 +95,6 @@ def vary(fun: Callable[..., Any], args: Sequence, places: Sequence[int]) -> tupl
 
 def _finite(name: str, cotangent: Any) -> Any:
     """Return the cotangent; raise NonFiniteError if it overflowed."""
-    check_finite(f"a gradient of {name}", plain(cotangent), advice="; scale the loss or the right-hand side")
+    advice = "; scale the loss or the right-hand side"
+    check_values(partial(check_finite, f"a gradient of {name}", advice=advice), cotangent)
     return cotangent

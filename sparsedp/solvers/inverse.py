@@ -15,6 +15,7 @@ from sparsedp._utils.counters import active, count, spent
 from sparsedp._utils.html import facts
 from sparsedp._utils.validation import check_finite, check_native, check_on, field_array
 from sparsedp.autodiff.backend import collectively
+from sparsedp.autodiff.program_trace import opaque
 from sparsedp.autodiff.tape import apply_operator, isbox, plain
 from sparsedp.errors import NonFiniteError, ShapeError
 from sparsedp.grid.space import fits
@@ -407,6 +408,7 @@ class Inverse(Operator):
         shape = self.codomain.shape
         return lambda b: solve(b.reshape(-1)).reshape(shape)
 
+    @opaque
     def _solve_from(self, b: Any, start: Any) -> Any:
         """Solve from an initial guess, or by iterations that autograd records."""
         if start is not None:

@@ -13,7 +13,7 @@ places of the pattern are visited.
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,7 +25,8 @@ from sparsedp._utils.validation import check_finite, check_kind, check_plain, ch
 from sparsedp.autodiff.backend import as_field, gathered
 from sparsedp.autodiff.derivative import of_argument
 from sparsedp.autodiff.fast_derivatives import in_dtype
-from sparsedp.autodiff.tape import cast, dtype_of, isbox, plain
+from sparsedp.autodiff.program_trace import check_values
+from sparsedp.autodiff.tape import cast, dtype_of, isbox, sample
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.grid.space import Space, fits
 from sparsedp.operators.given import from_matrix
@@ -323,7 +324,7 @@ class EllipticSolver(ParametricSolver):
             return self._face_coefficient(k), self
         self.D.backend.check("a tensor")
         solver = self._tensor_solver
-        check_tensor("k", k, self.D.codomain.grid)
+        check_values(partial(check_tensor, "k", grid=self.D.codomain.grid), k)
         return solver.at_corners(cast(k, np.result_type(dtype_of(k), float))), solver
 
     @cached_property
@@ -332,10 +333,8 @@ class EllipticSolver(ParametricSolver):
 
     def _face_coefficient(self, k):
         k = _checked_parameter("k", k, self.D.domain, "harmonic_average(grid)(k)", self.D.codomain)
-        values = as_field(plain(k))
-        if values.dtype.kind != "c" and np.any(values < 0):
-            raise ValueError(f"k must be >= 0, got {np.min(values):g} at {np.argmin(values)}")
-        if values.ndim == 0:
+        check_values(_check_not_negative, k)
+        if np.ndim(sample(k)) == 0:
             return k * np.ones(self.D.domain.shape)
         return k
 
@@ -397,7 +396,7 @@ def _checked_parameter(name, parameter, space, advice="", other_space=None):
 
     `advice` says what to write where it is a field on `other_space`.
     """
-    values = as_field(plain(parameter))
+    values = as_field(sample(parameter))
     if values.shape not in ((), space.shape):
         hint = ""
         if other_space is not None and values.shape == other_space.shape:
@@ -406,8 +405,14 @@ def _checked_parameter(name, parameter, space, advice="", other_space=None):
             f"{name} takes a number or a field on {space.described}, got an array of shape {values.shape}{hint}"
         )
     check_kind(name, values.dtype, "numbers", f"; write np.asarray({name}, float)")
-    check_finite(name, values)
+    check_values(partial(check_finite, name), parameter if isbox(parameter) else values)
     return parameter if isbox(parameter) else values
+
+
+def _check_not_negative(k):
+    k = np.asarray(k)
+    if k.dtype.kind != "c" and np.any(k < 0):
+        raise ValueError(f"k must be >= 0, got {np.min(k):g} at {np.argmin(k)}")
 
 
 class Elliptic(Sum):
@@ -647,12 +652,12 @@ class MatrixSolver(ParametricSolver):
         check_plain(self.name, data, b)
         if self.assembly is not None:
             data = self.assembly(data)
-        values = np.asarray(plain(data))
+        values = np.asarray(sample(data))
         check_shape("data", values, self.rows.shape, "; give one value for each entry")
         check_kind("data", values.dtype, "numbers")
-        check_finite("data", values, where=self._place_of)
         if not isbox(data):
             data = values
+        check_values(partial(check_finite, "data", where=self._place_of), data)
         if not isbox(b):
             b = np.asarray(b)
         return self._solution(data, b, 0.0)

@@ -25,6 +25,7 @@ from sparsedp._utils.pytree import mapped, power_of_two
 from sparsedp._utils.validation import check_function, check_takes, check_whole
 from sparsedp.autodiff.backend import NUMPY, collectively
 from sparsedp.autodiff.derivative import pullback, push
+from sparsedp.autodiff.program_trace import opaque
 from sparsedp.autodiff.tape import Rule, plain
 from sparsedp.errors import DerivativeError
 from sparsedp.solvers.adjoint import solve_rule, vary
@@ -275,6 +276,7 @@ class Root(Reconstructible):
         finally:
             del self._series[get_ident()]
 
+    @opaque
     @public("dp.implicit(residual)")
     def __call__(self, guess: Any, *params: Any) -> Any:
         """Solve residual(x, *params) = 0 from a guess.
