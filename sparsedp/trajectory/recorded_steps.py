@@ -85,11 +85,16 @@ class RecordedStepRunner(StepRunner):
         self.keeps_form = all(map(_is_same_kind, returned, values)) and all(type(slot) is Slot for slot in slots)
         # For each variable of the state its position among the results of the program.
         self._order = [outputs.slots.index(slot) for slot in slots] if self.keeps_form else []
+        # For each result of the program the position of its variable in the state.
+        self._places = [self._order.index(place) for place in range(len(self._order))]
+        self._differentiated_params = [root for root in self.param_roots if root]
 
     def _variables(self, state: State) -> list:
         """Return the variables of the arguments of the step that begins at a state."""
-        rows = [block[state.i] for block in self.inputs]
-        return [*state.values, *self._params, *rows]
+        variables = state.values + self._params
+        for block in self.inputs:
+            variables.append(block[state.i])
+        return variables
 
     def step(self, state: State, is_taped: bool) -> State:
         """Return the state after one step; if `is_taped`, store what the backward pass needs in the given state."""
@@ -113,22 +118,24 @@ class RecordedStepRunner(StepRunner):
         """Return the cotangents of a state with a tape, given those of the next state; None if no variable has one."""
         self.current = state
         (saved,) = state.tape
-        cotangents: list = [None] * len(g)
-        for place, cotangent, value in zip(self._order, g, state.values, strict=True):
-            cotangents[place] = zero_like(value) if cotangent is None else cotangent
-        pulled = iter(self._program.backward(*saved, *cotangents))
-        backs = [next(pulled) for _ in range(self._n_state)]
-        for root in self.param_roots:
-            if root:
-                back = next(pulled)
-                if back is not None:
-                    sums[root] = added(sums.get(root), back)
+        if any(back is None for back in g):
+            g = [zero_like(value) if back is None else back for back, value in zip(g, state.values, strict=True)]
+        cotangents = [g[place] for place in self._places]
+        pulled = self._program.backward(*saved, *cotangents)
+        backs = list(pulled[: self._n_state])
+        position = self._n_state
+        for root in self._differentiated_params:
+            back = pulled[position]
+            position += 1
+            if back is not None:
+                sums[root] = added(sums.get(root), back)
         for row, root in zip(rows, self.input_roots, strict=True):
             if root:
-                back = next(pulled)
-                if back is not None:
-                    row[state.i] = back
-        if state.i < self.specification.first_traced or state.i in self.specification.cuts:
+                if pulled[position] is not None:
+                    row[state.i] = pulled[position]
+                position += 1
+        specification = self.specification
+        if state.i < specification.first_traced or state.i in specification.cuts:
             return None
         if all(back is None for back in backs):
             return None
