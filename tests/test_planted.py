@@ -72,14 +72,14 @@ BUGS = {
     ),
     "cotangents of a jitted step in the order of its result": Bug(
         "trajectory/recorded_steps.py",
-        "            cotangents[place] = zero_like",
-        "            cotangents[len(cotangents) - 1 - place] = zero_like",
+        "        cotangents = [g[place] for place in self._places]\n",
+        "        cotangents = list(g)\n",
         "tests/trajectory/test_rollout_jit.py",
     ),
     "a state before a cut of truncation that gets a cotangent from a jitted step": Bug(
         "trajectory/recorded_steps.py",
-        "        if state.i < self.specification.first_traced or state.i in self.specification.cuts:\n",
-        "        if state.i < self.specification.first_traced:\n",
+        "        if state.i < specification.first_traced or state.i in specification.cuts:\n",
+        "        if state.i < specification.first_traced:\n",
         "tests/trajectory/test_rollout_jit.py",
     ),
     "a program that is not compared with its function": Bug(
