@@ -237,6 +237,8 @@ def _append_form(tree, structure, leaf_forms, variables):
         if value.dtype.kind in "fc":
             variables.append(tree)
             leaf_forms.append((value.shape, value.dtype, value.flags.c_contiguous or value.strides))
+        elif value.dtype.hasobject:
+            leaf_forms.append(_Identity(value))
         else:
             leaf_forms.append((value.shape, value.dtype, value.tobytes()))
         return True
@@ -749,15 +751,25 @@ class OpaqueCall(Rule):
         arguments = self._structure.build(variables)
         if not self._nums:
             result = self._evaluate(arguments)
-            self._result = TreeStructure(result, "result", is_variable)
-            return self._result.variables(result), None
+            return self._variables_of(result), None
         moving = [False] * len(self._structure.statics)
         for num in self._nums:
             moving[self._structure.places[num]] = True
         tape = taped(self._evaluate, arguments, moving)
-        result = tape.rebuild(tape.values)
-        self._result = TreeStructure(result, "result", is_variable)
-        return self._result.variables(result), tape
+        return self._variables_of(tape.rebuild(tape.values)), tape
+
+    def _variables_of(self, result):
+        """Return the floating leaves of a result; raise JitError if another leaf differs from that of the recording."""
+        structure = TreeStructure(result, "result", is_variable, constant)
+        if self._result is None:
+            self._result = structure
+        recorded = self._result
+        if structure.places != recorded.places or not all(map(_agree, structure.statics, recorded.statics)):
+            raise JitError(
+                f"{self.name} returned a leaf that is not floating and differs from that of the recording; "
+                "call the function without dp.jit"
+            )
+        return structure.variables(result)
 
     def build(self, results: Any) -> Any:
         """Return the result of the function from its floating leaves."""

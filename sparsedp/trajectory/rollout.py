@@ -134,6 +134,8 @@ def rollout(
     bytes. A forward derivative needs the memory of one step, and the derivative of a gradient (`hvp`) twice the memory
     of the gradient. The gradient of a gradient records all calls of both passes on its tape.
     A step decorated with `differentiable` uses a hand-written derivative.
+    A jitted step (see `jit`) runs as a program in both passes, without a tape, under every option except
+    memory="reverse". This shortens runs of small states several times.
 
     The backward pass differentiates one run of steps that ends, bit for bit, in the result: whenever it runs a step
     again on a tape, it compares the next state with the one that it used before, by fingerprints of 64 bits. With

@@ -109,6 +109,28 @@ def test_tangents_of_calls_that_decide():
         dp.jit(lambda u: dp.jvp(twice, u, u)[1])(X)
 
 
+def test_counts_of_calls_that_decide():
+    """The count is a constant of the program, which must not become stale."""
+
+    @opaque
+    def halved(u):
+        n = 0
+        while np.max(np.abs(plain(u))) > 1.0:
+            u = 0.5 * u
+            n += 1
+        return u, n
+
+    jitted = dp.jit(lambda u: halved(u)[0] * halved(u)[1], check=False)
+    assert jitted(3.0 * X)[1] == 2 * 0.75 * X[1]
+    assert jitted(3.1 * X)[1] == pytest.approx(2 * 0.775 * X[1])
+    message = (
+        "halved returned a leaf that is not floating and differs from that of the recording; "
+        "call the function without dp.jit"
+    )
+    with pytest.raises(dp.errors.JitError, match=message):
+        jitted(9.0 * X)
+
+
 def test_integers_have_no_derivative():
     message = "Can't differentiate w.r.t. type <class 'numpy.int64'>"
     with pytest.raises(TypeError, match=re.escape(message)):
