@@ -19,7 +19,7 @@ from sparsedp._utils.validation import check_function, check_leaves, check_nativ
 from sparsedp.autodiff.backend import ARRAY_KINDS
 from sparsedp.autodiff.derivative import gradient_of, hvp, taped, value_and_grad, zero_like
 from sparsedp.autodiff.program import compile_program, free_slots, needed_calls
-from sparsedp.autodiff.program_trace import ProgramTrace, Slot, opaque, open_traces
+from sparsedp.autodiff.program_trace import ProgramTrace, Slot, opaque, open_traces, refuse_outer_trace
 from sparsedp.autodiff.tape import (
     Rule,
     VJPNode,
@@ -492,6 +492,8 @@ class Outputs:
         for place, end in enumerate(ends):
             if is_recorded(end):
                 slot = end._node.slot
+            elif isbox(end):
+                refuse_outer_trace()
             elif isinstance(end, np.ndarray):
                 slot = trace.call(_copied, end)
             else:

@@ -43,6 +43,7 @@ __all__ = [
     "open_traces",
     "recorded_level",
     "recording_trace",
+    "refuse_outer_trace",
     "sample",
 ]
 
@@ -146,6 +147,8 @@ class ProgramTrace:
                 f"dp.jit cannot record {name}, because the shape of its result depends on values; "
                 "write np.where(condition, a, b)"
             )
+        if any(map(isbox, args)):
+            refuse_outer_trace()
         kept = tuple(arg if type(arg) is Slot else constant(arg) for arg in args)
         slot = self.slot(value)
         self.calls.append(ProgramCall(function, kept, constant(options), slot, has_effect))
@@ -183,6 +186,14 @@ class ProgramNode(Node):
             slots[num] = parent.slot
         _refuse_hidden(function, slots)
         self.slot = self.trace.add(function, slots, options, value)
+
+
+def refuse_outer_trace() -> None:
+    """Raise JitError for a value of another trace, which would be a constant of the program."""
+    raise JitError(
+        "dp.jit cannot record a function that uses a traced value which is not one of its arguments; pass it as an "
+        "argument"
+    )
 
 
 def _refuse_hidden(function, args):

@@ -131,6 +131,16 @@ def test_counts_of_calls_that_decide():
         jitted(9.0 * X)
 
 
+@pytest.mark.parametrize("function", [lambda u, p: p * u, lambda u, p: p, lambda u, p: anp.sin(p) + 0.0 * u])
+def test_values_of_outer_traces(function):
+    message = (
+        "dp.jit cannot record a function that uses a traced value which is not one of its arguments; pass it as an "
+        "argument"
+    )
+    with pytest.raises(dp.errors.JitError, match=message):
+        dp.grad(lambda p: anp.sum(dp.jit(lambda u: function(u, p))(X)))(2.0)
+
+
 def test_integers_have_no_derivative():
     message = "Can't differentiate w.r.t. type <class 'numpy.int64'>"
     with pytest.raises(TypeError, match=re.escape(message)):
