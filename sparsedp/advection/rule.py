@@ -11,6 +11,7 @@ import numpy as np
 from sparsedp._utils.validation import check_finite, surely_finite
 from sparsedp.advection.arguments import FLOAT, check_step, flatten_array
 from sparsedp.advection.settings import FIELD, INFLOW, STEP, VELOCITY
+from sparsedp.autodiff.program_trace import check_values, open_traces, recording_trace
 from sparsedp.autodiff.tape import MOST_BOUND, Rule, cast, dtype_of, form_of, isbox, linear, plain
 from sparsedp.errors import DerivativeError
 
@@ -111,7 +112,7 @@ def _pull(
             # The sum may have been infinite before this step: check only the cotangent of this step.
             of_velocity = method.vjp((VELOCITY,), g, *flat)[0][0]
             _check_derivative(method, "the gradient in v", of_velocity, (g,))
-    if velocity_sum is None and (finite or all(map(surely_finite, map(plain, cotangents)))):
+    if velocity_sum is None and (finite or _are_surely_finite(cotangents)):
         return [_unflatten(args[num], cotangent) for num, cotangent in zip(nums, cotangents, strict=True)]
     results = []
     for position, (num, cotangent) in enumerate(zip(nums, cotangents, strict=True)):
@@ -155,10 +156,20 @@ def _cotangents(
 
 def _check_derivative(method: TransportMethod, description: str, derivative: Any, given: Iterable) -> None:
     """Raise if a derivative is not finite although all cotangents or tangents passed to the step are finite."""
-    derivative = plain(derivative)
-    if surely_finite(derivative) or not all(np.all(np.isfinite(plain(value))) for value in given):
+    check_values(partial(_check_plain_derivative, method.name, description), derivative, *given)
+
+
+def _check_plain_derivative(name, description, derivative, *given):
+    if surely_finite(derivative) or not all(np.all(np.isfinite(value)) for value in given):
         return
-    check_finite(method.name, np.asarray(derivative), f"cannot represent {description}")
+    check_finite(name, np.asarray(derivative), f"cannot represent {description}")
+
+
+def _are_surely_finite(cotangents):
+    """Return True if all entries are known to be finite; False while `dp.jit` records, which checks them later."""
+    if open_traces and recording_trace(cotangents) is not None:
+        return False
+    return all(map(surely_finite, map(plain, cotangents)))
 
 
 def _linear_rules(method: TransportMethod, nums: Sequence[int], flat: tuple) -> list:
@@ -219,12 +230,10 @@ def _bound_flatten(method: TransportMethod, u: Any, v: Any, dt: Any, inflow: Any
 
 def _flatten(method: TransportMethod, u: Any, v: Any, dt: Any, inflow: Any) -> tuple[Any, Any, Any, Any]:
     """Check the arguments of a step and return them as flat arrays and a float, as the method needs them."""
-    if type(dt) is not float or not 0 < dt < np.inf:
-        number = check_step(method.name, plain(dt))
-        if isbox(dt):
-            dt = dt
-        else:
-            dt = number
+    if isbox(dt):
+        check_values(partial(check_step, method.name), dt)
+    elif type(dt) is not float or not 0 < dt < np.inf:
+        dt = check_step(method.name, dt)
     u = flatten_array(method.name, "u", u, method.field_shapes)
     v = flatten_array(method.name, "v", v, method.velocity_shapes)
     return u, v, dt, _flatten_inflow(method.name, inflow, method.walls)

@@ -28,6 +28,7 @@ import scipy.sparse as sp
 from sparsedp._utils.pytree import placed
 from sparsedp.advection.control_volumes import Component, components
 from sparsedp.autodiff.derivative import pullback, pushforward
+from sparsedp.autodiff.program_trace import recorded_level
 from sparsedp.autodiff.tape import isbox, linear, plain
 from sparsedp.kernels.fluxes import INVERSE_LENGTH
 
@@ -244,7 +245,7 @@ class _Maps(NamedTuple):
 
 def _by_direction(courant: Any) -> tuple[Any, Any]:
     """Return the positive part p and the negative part m of Courant numbers."""
-    share = np.heaviside(plain(courant), 0.5)
+    share = anp.heaviside(recorded_level(courant), 0.5)
     return courant * share, courant * (1.0 - share)
 
 

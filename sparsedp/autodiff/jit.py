@@ -45,7 +45,15 @@ __all__ = ["Jitted", "PullbackProgram", "tree_form", "is_watched", "jit", "opaqu
 FORMS_BEFORE_WARNING = 8
 MOST_FORMS = 64  # programs of one function that are kept
 # Parts of Python's and NumPy's messages for a traced value in a wrong place; the last one: in an index.
-OF_TRACED_VALUES = ("ArrayBox", "object array", "only integers, slices")
+OF_TRACED_VALUES = (
+    "ArrayBox",
+    "object array",
+    "dtype object",
+    "dtype('O')",
+    "setting an array element",
+    "boolean ndarray",
+    "only integers, slices",
+)
 # Largest accepted difference between a program and its function, relative to the largest entry, in units of eps.
 VALUE_TOLERANCE = 1e4
 
@@ -705,7 +713,11 @@ def opaque_call(function: Callable, args: tuple, options: dict) -> Any:
     structure = TreeStructure((args, options), "arguments", is_variable)
     variables = structure.variables((args, options))
     nums = innermost(variables)
-    rule = OpaqueCall(function, structure, nums)
+    owner = getattr(function, "__self__", args[0] if args else None)
+    name = getattr(owner, "name", None)
+    if not isinstance(name, str):
+        name = _name(function)
+    rule = OpaqueCall(name, function, structure, nums)
     return rule.build(through(rule, nums, *variables))
 
 
@@ -714,6 +726,8 @@ class OpaqueCall(Rule):
 
     Parameters
     ----------
+    name : str
+        Name of the function, or of the object whose method it is.
     function : callable
     structure : TreeStructure
         Structure of the pair of its positional and keyword arguments.
@@ -725,8 +739,8 @@ class OpaqueCall(Rule):
     keywords = ()
     accepts_traced = True
 
-    def __init__(self, function: Callable, structure: TreeStructure, nums: Sequence[int]) -> None:
-        self.name = _name(function)
+    def __init__(self, name: str, function: Callable, structure: TreeStructure, nums: Sequence[int]) -> None:
+        self.name = name
         self._function = function
         self._structure = structure
         self._nums = nums

@@ -150,6 +150,13 @@ class ProgramTrace:
         if any(map(isbox, args)):
             refuse_outer_trace()
         kept = tuple(arg if type(arg) is Slot else constant(arg) for arg in args)
+        if _is_hiding(value) or any(map(_is_hiding, kept)):
+            rule = kept[0] if kept else None
+            name = getattr(rule, "name", None) or getattr(function, "__name__", type(function).__name__)
+            raise JitError(
+                f"dp.jit cannot record {name}, which got a traced value by its closure or inside an array of NumPy; "
+                "pass traced values as arguments, and write anp.array([...])"
+            )
         slot = self.slot(value)
         self.calls.append(ProgramCall(function, kept, constant(options), slot, has_effect))
         return slot
@@ -194,6 +201,15 @@ def refuse_outer_trace() -> None:
         "dp.jit cannot record a function that uses a traced value which is not one of its arguments; pass it as an "
         "argument"
     )
+
+
+def _is_hiding(value):
+    """Return True if a value that should be plain is traced, or is an array of objects, which may be traced."""
+    if isinstance(value, np.ndarray):
+        return value.dtype == object
+    if type(value) in (tuple, list):
+        return any(map(_is_hiding, value))
+    return isbox(value)
 
 
 def _refuse_hidden(function, args):
@@ -297,8 +313,21 @@ def _refusing(convert):
     return new
 
 
+def _in_order(function):
+    return lambda box, other: function(box, other)
+
+
+def _in_reverse(function):
+    return lambda box, other: function(other, box)
+
+
 def _install():
     BOX.__bool__ = _truth
+    # Comparisons of values on this trace are traced, too, and masks are combined.
+    for operation, function in (("and", anp.bitwise_and), ("or", anp.bitwise_or), ("xor", anp.bitwise_xor)):
+        setattr(BOX, f"__{operation}__", _in_order(function))
+        setattr(BOX, f"__r{operation}__", _in_reverse(function))
+    BOX.__invert__ = anp.invert
     for kind in (anp.int8, anp.int16, anp.int32, anp.int64):
         kind.__new__ = _refusing(kind.__new__)
     for kind in (np.bool_, np.int64, np.intp, bool, int):

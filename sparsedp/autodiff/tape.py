@@ -113,7 +113,9 @@ def plain(value: Any) -> Any:
     """Return the value below all boxes; raise JitError while `dp.jit` records it, as its entries decide something."""
     while type(value) in box_types:
         if type(value._node) is ProgramNode:
-            frame = sys._getframe(1)
+            frame: Any = sys._getframe(1)
+            while frame.f_globals.get("__name__", "").startswith("sparsedp._utils"):  # of the functions of trees
+                frame = frame.f_back
             name = frame.f_code.co_name.strip("<>")
             raise JitError(
                 f"dp.jit cannot record a decision by the values of a traced array ({name} in "

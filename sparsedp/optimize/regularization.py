@@ -89,14 +89,16 @@ def total_variation(grid: Grid, eps: float, solid: ArrayLike | None = None) -> C
         raise ValueError(f"total_variation needs eps > 0, a slope that counts as small, got {eps!r}")
     squared_slope, volumes = _squared_slope(grid, "total_variation", solid)
 
-    @opaque  # the unit depends on values
     def integral(u):
         square, unit = squared_slope(u, eps)
         scaled_eps = eps / unit
         # This quotient equals sqrt(g^2 + eps^2) - eps, but avoids cancellation.
         return unit * anp.sum(volumes * square / (anp.sqrt(square + scaled_eps**2) + scaled_eps))
 
-    return ReconstructibleFunction(integral, total_variation, grid, eps, constant(solid))
+    integral.__name__ = "total_variation"
+    return ReconstructibleFunction(
+        opaque(integral), total_variation, grid, eps, constant(solid)
+    )  # the unit is a decision
 
 
 def smoothness(grid: Grid, solid: ArrayLike | None = None) -> Callable[[Any], Any]:

@@ -47,7 +47,26 @@ def reads(u):
     return u * plain(u)[0]
 
 
+def closes(u):
+    square = dp.differentiable("square", lambda x: u * x, lambda nums, ans, x: lambda g: (g * u,))
+    return square(2.0 * u)
+
+
+def hides_in_an_array(u):
+    return np.asarray(u) * 2.0 + u
+
+
 REFUSED = [
+    (
+        closes,
+        "dp.jit cannot record square, which got a traced value by its closure or inside an array of NumPy; pass traced "
+        "values as arguments, and write anp.array([...])",
+    ),
+    (
+        hides_in_an_array,
+        "dp.jit cannot record add, which got a traced value by its closure or inside an array of NumPy; pass traced "
+        "values as arguments, and write anp.array([...])",
+    ),
     (
         decides,
         "dp.jit cannot record a decision by a traced value (if, while, and, or); write np.where(condition, a, b), "

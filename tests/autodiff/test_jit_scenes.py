@@ -282,6 +282,12 @@ def total_variation():
 
 
 @scene
+def combined_masks():
+    inside = lambda u, v: anp.where((u > 0.8) & ~(v > 1.0) | (u < v) ^ (v < 0.7), u, 2.0 * v)
+    return inside, [of(20), of(20)]
+
+
+@scene
 def smoothness():
     return dp.smoothness(SQUARE), [of(SQUARE)]
 
