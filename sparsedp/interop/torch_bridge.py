@@ -18,6 +18,7 @@ import torch
 from sparsedp._utils.base_classes import ReconstructibleFunction
 from sparsedp._utils.pytree import flatten, leaves, paired, placed
 from sparsedp._utils.validation import check_function, check_leaves
+from sparsedp.autodiff.program_trace import opaque
 from sparsedp.autodiff.tape import Rule, dtype_of, is_variable, isbox
 from sparsedp.autodiff.tape_constants import constant, frozen
 from sparsedp.errors import ShapeError
@@ -288,7 +289,9 @@ def from_torch(function: Callable) -> TorchFunction:
         results = _rule(graph, *entries)
         return rebuild_result(parts(results, len(graph.outputs)))
 
-    return TorchFunction(call, function, parameters)
+    call.__name__ = "from_torch"
+    # Each call has a graph of its own, so that `dp.jit` must not record the rule of this call.
+    return TorchFunction(opaque(call), function, parameters)
 
 
 class TorchFunction(ReconstructibleFunction):

@@ -317,6 +317,45 @@ def sample_at_points():
     return look, [of(SQUARE)]
 
 
+@scene
+def from_torch():
+    torch = pytest.importorskip("torch")
+    return dp.interop.from_torch(lambda x: torch.sin(x) ** 2), [of(6)]
+
+
+@scene
+def from_jax():
+    pytest.importorskip("jax")
+    return dp.interop.from_jax(lambda x, k: k * x**3), [of(6), of(())]
+
+
+@scene
+def guess_of_a_root():
+    """The guess decides which of two roots is found."""
+    root = dp.implicit(lambda x, p: x**2 - p)
+    return (lambda u, p: root(u - 1.0, p)), [of(6), of(())]
+
+
+@scene
+def loop_of_adaptive_steps():
+    step = dp.stepper("rk4", lambda u, p: -p * u**2, 1.0, tolerance=1e-5)
+
+    def run(u, p):
+        for _ in range(4):
+            u = step(u, p)
+        return u
+
+    return run, [of(6), of(())]
+
+
+@scene
+def number_of_events():
+    """Events: other ones for other arguments."""
+    rate = lambda u, p: p * anp.array([anp.cos(3 * u[1]), 1.0])
+    step = dp.stepper("rk4", rate, 6.0, tolerance=1e-5, events=lambda u, p: u[0] - 0.3)
+    return (lambda u, p: step((anp.array([u - 0.7, 0.0]), 0.0), p)), [of(()), of(())]
+
+
 # ---- the comparison --------------------------------------------------------------------------------------------------
 
 
