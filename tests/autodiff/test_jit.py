@@ -48,7 +48,16 @@ def of_indices(u):
     return u[last] ** 2 + anp.sum(u[np.array([1, 1, 2])] ** 2) + anp.sum(anp.sort(u)[:3])
 
 
-LOSSES = [arithmetic, functions, physics, of_indices]
+def rolls(u):
+    """Shifts of arrays with one axis, which are two slices, and others."""
+    total = 0.0
+    for shift in (-17, -1, 0, 3, 16, 33):
+        total = total + anp.sum(u * anp.roll(u, shift)) * anp.sum(anp.roll(u, shift, 0) * Y)
+    pair = anp.reshape(u, (2, 8))
+    return total + anp.sum(anp.roll(pair, 3) * anp.roll(pair, 1, axis=0) * anp.roll(pair, 5, 1))
+
+
+LOSSES = [arithmetic, functions, physics, of_indices, rolls]
 
 
 @pytest.mark.parametrize("loss", LOSSES, ids=lambda loss: loss.__name__)
