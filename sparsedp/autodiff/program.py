@@ -201,11 +201,11 @@ class _Writer:
 
         Two slices give the same bits as `numpy.roll` in a tenth of its time.
         """
-        if call.function is not anp.roll or call.options or len(call.args) > 3:
+        if call.function is not anp.roll or not 2 <= len(call.args) <= 3 or call.options.keys() - {"axis"}:
             return 0
         array = self._trace.sample(call.args[0])
         shift = call.args[1]
-        axis = call.args[2] if len(call.args) == 3 else None
+        axis = call.args[2] if len(call.args) == 3 else call.options.get("axis")
         if type(array) is not np.ndarray or array.ndim != 1 or type(shift) is not int or axis not in (None, 0, -1):
             return 0
         return shift % array.size if array.size else 0
