@@ -70,6 +70,24 @@ BUGS = {
         "    if open_traces and is_recorded(g):\n",
         "tests/autodiff/test_jit.py::test_second_order_and_forward_mode",
     ),
+    "a mask of a conservation law that a program keeps": Bug(
+        "flow",
+        "no_waves = a == b",
+        "no_waves = sample(a) == sample(b)",
+        "tests/autodiff/test_jit_scenes.py",
+    ),
+    "a coefficient that a program does not check": Bug(
+        "operators",
+        "check_values(_check_coefficient, k)",
+        "_check_coefficient(sample(k))",
+        "tests/autodiff/test_jit_checks.py",
+    ),
+    "Newton's method that a program repeats with the values of the recording": Bug(
+        "solvers",
+        '    @opaque\n    @public("dp.implicit(residual)")\n',
+        '    @public("dp.implicit(residual)")\n',
+        "tests/autodiff/test_jit_scenes.py",
+    ),
     "cotangents of a jitted step in the order of its result": Bug(
         "trajectory/recorded_steps.py",
         "        cotangents = [g[place] for place in self._places]\n",

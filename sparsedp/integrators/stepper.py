@@ -24,7 +24,7 @@ from sparsedp._utils.validation import (
 from sparsedp.autodiff.derivative import is_finite
 from sparsedp.autodiff.program_trace import check_values, opaque, open_traces, recording_trace, sample
 from sparsedp.autodiff.tape import is_variable, plain
-from sparsedp.errors import NonFiniteError, UnstableStepError
+from sparsedp.errors import JitError, NonFiniteError, UnstableStepError
 from sparsedp.integrators.problem import Problem, check_pair, like, real_number
 from sparsedp.integrators.runge_kutta import (
     EXPLICIT,
@@ -429,6 +429,7 @@ class Step(Reconstructible):
         self.name = f"stepper({method})"
         self.order: int = scheme.order
         self.info = scheme.info
+        self._is_recorded = False  # whether the last call was recorded by dp.jit
         # Whether values decide about the computation, as in error control and Newton's method.
         self.decides = arguments["tolerance"] is not None or method == "radau" or isinstance(scheme, Nonlinear)
         self.is_interrupted = arguments["breaks"] is not None or arguments["events"] is not None
@@ -437,12 +438,22 @@ class Step(Reconstructible):
     @property
     def taken(self) -> list[float]:
         """Return the lengths of the accepted steps in the last interval, as fractions of the interval."""
+        self._check_known("taken")
         return getattr(self.scheme, "taken", [1.0])
 
     @property
     def t_events(self) -> list[np.ndarray]:
         """Return the times of each event in the last interval."""
+        self._check_known("t_events")
         return getattr(self.scheme, "t_events", [])
+
+    def _check_known(self, word: str) -> None:
+        """Raise JitError for an attribute of the last step if this step is a call of a program."""
+        if self._is_recorded:
+            raise JitError(
+                f"dp.jit cannot record {word} of {self.name}, which differs from call to call and is not traced; read "
+                "it outside of the jitted function"
+            )
 
     @public("dp.stepper(method, rate, dt)")
     def __call__(self, state: Any, params: Any = None, *inputs: Any) -> Any:
@@ -461,11 +472,14 @@ class Step(Reconstructible):
             The new state, with the structure, shapes and dtypes of the old one.
         """
         if open_traces and self.decides:
-            return opaque(self._advance)(state, params, *inputs)
+            new = opaque(self._advance)(state, params, *inputs)
+            self._is_recorded = recording_trace(leaves(new)) is not None
+            return new
         return self._advance(state, params, *inputs)
 
     def _advance(self, state: Any, params: Any, *inputs: Any) -> Any:
         """Take one step."""
+        self._is_recorded = False
         first_params = params
         if inputs:
             params = (params, *inputs)
@@ -501,8 +515,11 @@ class Step(Reconstructible):
             self._refuse_nonfinite(state, params)
             raise NonFiniteError(self._overflow(h))
         if self.method == "leapfrog" and self.arguments["unstable"] == "raise":
-            entries, rebuild = flatten((u, params, h, first_params))
-            check_values(lambda *values: self.scheme.check_stable(*rebuild(values)), *entries)
+            if open_traces:
+                entries, rebuild = flatten((u, params, h, first_params))
+                check_values(lambda *values: self.scheme.check_stable(*rebuild(values)), *entries)
+            else:
+                self.scheme.check_stable(u, params, h, first_params)
         if not self.problem.timed:
             return new
         return new, end if self.is_interrupted else t + h

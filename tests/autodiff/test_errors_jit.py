@@ -160,6 +160,19 @@ def test_values_of_outer_traces(function):
         dp.grad(lambda p: anp.sum(dp.jit(lambda u: function(u, p))(X)))(2.0)
 
 
+def test_lengths_of_steps_are_not_read():
+    step = dp.stepper("rk4", lambda u, p: -p * u**2, 2.0, tolerance=1e-5)
+    jitted = dp.jit(lambda u, p: (step(u, p), len(step.taken)))
+    message = (
+        "dp.jit cannot record taken of stepper(rk4), which differs from call to call and is not traced; read it "
+        "outside of the jitted function"
+    )
+    with pytest.raises(dp.errors.JitError, match=re.escape(message)):
+        jitted(X**2, 1.0)
+    dp.jit(step)(X**2, 1.0)
+    assert len(step.taken) > 1
+
+
 def test_integers_have_no_derivative():
     message = "Can't differentiate w.r.t. type <class 'numpy.int64'>"
     with pytest.raises(TypeError, match=re.escape(message)):
