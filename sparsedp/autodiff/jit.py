@@ -130,6 +130,7 @@ class Jitted(Reconstructible):
 
     def __init__(self, function: Callable, check: bool = True, falls_back: bool = False) -> None:
         self.function = function
+        self.name = _name(function)
         self.check = check
         self.falls_back = falls_back
         self._recorded: dict[Any, Recorded] = {}
@@ -146,7 +147,7 @@ class Jitted(Reconstructible):
         return Jitted, (self.function, self.check, self.falls_back)
 
     def __repr__(self) -> str:
-        return f"<jit of {_name(self.function)}: {self.forms} forms recorded>"
+        return f"<jit of {self.name}: {self.forms} forms recorded>"
 
     def __call__(self, *args: Any, **options: Any) -> Any:
         """Call the function, by its program if there is one for arguments of this form."""
@@ -182,7 +183,7 @@ class Jitted(Reconstructible):
             with self._lock:
                 recorded = self._recorded.get(form)
                 if recorded is None:
-                    recorded = Recorded(self.function, args, options, variables, self.check)
+                    recorded = Recorded(self, args, options, variables)
                     self._add(form, recorded, (args, options))
         return recorded
 
@@ -193,7 +194,7 @@ class Jitted(Reconstructible):
             last_form = next(reversed(self._recorded))
             warnings.warn(
                 JitWarning(
-                    f"dp.jit recorded {_name(self.function)} for {self.forms} forms of its arguments, and "
+                    f"dp.jit recorded {self.name} for {self.forms} forms of its arguments, and "
                     f"{_difference(last_form, form, arguments)}; pass it as a floating number, or leave out dp.jit"
                 ),
                 stacklevel=frames_inside() + 1,
@@ -207,15 +208,17 @@ class Jitted(Reconstructible):
         """Return the jitted function ``value_and_grad(function, argnum)``, which `value_and_grad` calls."""
         known = self._gradients.get(argnum)
         if known is None:
-            known = self._gradients.setdefault(
-                argnum, Jitted(value_and_grad(self.function, argnum), self.check, self.falls_back)
-            )
+            known = Jitted(value_and_grad(self.function, argnum), self.check, self.falls_back)
+            known.name = f"value_and_grad({self.name})"
+            known = self._gradients.setdefault(argnum, known)
         return known
 
     def jitted_hvp(self, x: Any, tangent: Any) -> Any:
         """Return ``hvp(function, x, tangent)`` by a program."""
         if self._hessian_product is None:
-            self._hessian_product = Jitted(partial(hvp, self.function), self.check, falls_back=True)
+            product = Jitted(partial(hvp, self.function), self.check, falls_back=True)
+            product.name = f"hvp({self.name})"
+            self._hessian_product = product
         return self._hessian_product(x, tangent)
 
 
@@ -340,20 +343,20 @@ class Recorded:
 
     Parameters
     ----------
-    function : callable
+    jitted : Jitted
+        The function, its name, and whether each program is compared with the function once.
     args, options : tuple, dict
         Arguments of this form.
     variables : list
         Their floating leaves, plain or traced.
-    check : bool
-        Whether each program is compared with the function once.
     """
 
-    def __init__(self, function: Callable, args: tuple, options: dict, variables: Sequence, check: bool) -> None:
-        self.name = _name(function)
-        self._check = check
-        self._function = function
+    def __init__(self, jitted: Jitted, args: tuple, options: dict, variables: Sequence) -> None:
+        self.name = jitted.name
+        self._check = jitted.check
+        self._function = jitted.function
         self.first = [_copied(sample(variable)) for variable in variables]
+        self.eps = max([np.finfo(dtype_of(value)).eps for value in self.first], default=0.0)
         self._strided = [num for num, variable in enumerate(variables) if _is_strided(sample(variable))]
         check_leaves("args", (args, options))
         check_native("dp.jit", *self.first)
@@ -397,8 +400,8 @@ class Recorded:
         run, outputs = self._value
         results = run(*self.dense(variables))
         if not self._value_is_checked and self._is_to_be_checked(variables):
+            check_program(self.name, self.call(self.arguments(variables)), outputs.build(results), self.eps)
             self._value_is_checked = True
-            check_program(self.name, self.call(self.arguments(variables)), outputs.build(results))
         return outputs, results
 
     def pullback(self, nums: tuple[int, ...], variables: Sequence) -> PullbackProgram:
@@ -407,8 +410,8 @@ class Recorded:
         if program is None:
             program = self._pullbacks.setdefault(nums, PullbackProgram(self, nums))
         if not program.is_checked and self._is_to_be_checked(variables):
-            program.is_checked = True
             program.compare([sample(variable) for variable in variables])
+            program.is_checked = True
         return program
 
     def _is_to_be_checked(self, variables):
@@ -427,17 +430,20 @@ class Recorded:
         return compile_program(trace, needed_calls(trace.calls, outputs.slots), inputs, outputs.slots), outputs
 
 
-def check_program(name: str, expected: Any, result: Any) -> None:
-    """Raise JitError if the result of a program differs from that of its function."""
+def check_program(name: str, expected: Any, result: Any, eps: float) -> None:
+    """Raise JitError if the result of a program differs from that of its function.
+
+    `eps` is the rounding error of the least precise argument, which differences are compared with.
+    """
     for place, (a, b) in enumerate(zip(leaves(expected), leaves(result), strict=True)):
-        if not _agree(a, b):
+        if not _agree(a, b, eps):
             raise JitError(
                 f"the program of {name} differs from the function in result {place}: the function uses something that "
                 "has changed, or random numbers, or values of traced arrays; pass what changes as an argument"
             )
 
 
-def _agree(a, b):
+def _agree(a, b, eps=0.0):
     if is_variable(a):
         a = np.asarray(a)
         b = np.asarray(b)
@@ -449,7 +455,7 @@ def _agree(a, b):
         if not np.array_equal(finite, np.isfinite(b)):
             return False
         size = float(np.max(np.abs(a), where=finite, initial=0.0))
-        return bool(np.all(np.abs(a - b)[finite] <= VALUE_TOLERANCE * np.finfo(a.dtype).eps * size))
+        return bool(np.all(np.abs(a - b)[finite] <= VALUE_TOLERANCE * max(eps, np.finfo(a.dtype).eps) * size))
     if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
         return np.array_equal(a, b)
     return a is b or a == b
@@ -492,6 +498,7 @@ class Outputs:
     """
 
     def __init__(self, trace: ProgramTrace, inputs: Sequence[Slot], result: Any) -> None:
+        trace.check()
         ends = leaves(result)
         self._rebuild = flatten(_without_leaves(result))[1]
         self.slots: list[Slot] = []
@@ -522,7 +529,11 @@ def _own_array(trace, slot, others):
     if not isinstance(value, np.ndarray):
         return slot
     producer = next((call for call in trace.calls if call.result is slot), None)
-    is_new = producer is not None and (value.base is None or is_fresh(producer.function))
+    if producer is None:
+        return trace.call(_copied, slot)
+    used = [trace.sample(arg) for arg in producer.args]
+    shares = any(isinstance(arg, np.ndarray) and np.may_share_memory(value, arg) for arg in used)
+    is_new = is_fresh(producer.function) or (value.base is None and not shares)
     if is_new and all(slot.number != other.number for other in others):
         return slot
     return trace.call(_copied, slot)
@@ -577,6 +588,7 @@ class PullbackProgram:
                 if cotangent is not None:
                     cotangent = trace.unboxed(gradient_of(boxes[num], cotangent))
                 cotangents.append(cotangent)
+            trace.check()
         found = [cotangent for cotangent in cotangents if type(cotangent) is Slot]
         backward_calls = needed_calls(trace.calls[n_forward:], found)
         used = free_slots(backward_calls) | {slot.number for slot in found}
@@ -599,20 +611,35 @@ class PullbackProgram:
         """Raise JitError if the program and the function, or their pullbacks, differ at some plain variables."""
         recorded = self._recorded
         results, saved = self.forward(variables)
-        arguments = recorded.arguments(variables)
-        moving = [False] * len(leaves(arguments))
-        for num in self.nums:
-            moving[recorded.places[num]] = True
-        tape = taped(recorded.call, arguments, moving)
-        check_program(recorded.name, tape.rebuild(tape.values), self.outputs.build(results))
+        tape = self._tape(variables)
+        check_program(recorded.name, tape.rebuild(tape.values), self.outputs.build(results), recorded.eps)
         cotangents = [_random_like(results[k]) for k in self.floating]
         given = placed([None] * len(tape.values), [self.outputs.places[k] for k in self.floating], cotangents)
         pulled = tape.pull(given)
         expected = [gradient_of(variables[num], pulled[recorded.places[num]]) for num in self.nums]
-        check_program(f"the gradient of {recorded.name}", expected, self.pull(saved, cotangents, variables))
+        pulled = self.pull(saved, cotangents, variables)
+        check_program(f"the gradient of {recorded.name}", expected, pulled, recorded.eps)
+
+    def _tape(self, variables):
+        """Return the function on a tape at some plain variables."""
+        recorded = self._recorded
+        arguments = recorded.arguments(variables)
+        moving = [False] * len(leaves(arguments))
+        for num in self.nums:
+            moving[recorded.places[num]] = True
+        return taped(recorded.call, arguments, moving)
+
+    def _pull_on_tape(self, cotangents, variables):
+        """Return the cotangents of the variables for traced cotangents of the result, by the function itself."""
+        tape = self._tape(variables)
+        places = [self.outputs.places[k] for k in self.floating]
+        pulled = tape.pull(placed([None] * len(tape.values), places, cotangents))
+        return [gradient_of(variables[num], pulled[self._recorded.places[num]]) for num in self.nums]
 
     def pull(self, saved: Sequence, cotangents: Sequence, variables: Sequence) -> list:
-        """Return the cotangents of the variables `nums`."""
+        """Return the cotangents of the variables `nums`, for cotangents that may be traced."""
+        if any(map(isbox, cotangents)):
+            return self._pull_on_tape(cotangents, variables)
         pulled = self.backward(*saved, *cotangents)
         return [
             zero_like(variables[num]) if back is None else back for num, back in zip(self.nums, pulled, strict=True)

@@ -17,6 +17,7 @@ Traces of derivatives lie above this trace: a gradient is recorded like any othe
 
 from __future__ import annotations
 
+import operator
 from functools import wraps
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -115,6 +116,8 @@ class ProgramTrace:
     calls : list of ProgramCall
     samples : list
         The values in the execution that was recorded, in the order of the slots.
+    refusal : JitError or None
+        The reason why the function cannot be recorded.
     """
 
     def __init__(self, number: int, opaque_call: Callable) -> None:
@@ -122,6 +125,17 @@ class ProgramTrace:
         self.opaque_call = opaque_call
         self.calls: list[ProgramCall] = []
         self.samples: list[Any] = []
+        self.refusal: JitError | None = None
+
+    def refused(self, error: JitError) -> JitError:
+        """Return an error to be raised, which `check` raises again if the recorded function catches it."""
+        self.refusal = error
+        return error
+
+    def check(self) -> None:
+        """Raise the JitError that the recorded function has caught."""
+        if self.refusal is not None:
+            raise self.refusal
 
     def slot(self, value: Any) -> Slot:
         """Return the slot of a new value."""
@@ -288,11 +302,29 @@ def opaque(function: Callable) -> Callable:
 def _truth(box):
     """Return the truth value of a traced value, unless its trace is recorded."""
     if type(box._node) is ProgramNode:
-        raise JitError(
+        error = JitError(
             "dp.jit cannot record a decision by a traced value (if, while, and, or); write np.where(condition, a, b), "
             "or call the function without dp.jit"
         )
+        raise box._node.trace.refused(error)
     return bool(box._value)
+
+
+def _in_place(function):
+    """Return an operator such as ``+=``, which rebinds a name, for traced values.
+
+    It is refused for arrays while `dp.jit` records, because NumPy would change the array, to which other names may
+    refer.
+    """
+
+    def act(box, other):
+        if open_traces and isinstance(sample(box), np.ndarray):
+            trace = recording_trace((box,))
+            if trace is not None:
+                raise trace.refused(JitError("dp.jit cannot record an operation in place (u += v); write u = u + v"))
+        return function(box, other)
+
+    return act
 
 
 def _scalar_box(value, trace, node):
@@ -323,6 +355,8 @@ def _in_reverse(function):
 
 def _install():
     BOX.__bool__ = _truth
+    for name in ("add", "sub", "mul", "truediv", "floordiv", "mod", "pow", "matmul"):
+        setattr(BOX, f"__i{name}__", _in_place(getattr(operator, name)))
     # Comparisons of values on this trace are traced, too, and masks are combined.
     for operation, function in (("and", anp.bitwise_and), ("or", anp.bitwise_or), ("xor", anp.bitwise_xor)):
         setattr(BOX, f"__{operation}__", _in_order(function))

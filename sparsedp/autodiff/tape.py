@@ -117,10 +117,11 @@ def plain(value: Any) -> Any:
             while frame.f_globals.get("__name__", "").startswith("sparsedp._utils"):  # of the functions of trees
                 frame = frame.f_back
             name = frame.f_code.co_name.strip("<>")
-            raise JitError(
+            error = JitError(
                 f"dp.jit cannot record a decision by the values of a traced array ({name} in "
                 f"{frame.f_globals.get('__name__')}); call the function without dp.jit"
             )
+            raise value._node.trace.refused(error)
         value = value._value
     return value
 
@@ -622,9 +623,11 @@ def added(total: tuple | None, g: Any) -> tuple:
 
 def _add_recorded(total, g):
     """Add a cotangent to a sum of cotangents, one of which belongs to a program."""
+    if type(g) is not BOX:
+        g = add_outgrads(None, g)[0]  # the array of a sparse cotangent
     if total is None:
-        return add_outgrads(None, g)[0], False
-    if type(g) is BOX:
+        return g, False
+    if type(total[0]) in NUMBERS or type(total[0]) is BOX:  # not in place: the sum may be a constant of the program
         return total[0] + g, True
     return add_outgrads((total[0], False), g)[0], False
 
@@ -1156,12 +1159,14 @@ def _recorded_pullback_of_autograd(value, function, args, options, nums):
     try:
         pull = VJPNode(value, function, args, options, nums, ()).vjp
     except UNTRACEABLE:
+        trace.refusal = None
         return as_one_call
 
     def traced_pull(g):
         try:
             return pull(g)
         except UNTRACEABLE:
+            trace.refusal = None
             return as_one_call(g)
 
     return traced_pull

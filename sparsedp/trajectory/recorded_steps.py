@@ -121,7 +121,10 @@ class RecordedStepRunner(StepRunner):
         if any(back is None for back in g):
             g = [zero_like(value) if back is None else back for back, value in zip(g, state.values, strict=True)]
         cotangents = [g[place] for place in self._places]
-        pulled = self._program.backward(*saved, *cotangents)
+        if any(map(isbox, cotangents)):
+            pulled = tuple(self._program.pull(saved, cotangents, self._variables(state)))
+        else:
+            pulled = self._program.backward(*saved, *cotangents)
         backs = list(pulled[: self._n_state])
         position = self._n_state
         for root in self._differentiated_params:

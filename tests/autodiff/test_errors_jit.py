@@ -43,6 +43,20 @@ def converts_to_an_integer(u):
     return u * anp.int64(u[0])
 
 
+def works_in_place(u):
+    v = anp.sin(u)
+    w = v
+    v += 1.0
+    return anp.sum(w)
+
+
+def catches(u):
+    try:
+        return u if u[0] > 0 else -u
+    except dp.errors.JitError:
+        return 0.0 * u
+
+
 def reads(u):
     return u * plain(u)[0]
 
@@ -98,6 +112,12 @@ REFUSED = [
         hides,
         "dp.jit cannot record dot with a traced value inside a list; write anp.array([...]) around values, and "
         "anp.where for entries chosen by a traced index",
+    ),
+    (works_in_place, "dp.jit cannot record an operation in place (u += v); write u = u + v"),
+    (
+        catches,
+        "dp.jit cannot record a decision by a traced value (if, while, and, or); write np.where(condition, a, b), "
+        "or call the function without dp.jit",
     ),
     (
         converts_to_an_integer,
@@ -193,6 +213,8 @@ def test_a_function_that_is_not_pure_is_named():
     )
     with pytest.raises(dp.errors.JitError, match=message):
         jitted(Y)
+    with pytest.raises(dp.errors.JitError, match=message):
+        jitted(Y + 1.0)  # again, as long as they differ
     unchecked = dp.jit(noisy, check=False)
     assert unchecked(X)[0] - X[0] == pytest.approx(unchecked(Y)[0] - Y[0])
 

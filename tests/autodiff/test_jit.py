@@ -148,7 +148,7 @@ def test_layouts(view):
 def test_results_share_no_memory():
     def function(u):
         v = 3.0 * u
-        return u, u, u[:2], v, v, 1.0 * u, X
+        return u, u, u[:2], v, v, anp.real(v), anp.real(u), 1.0 * u, X
 
     jitted = dp.jit(function)
     for x in (X.copy(), Y.copy()):
@@ -247,3 +247,40 @@ def test_threads_and_pickles():
     again = pickle.loads(pickle.dumps(jitted))
     assert again.forms == 0 and again(X) == physics(X)
     assert repr(again) == "<jit of physics: 1 forms recorded>"
+
+
+PLACES = np.array([1, 2])
+OTHER_PLACES = np.array([0, 1])
+
+
+def constant_and_traced_parts(u):
+    """The cotangent of an array is the sum of a constant part and of a traced one."""
+    return anp.sum(u[PLACES] ** 2) + anp.sum(u[OTHER_PLACES]) + u[3] * u[4] * np.float64(1.0) + u[3]
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_constant_sums_of_cotangents_are_not_written_into(dtype):
+    jitted = dp.jit(constant_and_traced_parts, check=False)
+    step = dp.jit(lambda u, p: u - 0.1 * p * dp.grad(constant_and_traced_parts)(u), check=False)
+    for factor in (1.0, 10.0, 1.0, 0.0):
+        x = (factor * np.arange(1.0, 7.0)).astype(dtype)
+        np.testing.assert_array_equal(dp.value_and_grad(jitted)(x)[1], dp.grad(constant_and_traced_parts)(x))
+        np.testing.assert_array_equal(dp.jit(dp.grad(jitted))(x), dp.grad(constant_and_traced_parts)(x))
+        if dtype is np.float64:
+            slopes = [dp.grad(lambda x, f=f: anp.sum(dp.rollout(f, x, 1.0, 3) ** 2))(x) for f in (step, step.function)]
+            np.testing.assert_allclose(*slopes, rtol=1e-14)
+
+
+def test_functions_without_jvp():
+    """Their tangent comes from two reverse passes, in which the cotangent is traced."""
+
+    def solved(x):
+        return anp.linalg.solve(anp.sum(x) * np.eye(16) + anp.outer(x, x), x)
+
+    jitted = dp.jit(solved)
+    for x in (X, Y):
+        dp.vjp(jitted, x)[1](x)
+        np.testing.assert_allclose(dp.jvp(jitted, x, Y)[1], dp.jvp(solved, x, Y)[1], rtol=1e-13)
+    step = dp.jit(lambda u, p: p * solved(u))
+    found = dp.jvp(lambda u: dp.rollout(step, u, 1.5, 3), X, Y)[1]
+    np.testing.assert_allclose(found, dp.jvp(lambda u: dp.rollout(step.function, u, 1.5, 3), X, Y)[1], rtol=1e-12)
