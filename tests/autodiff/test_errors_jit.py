@@ -215,6 +215,17 @@ def test_a_function_that_is_not_pure_is_named():
         jitted(Y)
     with pytest.raises(dp.errors.JitError, match=message):
         jitted(Y + 1.0)  # again, as long as they differ
+    gradient = dp.value_and_grad(dp.jit(lambda u: anp.sum(noisy(u) ** 2)))
+    pull = dp.jit(noisy)
+    dp.vjp(pull, X)
+    for x in (Y, Y + 1.0):
+        with pytest.raises(dp.errors.JitError, match="the program of .*noisy differs from the function in result 0"):
+            dp.vjp(pull, x)
+    gradient(X)
+    with pytest.raises(
+        dp.errors.JitError, match=r"the program of value_and_grad\(<lambda>\) differs from the function"
+    ):
+        gradient(Y)
     unchecked = dp.jit(noisy, check=False)
     assert unchecked(X)[0] - X[0] == pytest.approx(unchecked(Y)[0] - Y[0])
 
