@@ -410,7 +410,7 @@ def _checked_parameter(name, parameter, space, advice="", other_space=None):
 
 
 def _check_not_negative(k):
-    k = np.asarray(k)
+    k = as_field(k)
     if k.dtype.kind != "c" and np.any(k < 0):
         raise ValueError(f"k must be >= 0, got {np.min(k):g} at {np.argmin(k)}")
 
