@@ -64,7 +64,7 @@ BUGS = {
         "",
         "tests/autodiff/test_jit.py",
     ),
-    "a check dropped from a program because nobody uses its result": Bug(
+    "a check dropped from a program because its result is not used": Bug(
         "autodiff/program.py",
         "        if call.result.number in wanted or call.has_effect:\n",
         "        if call.result.number in wanted:\n",

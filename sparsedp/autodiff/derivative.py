@@ -62,6 +62,7 @@ __all__ = [
     "pullback",
     "push",
     "pushforward",
+    "random_like",
     "taped",
     "traced",
     "unwarned",
@@ -738,13 +739,13 @@ def _twice_reverse(fun, tree, tangents):
                 total = total + anp.sum(cotangent * tangent)
         return total
 
-    z = [_random_like(value) if moves else None for value, moves in zip(tape.values, moving, strict=True)]
+    z = [random_like(value) if moves else None for value, moves in zip(tape.values, moving, strict=True)]
     slopes = taped(product, z, moving).pull([1.0])
     return tape.rebuild(tape.values), tape.rebuild(map(tangent_of, tape.values, slopes))
 
 
-def _random_like(value):
-    """Return random numbers of the shape and dtype of a value, the same in every run."""
+def random_like(value: Any) -> Any:
+    """Return random numbers of the shape and dtype of a value, plain or traced, the same in every run."""
     numbers = np.random.default_rng(0).uniform(0.5, 1.5, np.shape(sample(value)))
     return np.asarray(numbers, dtype_of(value))[()]
 

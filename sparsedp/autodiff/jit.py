@@ -17,7 +17,7 @@ from sparsedp._utils.counters import active, thread
 from sparsedp._utils.pytree import TreeStructure, child, flatten, keys, labels, leaves, placed
 from sparsedp._utils.validation import check_function, check_leaves, check_native
 from sparsedp.autodiff.backend import ARRAY_KINDS
-from sparsedp.autodiff.derivative import gradient_of, hvp, taped, value_and_grad, zero_like
+from sparsedp.autodiff.derivative import gradient_of, hvp, random_like, taped, value_and_grad, zero_like
 from sparsedp.autodiff.program import compile_program, free_slots, needed_calls
 from sparsedp.autodiff.program_trace import ProgramTrace, Slot, opaque, open_traces, refuse_outer_trace
 from sparsedp.autodiff.tape import (
@@ -169,11 +169,7 @@ class Jitted(Reconstructible):
             self._is_refused = True
             return self.function(*args, **options)
         rule = JittedRule(recorded.name, program)
-        results = through(rule, nums, *variables)
-        if len(program.floating) == 1:
-            results = [results]
-        else:
-            results = [results[k] for k in range(len(program.floating))]
+        results = _separated(through(rule, nums, *variables), len(program.floating))
         return program.build(results, rule.others)
 
     def recorded(self, form: Any, args: tuple, options: dict, variables: list) -> Recorded:
@@ -565,12 +561,8 @@ class PullbackProgram:
         self._recorded = recorded
         trace, inputs = recorded.begin()
         boxes = list(map(trace.box, inputs))
-        arguments = recorded.arguments(boxes)
-        moving = [False] * len(leaves(arguments))
-        for num in nums:
-            moving[recorded.places[num]] = True
         with _recording(recorded.name):
-            tape = taped(recorded.call, arguments, moving)
+            tape = self._tape(boxes)
             self.outputs = Outputs(trace, inputs, tape.rebuild(tape.values))
             n_forward = len(trace.calls)
             results = [trace.samples[slot.number] for slot in self.outputs.slots]
@@ -578,7 +570,7 @@ class PullbackProgram:
             given: list = [None] * len(tape.values)
             cotangent_slots = []
             for k in self.floating:
-                slot = trace.slot(_random_like(results[k]))
+                slot = trace.slot(random_like(results[k]))
                 cotangent_slots.append(slot)
                 given[self.outputs.places[k]] = trace.box(slot)
             pulled = tape.pull(given)
@@ -613,15 +605,13 @@ class PullbackProgram:
         results, saved = self.forward(variables)
         tape = self._tape(variables)
         check_program(recorded.name, tape.rebuild(tape.values), self.outputs.build(results), recorded.eps)
-        cotangents = [_random_like(results[k]) for k in self.floating]
-        given = placed([None] * len(tape.values), [self.outputs.places[k] for k in self.floating], cotangents)
-        pulled = tape.pull(given)
-        expected = [gradient_of(variables[num], pulled[recorded.places[num]]) for num in self.nums]
-        pulled = self.pull(saved, cotangents, variables)
-        check_program(f"the gradient of {recorded.name}", expected, pulled, recorded.eps)
+        cotangents = [random_like(results[k]) for k in self.floating]
+        expected = self._pull_tape(tape, cotangents, variables)
+        found = self.pull(saved, cotangents, variables)
+        check_program(f"the gradient of {recorded.name}", expected, found, recorded.eps)
 
     def _tape(self, variables):
-        """Return the function on a tape at some plain variables."""
+        """Return the function on a tape at some variables, plain or of a program."""
         recorded = self._recorded
         arguments = recorded.arguments(variables)
         moving = [False] * len(leaves(arguments))
@@ -629,9 +619,8 @@ class PullbackProgram:
             moving[recorded.places[num]] = True
         return taped(recorded.call, arguments, moving)
 
-    def _pull_on_tape(self, cotangents, variables):
-        """Return the cotangents of the variables for traced cotangents of the result, by the function itself."""
-        tape = self._tape(variables)
+    def _pull_tape(self, tape, cotangents, variables):
+        """Return the cotangents of the variables `nums` by a tape of the function itself."""
         places = [self.outputs.places[k] for k in self.floating]
         pulled = tape.pull(placed([None] * len(tape.values), places, cotangents))
         return [gradient_of(variables[num], pulled[self._recorded.places[num]]) for num in self.nums]
@@ -639,7 +628,7 @@ class PullbackProgram:
     def pull(self, saved: Sequence, cotangents: Sequence, variables: Sequence) -> list:
         """Return the cotangents of the variables `nums`, for cotangents that may be traced."""
         if any(map(isbox, cotangents)):
-            return self._pull_on_tape(cotangents, variables)
+            return self._pull_tape(self._tape(variables), cotangents, variables)
         pulled = self.backward(*saved, *cotangents)
         return [
             zero_like(variables[num]) if back is None else back for num, back in zip(self.nums, pulled, strict=True)
@@ -660,12 +649,6 @@ def _bytes_of(trace, slots, inputs):
             wanted.update(arg.number for arg in call.args if type(arg) is Slot)
     wanted -= {slot.number for slot in inputs}
     return sum(getattr(trace.samples[number], "nbytes", 0) for number in wanted)
-
-
-def _random_like(value):
-    """Return random numbers of the shape and dtype of a value: zeros could be treated as a special case."""
-    numbers = np.random.default_rng(0).uniform(0.5, 1.5, np.shape(value))
-    return np.asarray(numbers, dtype_of(value))[()]
 
 
 @contextmanager
@@ -717,7 +700,7 @@ class JittedRule(Rule):
         results, self._saved = program.forward(constant_args(variables, program.nums))
         floating = [results[k] for k in program.floating]
         self.others = [results[k] for k in range(len(results)) if k not in program.floating]
-        return floating[0] if len(floating) == 1 else tuple(floating)
+        return _combined(floating)
 
     def vjp(self, nums: Sequence[int], ans: Any, *variables: Any) -> Callable:
         """Return the function that maps cotangents of the result to those of the differentiated variables."""
@@ -725,9 +708,7 @@ class JittedRule(Rule):
         self._saved = ()
 
         def pull(g):
-            n = len(self._program.floating)
-            cotangents = [g] if n == 1 else [g[k] for k in range(n)]
-            return self._program.pull(saved, cotangents, variables)
+            return self._program.pull(saved, _separated(g, len(self._program.floating)), variables)
 
         return pull
 
@@ -783,7 +764,7 @@ class OpaqueCall(Rule):
         trace = recording_trace(variables)
         self._call = trace.call(self._run, *map(trace.unboxed, variables))
         results, _ = trace.sample(self._call)
-        return _single([trace.box(trace.call(_entry, self._call, 0, place)) for place in range(len(results))])
+        return _combined([trace.box(trace.call(_entry, self._call, 0, place)) for place in range(len(results))])
 
     def _evaluate(self, arguments):
         args, options = arguments
@@ -816,16 +797,13 @@ class OpaqueCall(Rule):
 
     def build(self, results: Any) -> Any:
         """Return the result of the function from its floating leaves."""
-        if len(self._result.places) != 1:
-            return self._result.build([results[k] for k in range(len(self._result.places))])
-        return self._result.build([results])
+        return self._result.build(_separated(results, len(self._result.places)))
 
     def vjp(self, nums: Sequence[int], ans: Any, *variables: Any) -> Callable:
         """Return the function that maps cotangents of the result to those of the differentiated variables."""
 
         def pull(g):
-            n = len(self._result.places)
-            cotangents = [g] if n == 1 else [g[k] for k in range(n)]
+            cotangents = _separated(g, len(self._result.places))
             trace = recording_trace((ans, *cotangents, *variables))
             plain_variables = [trace.unboxed(variable) for variable in variables]
             pulled = trace.call(self._pull, self._call, *map(trace.unboxed, cotangents), *plain_variables)
@@ -843,11 +821,18 @@ class OpaqueCall(Rule):
         return [gradient_of(variables[num], pulled[self._structure.places[num]]) for num in self._nums]
 
 
-def _single(values):
-    """Return the only entry of a list, or the list as a tuple."""
+def _combined(values):
+    """Return several values as the result of a rule: the only one, or a tuple."""
     if len(values) == 1:
         return values[0]
     return tuple(values)
+
+
+def _separated(result, n):
+    """Return the list of the n values that `_combined` has combined, or of their cotangents."""
+    if n == 1:
+        return [result]
+    return [result[k] for k in range(n)]
 
 
 def _entry(call, part, place):

@@ -1,7 +1,7 @@
 """Programs: recorded calls, compiled to one function of straight-line Python code.
 
 A program executes the calls of a `ProgramTrace` that its results need, on plain values and without a tape. Calls whose
-results nobody uses are dropped, except checks. Large arrays are overwritten by a later result, or freed, as soon as no
+results are not used are dropped, except checks. Large arrays are overwritten by a later result, or freed, as soon as no
 call needs them any more.
 """
 

@@ -91,7 +91,7 @@ class ProgramCall(NamedTuple):
     options : dict
     result : Slot
     has_effect : bool
-        Whether the call is kept although nobody uses its result: a check.
+        Whether the call is kept although its result is not used: a check.
     """
 
     function: Any

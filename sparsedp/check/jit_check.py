@@ -13,7 +13,7 @@ import numpy as np
 from sparsedp._utils.pytree import copied, labels, leaves, mapped
 from sparsedp._utils.validation import check_function
 from sparsedp.autodiff.derivative import pullback, unwarned, value_and_grad
-from sparsedp.autodiff.jit import Jitted, is_watched, tree_form
+from sparsedp.autodiff.jit import VALUE_TOLERANCE, Jitted, is_watched, tree_form
 from sparsedp.autodiff.jit import jit as record
 from sparsedp.autodiff.tape import is_variable
 from sparsedp.check.summary import Row, Summary, error_text
@@ -21,7 +21,7 @@ from sparsedp.errors import JitError
 
 __all__ = ["JitSummary", "jit"]
 
-LIMIT = 1e4  # largest accepted gap, in units of eps; `jit` has the same limit for its own comparison
+LIMIT = VALUE_TOLERANCE  # largest accepted gap, in units of eps
 PERTURBATION = 0.05  # relative change of the arguments
 PLACES = ("the given arguments", "perturbed arguments 1", "perturbed arguments 2")
 NO_PROGRAM = "no program was recorded: a field is distributed, or calls are counted or observed"
@@ -147,25 +147,11 @@ class _Comparison:
             if place == PLACES[0]:
                 raise
             return [Row(f"result at {place}", note=f"not compared, the function raised {error_text(error)}")]
-        found = _second_chance(self.jitted, *copied(args), **options)
+        found = self.jitted(*copied(args), **options)
         rows = [_row(f"result at {place}", "result", expected, found)]
         for name, derivative in _derivatives(expected, args, options).items():
-            rows.append(
-                _row(f"gradient at {place}", name, derivative(self.plain), _second_chance(derivative, self.jitted))
-            )
+            rows.append(_row(f"gradient at {place}", name, derivative(self.plain), derivative(self.jitted)))
         return rows
-
-
-def _second_chance(function: Callable[..., Any], *args: Any, **options: Any) -> Any:
-    """Return the result of a call, or of a second one if the first raised JitError.
-
-    A jitted function compares each program once, and raises JitError if it differs. Its next call returns the numbers
-    of the program. A function that cannot be recorded raises JitError in both calls.
-    """
-    try:
-        return function(*args, **options)
-    except JitError:
-        return function(*args, **options)
 
 
 def _derivatives(
