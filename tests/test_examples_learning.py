@@ -99,6 +99,17 @@ def test_mesh_design():
     assert float(re.search(r"mean difference (\S+)", printed)[1]) < 0.05
 
 
+@example("mbb_beam.py")
+def test_mbb_beam():
+    """The published compliances of both filters to 0.1 %, with our derivative."""
+    printed = run("mbb_beam.py")
+    assert float(re.search(r"textbooks: difference (\S+)", printed)[1]) < 1e-9 and "differences: agrees" in printed
+    table = rows(printed, r"^optimality criteria, (.*\S) +(\d+\.\d+) +(\d+\.\d+) +(\d+) ")
+    assert [row[0] for row in table] == ["sensitivity filter", "density filter"]
+    for _, compliance, published, iterations in table:
+        assert abs(compliance / published - 1) <= 1e-3 and iterations < 200
+
+
 @example("pylops_exchange.py")
 def test_pylops_exchange():
     """PyLops solves with our heat, and we search through a camera of PyLops."""

@@ -47,6 +47,7 @@ SMALL = {
     "solver_in_the_loop.py": "48",
     "ensemble.py": "5",
     "mesh_design.py": "3",
+    "mbb_beam.py": "20",
     "pylops_exchange.py": "32",
     "pendulums.py": "10",
 }  # cells, the end time, or gradients; the others run with 16
@@ -54,6 +55,7 @@ NEEDS = {
     "torch_training.py": "torch",
     "jax_optimiser.py": "optax",
     "mesh_design.py": "skfem",
+    "mbb_beam.py": "skfem",
     "pylops_exchange.py": "pylops",
 }  # libraries that need not be there
 DEFAULT = {"heat_rod.py", "new_operator.py", "plan.py", "pressure_projection.py", "two_families.py"}
