@@ -18,7 +18,7 @@ from typing import Any as _Any
 _PUBLIC_NAMES = {
     "grid.grid": "Grid",
     "grid.space": "Space",
-    "grid.boundary_conditions": "dirichlet free_slip inflow neumann no_slip outflow robin",
+    "grid.boundary_conditions": "dirichlet free_slip inflow neumann no_slip outflow patch robin",
     "autodiff.tape": "differentiable",
     "autodiff.derivative": "grad hvp jvp value_and_grad vjp",
     "autodiff.flattening": "flatten",

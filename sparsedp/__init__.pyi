@@ -26,6 +26,7 @@ from .grid.boundary_conditions import inflow as inflow
 from .grid.boundary_conditions import neumann as neumann
 from .grid.boundary_conditions import no_slip as no_slip
 from .grid.boundary_conditions import outflow as outflow
+from .grid.boundary_conditions import patch as patch
 from .grid.boundary_conditions import robin as robin
 from .grid.grid import Grid as Grid
 from .grid.space import Space as Space

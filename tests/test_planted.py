@@ -27,6 +27,48 @@ class Bug(NamedTuple):
 
 
 BUGS = {
+    "a patch that is ignored by a function without patches": Bug(
+        "grid/boundary_conditions.py",
+        "    if not accepted:\n        for axis, side, wall",
+        "    if False:\n        for axis, side, wall",
+        "tests/operators/test_patches.py",
+    ),
+    "both ends of an interval that belong to a patch": Bug(
+        "grid/boundary_conditions.py",
+        "(centres < stop - ON_END * widths)",
+        "(centres < stop + ON_END * widths)",
+        "tests/operators/test_patches.py::test_which_faces_belong_to_an_interval",
+    ),
+    "patches that overlap": Bug(
+        "grid/boundary_conditions.py",
+        "        if overlap:\n",
+        "        if False:\n",
+        "tests/operators/test_errors_patches.py",
+    ),
+    "values of a patch on the rest of its wall": Bug(
+        "grid/boundary_conditions.py",
+        "anp.where(faces, inside, elsewhere)",
+        "anp.where(~faces, inside, elsewhere)",
+        "tests/operators/test_patches.py",
+    ),
+    "the condition of a patch on the rest of its wall": Bug(
+        "operators/stencils.py",
+        "                terms += on_faces(axis, at_wall, faces)\n",
+        "                terms += on_faces(axis, at_wall, ~faces)\n",
+        "tests/operators/test_patches.py",
+    ),
+    "one condition for the values of all faces of a wall": Bug(
+        "operators/stencils.py",
+        "        terms += on_faces(axis, wall_slopes(grid, axis, side, condition), faces)\n",
+        "        terms += on_faces(axis, wall_slopes(grid, axis, side, wall.regions[0][0]), faces)\n",
+        "tests/operators/test_patches.py",
+    ),
+    "a patch that overwrites what other terms computed": Bug(
+        "operators/structure/kronecker.py",
+        "        if not accumulate:\n            out[...] = 0\n        out.reshape(-1)[row]",
+        "        if True:\n            out[...] = 0\n        out.reshape(-1)[row]",
+        "tests/operators/test_patches.py",
+    ),
     "constants of a program that the caller can still change": Bug(
         "autodiff/program_trace.py",
         "        kept = tuple(arg if type(arg) is Slot else constant(arg) for arg in args)\n",

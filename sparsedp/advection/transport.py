@@ -209,7 +209,7 @@ def transport(
 
 def _sides(grid: Grid, boundary: Any) -> tuple:
     """Return the conditions of both sides of each axis; raise unless they are dirichlet or neumann."""
-    sides = resolve(grid, boundary)
+    sides = resolve(grid, boundary, name="transport")
     for pair in sides:
         for condition in pair or ():
             if condition not in (dirichlet, neumann):

@@ -179,7 +179,7 @@ def conservation_law(
     check_function("conservation_law, as speed,", speed, "lambda u, params, axis: ...", 3)
     if source is not None:
         check_function("conservation_law, as source,", source, "lambda u, params: ...", 2)
-    sides = resolve(grid, boundary, outflow)
+    sides = resolve(grid, boundary, outflow, name="conservation_law")
     conditions = [condition for pair in sides for condition in pair or ()]
     for condition in conditions:
         if condition not in PAD_MODES:

@@ -107,7 +107,7 @@ def face_laplacian(
     >>> L(np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
     array([ 0.,  0., -4., -4.,  0.,  0.,  0.,  0.,  0.,  0.,  0.,  0.])
     """
-    sides = resolve(grid, boundary, no_slip)
+    sides = resolve(grid, boundary, no_slip, name="face_laplacian")
     free = Mask(free_faces(grid, sides, solid))
     stress = stresses(grid, sides, solid, solid_boundary)
     if solid is None:
@@ -156,7 +156,7 @@ def face_lift(grid: Grid, boundary: Any = no_slip, solid: ArrayLike | None = Non
     >>> B(B.domain.join(0.0, 0.0, 0.0, 1.0))  # y-upper moves along x: a lid
     array([0., 0., 0., 2., 0., 0., 0., 0., 0., 0., 0., 0.])
     """
-    sides = resolve(grid, boundary, no_slip)
+    sides = resolve(grid, boundary, no_slip, name="face_lift")
     structure = compose(Mask(free_faces(grid, sides, solid)), wall_stresses(grid, sides))
     return Operator(structure, wall_velocities(grid, sides), grid.faces, "face_lift")
 
@@ -220,7 +220,7 @@ def convection(grid: Grid, boundary: Any = no_slip, solid: ArrayLike | None = No
     >>> float(np.max(np.abs(convect(v, v, walls.join(0.5, 1.0)))))  # v at x-lower, u at y-lower
     0.0
     """
-    sides = resolve(grid, boundary, no_slip)
+    sides = resolve(grid, boundary, no_slip, name="convection")
     fluxes = MomentumFluxes(grid, sides)
     gain = fluxes.gain
     free = Mask(free_faces(grid, sides, solid))

@@ -78,7 +78,7 @@ class ProjectionSetup(Reconstructible):
 
     def __init__(self, grid: Grid, solid: ArrayLike | None, boundary: Any, settings: SolveSettings) -> None:
         self.grid = grid
-        self.sides = resolve(grid, boundary, no_slip)
+        self.sides = resolve(grid, boundary, no_slip, name="projection")
         if solid is None:
             self.solid = None
         else:

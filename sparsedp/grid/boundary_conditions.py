@@ -8,31 +8,55 @@ wall and h the width of that cell. The wall value u_w and the slope then follow 
 
 A FlowCondition describes a fluid at a wall. It consists of a condition for the tangential velocity and one for the
 pressure.
+
+A Patch is a condition on part of a wall and another one on the other faces of this wall. `resolve` converts it to a
+MixedWall, which has one boolean array of faces for each condition. A function that does not support mixed walls gets an
+error from `resolve`, so that no function can ignore a patch.
 """
 
 from __future__ import annotations
 
-from typing import Any, NoReturn
+from functools import cached_property
+from math import prod
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import autograd.numpy as anp
+import numpy as np
 
 from sparsedp._utils.base_classes import Value
 from sparsedp._utils.validation import check_number, check_type
+from sparsedp.autodiff.tape import isbox
+from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
 from sparsedp.grid.grid import AXES, Grid
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from numpy.typing import NDArray
 
 __all__ = [
     "Condition",
     "FlowCondition",
+    "MixedWall",
+    "Patch",
     "check_condition",
+    "describe_patches",
     "dirichlet",
     "free_slip",
+    "has_patches",
     "inflow",
     "neumann",
     "no_slip",
     "outflow",
+    "patch",
     "resolve",
     "robin",
+    "walls_of",
 ]
 
 EXAMPLE = "; write for example robin(1.0, 0.5)"
+ON_END = 1e-9  # a face centre within this share of its width from the end of an interval lies on this end
+SIDES = ("lower", "upper")
 
 
 class Condition(Value):
@@ -100,7 +124,7 @@ dirichlet = Condition(
 
     See Also
     --------
-    neumann, robin, gradient, laplacian, lift, transport
+    neumann, robin, patch, gradient, laplacian, lift, transport
 
     Examples
     --------
@@ -135,7 +159,7 @@ neumann = Condition(
 
     See Also
     --------
-    dirichlet, robin, gradient, laplacian, lift, transport
+    dirichlet, robin, patch, gradient, laplacian, lift, transport
 
     Examples
     --------
@@ -185,7 +209,7 @@ def robin(a: float, b: float) -> Condition:
 
     See Also
     --------
-    dirichlet, neumann, gradient, laplacian, lift
+    dirichlet, neumann, patch, gradient, laplacian, lift
 
     Examples
     --------
@@ -387,8 +411,277 @@ outflow = FlowCondition(
 )
 
 
+class Patch(Value):
+    """A condition on part of a wall, and another condition on the other faces of this wall; see `patch`.
+
+    Parameters
+    ----------
+    where : tuple of intervals, or bool array
+        The part of the wall. An interval is a pair of coordinates, or None for the whole length of its axis.
+    condition : Condition or FlowCondition
+    elsewhere : Condition, FlowCondition or Patch
+        Condition of the same type, or another patch of the same wall.
+    """
+
+    where: Any
+    condition: Any
+    elsewhere: Any
+
+    def __init__(self, where: Any, condition: Any, elsewhere: Any) -> None:
+        super().__init__(where=where, condition=condition, elsewhere=elsewhere)
+
+    @property
+    def _key(self):
+        where = self.where
+        if isinstance(where, np.ndarray):
+            where = where.shape, where.tobytes()
+        return where, self.condition, self.elsewhere
+
+    def values(self, grid: Grid, axis: int | str, inside: Any, elsewhere: Any = 0.0) -> Any:
+        """Return the wall values that are `inside` on the faces of the patch. Differentiable in both values.
+
+        Parameters
+        ----------
+        grid : Grid
+        axis : int or "x", "y", "z"
+            Axis across the wall.
+        inside : number, or array with one entry for each face of the wall
+            Its entries on other faces are not used.
+        elsewhere : number, or array with one entry for each face of the wall, optional
+            The values on the other faces of the wall, such as those of another patch.
+
+        Returns
+        -------
+        array, in the shape of the wall without its axis
+            An argument of ``join`` on the domain of `lift`.
+
+        Raises
+        ------
+        ShapeError
+            If an array has another shape than the wall.
+        ValueError
+            If the patch covers no face.
+
+        Examples
+        --------
+        >>> import sparsedp as dp
+        >>> heated = dp.patch((1.0, 3.0), dp.dirichlet)
+        >>> heated.values(dp.Grid((5, 4)), "x", 20.0)
+        array([ 0., 20., 20.,  0.])
+        """
+        number = grid.axis(axis)
+        faces = _faces_of(grid, number, f"the wall of {grid.axes[number]}", self)
+        for name, value in (("inside", inside), ("elsewhere", elsewhere)):
+            if np.shape(value) not in ((), faces.shape):
+                raise ShapeError(
+                    f"values of a patch takes {name} as a number or an array of shape {faces.shape}, one entry for "
+                    f"each face of the wall, got shape {np.shape(value)}"
+                )
+        return anp.where(faces, inside, elsewhere)
+
+    def __call__(self, value: Any) -> NoReturn:
+        """Raise TypeError, because a condition takes no value; boundary values are arguments of `lift`."""
+        raise TypeError("a patch takes no value here; write G(u) + B(values), B = dp.lift(grid, boundary)")
+
+    def __repr__(self) -> str:
+        if isinstance(self.where, np.ndarray):
+            where = f"<mask of {np.count_nonzero(self.where)} faces>"
+        elif len(self.where) == 1:
+            where = repr(self.where[0])
+        else:
+            where = repr(self.where)
+        return f"patch({where}, {self.condition!r}, elsewhere={self.elsewhere!r})"
+
+
+def patch(where: Any, condition: Any, elsewhere: Any = None) -> Patch:
+    """Return a boundary condition that holds on part of a wall; another condition holds on the rest of this wall.
+
+    Write the patch in the argument ``boundary=``, in the place of the condition of one wall.
+
+    Parameters
+    ----------
+    where : pair of float, tuple of pairs, or bool array
+        The part of the wall.
+
+        - In 2-D an interval ``(start, stop)`` of the coordinate along the wall [length], which includes the origin of
+          the grid.
+        - In 3-D a box, one interval for each of the two other axes in their order. None instead of an interval stands
+          for the whole axis.
+        - In any dimension a boolean array with one entry for each face of the wall: shape ``(ny,)`` for a wall of x in
+          2-D, and ``(ny, nz)`` in 3-D.
+    condition : Condition or FlowCondition
+        dirichlet, neumann or robin(a, b) for fields; no_slip, free_slip, inflow or outflow for flows.
+    elsewhere : Condition, FlowCondition or Patch, optional
+        Condition of the same type on the other faces of the wall. Another patch adds a second part of the same wall;
+        the two must not overlap. Default: neumann for fields, no_slip for flows.
+
+    Returns
+    -------
+    Patch
+
+    Raises
+    ------
+    TypeError
+        If `condition` or `elsewhere` is not a condition, if they are conditions of different types, or if `where` is
+        neither intervals nor a boolean array.
+    ValueError
+        If an interval is empty or reversed. When the patch is used: if it covers no face, if it extends beyond the
+        wall, or if two patches overlap.
+    NonFiniteError
+        If a coordinate is NaN or infinite.
+    ShapeError
+        When the patch is used, if `where` does not fit the wall.
+    DerivativeError
+        If autograd traces `where`.
+
+    See Also
+    --------
+    dirichlet, neumann, robin, lift, gradient, laplacian
+
+    Notes
+    -----
+    A face belongs to an interval if its centre c satisfies start <= c < stop. The patch is a union of whole faces, so
+    the ends of an interval are moved to the nearest ends of faces, an error of order h in the position of the patch. To
+    avoid this error, choose a grid with faces that end there.
+
+    A patch that covers all faces of a wall is the same as its condition. The values of `lift` have one entry for each
+    face of a wall; each is the value of the condition that holds on this face. A number for the whole wall is therefore
+    a temperature on the faces with dirichlet and a slope on those with neumann. ``heated.values(grid, "x", 20.0)``
+    returns an array that is 20 on the faces of the patch `heated`, and 0 on the others.
+
+    These functions accept patches: `gradient`, `laplacian`, `lift`, `average` and `upwind`, and with them `inverse` and
+    `elliptic_solver`. All others refuse them. Operators with patches are not sums of 1-D operators: `inverse` uses
+    sparse factors or multigrid for them, and method "separable" does not apply. Distributed grids have no patches.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sparsedp as dp
+    >>> grid = dp.Grid((2, 4), size=1.0)
+    >>> heated = dp.patch((0.25, 0.75), dp.dirichlet, elsewhere=dp.neumann)
+    >>> G = dp.gradient(grid, {"x": (heated, dp.neumann)})
+    >>> grid.split(G(np.ones((2, 4))))[0][0]  # slopes at the lower wall of x
+    array([0., 4., 4., 0.])
+
+    The slopes that the value 5 on the patch adds:
+
+    >>> B = dp.lift(grid, {"x": (heated, dp.neumann)})
+    >>> slopes = B(B.domain.join(heated.values(grid, "x", 5.0), 0.0, 0.0, 0.0))
+    >>> grid.split(slopes)[0][0]
+    array([  0., -20., -20.,   0.])
+    """
+    kinds = (Condition, FlowCondition)
+    if not isinstance(condition, kinds):
+        raise TypeError(
+            f"patch needs a condition such as dp.dirichlet or dp.outflow, got {condition!r}; write "
+            "dp.patch((0.2, 0.4), dp.dirichlet, elsewhere=dp.neumann)"
+        )
+    kind = type(condition)
+    if elsewhere is None:
+        elsewhere = neumann if kind is Condition else no_slip
+    base = elsewhere
+    while isinstance(base, Patch):
+        base = base.elsewhere
+    if not isinstance(base, kind):
+        raise TypeError(f"patch of {condition} needs {kind.choices} or a patch of them as elsewhere=, got {base!r}")
+    return Patch(_checked_where(where), condition, elsewhere)
+
+
+class MixedWall(Value):
+    """The conditions of a wall on which they differ from face to face.
+
+    Parameters
+    ----------
+    regions : tuple of pairs (condition, bool array)
+        The arrays have the shape of the wall without the axis across it. Each face is True in exactly one of them.
+    """
+
+    regions: tuple[tuple[Any, Any], ...]
+
+    def __init__(self, regions: tuple[tuple[Any, Any], ...]) -> None:
+        for _, faces in regions:
+            faces.flags.writeable = False
+        super().__init__(regions=regions)
+
+    @property
+    def _key(self):
+        return tuple((condition, faces.shape, faces.tobytes()) for condition, faces in self.regions)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the wall without the axis across it."""
+        return self.regions[0][1].shape
+
+    def map(self, change: Callable[[Any], Any]) -> Any:
+        """Return the wall with the conditions ``change(condition)``: one condition if they are all equal."""
+        return mixed_wall([(change(condition), faces) for condition, faces in self.regions])
+
+    def faces_with(self, accepts: Callable[[Any], bool]) -> NDArray[np.bool_]:
+        """Return the faces whose condition the function `accepts`, as a new boolean array."""
+        chosen = np.zeros(self.shape, bool)
+        for condition, faces in self.regions:
+            if accepts(condition):
+                chosen |= faces
+        return chosen
+
+    @cached_property
+    def description(self) -> str:
+        """The conditions with their numbers of faces, in words."""
+        total = prod(self.shape)
+        words = [f"{condition} on {np.count_nonzero(faces)}" for condition, faces in self.regions[:-1]]
+        return f"{', '.join(words)} of {total} faces, {self.regions[-1][0]} elsewhere"
+
+    def __repr__(self) -> str:
+        return f"<{self.description}>"
+
+
+def mixed_wall(regions: list) -> Any:
+    """Return a MixedWall of pairs (condition, faces), or a condition if only one occurs; equal ones are merged."""
+    merged: dict = {}
+    for condition, faces in regions:
+        if faces.any():
+            merged[condition] = faces | merged[condition] if condition in merged else faces.copy()
+    if len(merged) == 1:
+        return next(iter(merged))
+    return MixedWall(tuple(merged.items()))
+
+
+def walls_of(sides: tuple) -> Iterator[tuple[int, int, Any]]:
+    """Yield (axis, side, condition or MixedWall) for each wall, given the result of `resolve`; side 0 is the lower."""
+    for axis, pair in enumerate(sides):
+        for side, condition in enumerate(pair or ()):
+            yield axis, side, condition
+
+
+def conditions_of(wall: Any) -> tuple:
+    """Return the conditions that occur on a wall."""
+    if isinstance(wall, MixedWall):
+        return tuple(condition for condition, _ in wall.regions)
+    return (wall,)
+
+
+def has_patches(sides: tuple) -> bool:
+    """Return whether a wall has more than one condition, given the result of `resolve`."""
+    return any(isinstance(wall, MixedWall) for _, _, wall in walls_of(sides))
+
+
+def describe_patches(sides: tuple) -> str:
+    """Return the walls with several conditions in words, in brackets; an empty string if there are none."""
+    words = []
+    for axis, side, wall in walls_of(sides):
+        if isinstance(wall, MixedWall):
+            words.append(f"{AXES[axis]}-{SIDES[side]}: {wall.description}")
+    if not words:
+        return ""
+    return f"[{'; '.join(words)}]"
+
+
 def resolve(
-    grid: Grid, boundary: Any, default: Condition | FlowCondition = neumann
+    grid: Grid,
+    boundary: Any,
+    default: Condition | FlowCondition = neumann,
+    patches: bool = False,
+    name: str = "this function",
 ) -> tuple[tuple[Any, Any] | None, ...]:
     """Convert an argument `boundary` to one pair of conditions (lower, upper) for each axis.
 
@@ -400,19 +693,24 @@ def resolve(
         (lower, upper). On a 1-D grid a pair may be given without a dict.
     default : Condition or FlowCondition
         Condition of the axes that the dict does not name. All conditions must have the same type as `default`.
+    patches : bool
+        Whether the caller supports walls with several conditions.
+    name : str
+        Name of the caller, for the error message that refuses patches.
 
     Returns
     -------
     tuple
-        For each axis (lower, upper), or None if the axis is periodic.
+        For each axis (lower, upper), or None if the axis is periodic. A wall with several conditions is a MixedWall; a
+        patch that covers all faces, or none of another condition, is replaced by its condition.
 
     Raises
     ------
     ValueError
-        If the dict names a periodic axis, or an axis that the grid does not have.
+        If the dict names a periodic axis, or an axis that the grid does not have, or if a patch does not fit its wall.
     TypeError
         If an entry is not a condition of the type of `default`, if a pair is given without an axis on a grid of more
-        than one axis, or if `grid` is not a Grid.
+        than one axis, if `grid` is not a Grid, or if a wall has several conditions and `patches` is False.
 
     Examples
     --------
@@ -433,7 +731,146 @@ def resolve(
             conditions.append(None)
         else:
             conditions.append(_sides(axis, boundary.get(axis, default), type(default)))
+    if any(isinstance(wall, (Patch, MixedWall)) for _, _, wall in walls_of(tuple(conditions))):
+        return _with_patches(grid, conditions, patches, name)
     return tuple(conditions)
+
+
+def _with_patches(grid, conditions, accepted, name):
+    """Return pairs of conditions in which a MixedWall, or the only condition of its wall, replaces each Patch."""
+    grid.backend.check("a patch of a wall")
+    resolved: list = []
+    for axis, pair in enumerate(conditions):
+        if pair is not None:
+            pair = tuple(_wall(grid, axis, side, wall) for side, wall in enumerate(pair))
+        resolved.append(pair)
+    if not accepted:
+        for axis, side, wall in walls_of(tuple(resolved)):
+            if isinstance(wall, MixedWall):
+                raise TypeError(
+                    f"{name} takes one condition for each wall, but {grid.axes[axis]}-{SIDES[side]} has a patch; write "
+                    f"one condition, such as dp.{wall.regions[0][0]}"
+                )
+    return tuple(resolved)
+
+
+def _wall(grid, axis, side, wall):
+    """Return the conditions of a wall as one condition, or as a MixedWall."""
+    place = f"{grid.axes[axis]}-{SIDES[side]}"
+    shape = tuple(n for a, n in enumerate(grid.shape) if a != axis)
+    if isinstance(wall, MixedWall) and wall.shape != shape:
+        raise ShapeError(f"{place} of {grid} has faces of shape {shape}, but the conditions are for {wall.shape}")
+    if not isinstance(wall, Patch):
+        return wall
+    regions = []
+    uncovered = np.ones(shape, bool)
+    while isinstance(wall, Patch):
+        faces = _faces_of(grid, axis, place, wall)
+        overlap = np.count_nonzero(faces & ~uncovered)
+        if overlap:
+            raise ValueError(f"two patches overlap on {overlap} faces of {place}; give each face to one patch")
+        uncovered &= ~faces
+        regions.append((wall.condition, faces))
+        wall = wall.elsewhere
+    return mixed_wall([*regions, (wall, uncovered)])
+
+
+def _faces_of(grid, axis, place, patch):
+    """Return the faces of a wall that belong to a patch, a boolean array; raise if there are none."""
+    others = [a for a in range(grid.dim) if a != axis]
+    shape = tuple(grid.shape[a] for a in others)
+    where = patch.where
+    if isinstance(where, np.ndarray):
+        with_axis = grid.shape[:axis] + (1,) + grid.shape[axis + 1 :]
+        if where.shape not in (shape, with_axis):
+            raise ShapeError(
+                f"{place} has faces of shape {shape}, but the mask of {patch} has shape {where.shape}; give one entry "
+                "for each face"
+            )
+        faces = where.reshape(shape)
+    else:
+        if len(where) != len(others):
+            names = " and ".join(grid.axes[a] for a in others)
+            needed = f"one interval for each of {names}" if others else "a mask of one entry, because it is one face"
+            raise ShapeError(f"{place} of a grid in {grid.dim}-D takes {needed}, got {patch}")
+        faces = np.ones(shape, bool)
+        for number, (a, interval) in enumerate(zip(others, where, strict=True)):
+            inside = _centres_in(grid, a, interval, place)
+            faces &= inside.reshape([-1 if n == number else 1 for n in range(len(others))])
+    if not faces.any():
+        raise ValueError(
+            f"{patch} covers no face of {place}; a face belongs to a patch if its centre lies inside, so make the "
+            "patch larger or the cells smaller"
+        )
+    return faces
+
+
+def _centres_in(grid, axis, interval, place):
+    """Return for each cell of an axis whether its centre lies in an interval; the upper end does not belong to it."""
+    if interval is None:
+        return np.ones(grid.shape[axis], bool)
+    start, stop = interval
+    ends = grid.coordinates(axis, "ends")
+    widths = grid.widths[axis]
+    slack = ON_END * (ends[-1] - ends[0])
+    if start < ends[0] - slack or stop > ends[-1] + slack:
+        raise ValueError(
+            f"a patch of {place} reaches from {start:g} to {stop:g} along {grid.axes[axis]}, but the wall from "
+            f"{ends[0]:g} to {ends[-1]:g}; give coordinates on the wall"
+        )
+    centres = grid.coordinates(axis)
+    return (centres >= start - ON_END * widths) & (centres < stop - ON_END * widths)
+
+
+def _checked_where(where):
+    """Return the argument `where` of `patch` as a boolean array, or as a tuple of intervals (start, stop) and None."""
+    parts = where if isinstance(where, (tuple, list)) else (where,)
+    if isbox(where) or any(map(isbox, parts)):
+        raise DerivativeError("where of patch must be constant, not traced; the values of lift on it have derivatives")
+    if isinstance(where, (tuple, list)) and not _are_flags(where):
+        if len(where) == 2 and all(map(_is_coordinate, where)):
+            where = (where,)
+        return tuple(map(_checked_interval, where))
+    flags = np.asarray(where)
+    if flags.dtype != bool:
+        raise TypeError(f"where of patch needs (start, stop) or a bool array, got {where!r}; write (0.2, 0.4)")
+    flags = flags.copy()
+    flags.flags.writeable = False
+    return flags
+
+
+def _are_flags(entries):
+    """Return whether a list or tuple, or one nested in it, holds booleans only."""
+    return len(entries) > 0 and all(
+        _are_flags(entry) if isinstance(entry, (tuple, list)) else isinstance(entry, (bool, np.bool_))
+        for entry in entries
+    )
+
+
+def _is_coordinate(entry):
+    """Return whether an entry is one number."""
+    return np.ndim(entry) == 0 and entry is not None
+
+
+def _checked_interval(interval):
+    """Return an interval as a pair of floats, or None."""
+    if interval is None:
+        return None
+    if (
+        not isinstance(interval, (tuple, list, np.ndarray))
+        or len(interval) != 2
+        or not all(map(_is_coordinate, interval))
+    ):
+        raise TypeError(f"an interval of patch needs (start, stop), got {interval!r}; write for example (0.2, 0.4)")
+    ends = np.asarray(interval)
+    if ends.dtype.kind not in "iuf":
+        raise TypeError(f"an interval of patch needs two real numbers, got {interval!r}; write for example (0.2, 0.4)")
+    start, stop = map(float, ends)
+    if not np.all(np.isfinite(ends)):
+        raise NonFiniteError(f"an interval of patch needs finite coordinates, got ({start:g}, {stop:g})")
+    if start >= stop:
+        raise ValueError(f"an interval of patch needs start < stop, got ({start:g}, {stop:g})")
+    return start, stop
 
 
 def check_condition(name: str, condition: Any) -> None:
@@ -456,14 +893,23 @@ def _check_names(grid, boundary):
 
 def _sides(axis, entry, kind):
     """Return the conditions (lower, upper) of an axis, given one condition or a pair."""
-    if isinstance(entry, kind):
+    if _is_condition(entry, kind):
         return entry, entry
     sides = entry
-    if not (isinstance(sides, (tuple, list)) and len(sides) == 2 and all(isinstance(s, kind) for s in sides)):
+    if not (isinstance(sides, (tuple, list)) and len(sides) == 2 and all(_is_condition(s, kind) for s in sides)):
         raise TypeError(
             f"boundary on {axis} needs {kind.choices} or a pair of them, got {entry!r}{_advice(sides, kind)}"
         )
     return tuple(sides)
+
+
+def _is_condition(entry, kind):
+    """Return whether an entry is a condition of type `kind`, or a patch of such conditions."""
+    if isinstance(entry, Patch):
+        return isinstance(entry.condition, kind)
+    if isinstance(entry, MixedWall):
+        return isinstance(entry.regions[0][0], kind)
+    return isinstance(entry, kind)
 
 
 def _advice(sides, kind):
@@ -477,6 +923,8 @@ def _advice(sides, kind):
         if first == "periodic":
             return "; write dp.Grid(shape, periodic=True) and no condition"
         return ""
+    if isinstance(first, Patch):
+        first = first.condition
     if isinstance(first, FlowCondition):
         return f"; {first} belongs to dp.projection and dp.flow_step, write dp.{first.along} here"
     if getattr(first, "__name__", "") == "robin":

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.grid.boundary_conditions import check_condition, neumann, resolve
+from sparsedp.grid.boundary_conditions import check_condition, describe_patches, neumann, resolve
 from sparsedp.grid.grid import Grid, check_grid
 from sparsedp.grid.space import Space
 from sparsedp.operators.masks_and_lift import check_solid, region_of, solid_faces
 from sparsedp.operators.operator import Operator
-from sparsedp.operators.stencils import along, differences, kronecker_operator, one_sided, pick, slopes, to_faces
+from sparsedp.operators.stencils import along, differences, kronecker_operator, one_sided, pick, slope_terms, to_faces
 from sparsedp.operators.structure.base import Matrix
 from sparsedp.operators.structure.lazy import Mask, compose, total
 
@@ -34,7 +34,8 @@ def gradient(
     ----------
     grid : Grid
     boundary : condition, or dict of conditions
-        Boundary condition on the walls of the grid, with boundary value 0; add other values by `lift`.
+        Boundary condition on the walls of the grid, with boundary value 0; add other values by `lift`. A condition on
+        part of a wall is written with `patch`.
     solid : bool array, shape `grid.shape`, optional
         True for cells that are not part of the domain. On a face between two solid cells the gradient is 0.
     solid_boundary : condition
@@ -56,7 +57,7 @@ def gradient(
 
     See Also
     --------
-    divergence, laplacian, upwind, average, lift, dirichlet, neumann, robin, curl
+    divergence, laplacian, upwind, average, lift, dirichlet, neumann, robin, patch, curl
 
     Notes
     -----
@@ -74,9 +75,10 @@ def gradient(
     >>> gradient(Grid(3), {"x": (dirichlet, neumann)})(np.array([1.0, 2.0, 4.0]))
     array([2., 1., 2., 0.])
     """
-    sides = resolve(grid, boundary)
+    sides = resolve(grid, boundary, patches=True)
     check_condition("solid_boundary", solid_boundary)
-    slope = to_faces("gradient", grid, [slopes(grid, axis, sides[axis]) for axis in range(grid.dim)])
+    name = f"gradient{describe_patches(sides)}"
+    slope = to_faces(name, grid, [slope_terms(grid, axis, sides[axis]) for axis in range(grid.dim)])
     if solid is None:
         return slope
     # Set the slope to 0 on all faces of solid cells, then add the one-sided slope that the condition implies (0 for
@@ -88,7 +90,7 @@ def gradient(
             factors = [one_sided(grid, axis, upper, solid_boundary) for axis in range(grid.dim)]
             side = to_faces("gradient", grid, factors)
             structure = total(structure, compose(Mask(faces), side.structure))
-    return Operator(structure, grid.cells, grid.faces, "gradient")
+    return Operator(structure, grid.cells, grid.faces, name)
 
 
 def divergence(grid: Grid) -> Operator:
@@ -199,7 +201,7 @@ def laplacian(
 
     See Also
     --------
-    gradient, divergence, lift, inverse, face_laplacian, dirichlet, neumann, robin
+    gradient, divergence, lift, inverse, face_laplacian, dirichlet, neumann, robin, patch
 
     Notes
     -----
@@ -216,8 +218,9 @@ def laplacian(
     array([ 1.,  1., -2.])
     """
     check_grid("laplacian", grid)
-    product = divergence(grid) @ gradient(grid, boundary, solid, solid_boundary)
-    return Operator(product.structure, grid.cells, grid.cells, "laplacian")
+    G = gradient(grid, boundary, solid, solid_boundary)
+    product = divergence(grid) @ G
+    return Operator(product.structure, grid.cells, grid.cells, G.name.replace("gradient", "laplacian", 1))
 
 
 def curl(grid: Grid) -> Operator:
@@ -324,6 +327,8 @@ def upwind(grid: Grid, axis: int | str = 0, direction: int = 1, boundary: Any = 
         )
     if direction not in (1, -1):
         raise ValueError(f"upwind needs direction 1 or -1, got {direction!r}")
-    sides = resolve(grid, boundary)[number]
-    factor = pick(grid, number, direction == -1) @ slopes(grid, number, sides)
-    return kronecker_operator(grid.cells, grid.cells, {(0, 0): along(number, grid.dim, factor)}, "upwind")
+    sides = resolve(grid, boundary, patches=True)
+    (upstream_face,) = along(number, grid.dim, pick(grid, number, direction == -1))
+    terms = tuple(upstream_face @ term for term in slope_terms(grid, number, sides[number]))
+    name = f"upwind{describe_patches(sides)}"
+    return kronecker_operator(grid.cells, grid.cells, {(0, 0): terms}, name)

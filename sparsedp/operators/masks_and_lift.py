@@ -9,11 +9,11 @@ import numpy as np
 from sparsedp._utils.validation import check_finite, check_kind, check_on, check_plain, check_type
 from sparsedp.autodiff.tape import isbox
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.grid.boundary_conditions import resolve
+from sparsedp.grid.boundary_conditions import describe_patches, resolve, walls_of
 from sparsedp.grid.grid import Grid, check_grid
 from sparsedp.grid.space import Space
 from sparsedp.operators.operator import Operator
-from sparsedp.operators.stencils import along, kronecker_operator, wall_slopes
+from sparsedp.operators.stencils import kronecker_operator, wall_slope_terms
 from sparsedp.operators.structure.kronecker import Kronecker
 from sparsedp.operators.structure.lazy import Diagonal, Mask
 
@@ -31,7 +31,8 @@ def lift(grid: Grid, boundary: Any) -> Operator:
     grid : Grid
     boundary : condition, or dict of conditions
         The conditions that G was built with. The boundary values are u [unit] for dirichlet, du/dn [unit / length] for
-        neumann, and the right-hand side of a u + b du/dn = value for robin.
+        neumann, and the right-hand side of a u + b du/dn = value for robin. On a wall with a `patch`, the value of
+        each face belongs to the condition of this face.
 
     Returns
     -------
@@ -47,7 +48,7 @@ def lift(grid: Grid, boundary: Any) -> Operator:
 
     See Also
     --------
-    gradient, laplacian, upwind, face_lift, dirichlet, neumann, robin
+    gradient, laplacian, upwind, face_lift, dirichlet, neumann, robin, patch
 
     Notes
     -----
@@ -72,12 +73,12 @@ def lift(grid: Grid, boundary: Any) -> Operator:
     """
     parts: list[tuple[int, ...]] = []
     blocks = {}
-    for axis, sides in enumerate(resolve(grid, boundary)):
-        for side, condition in enumerate(sides or ()):
-            blocks[axis, len(parts)] = along(axis, grid.dim, wall_slopes(grid, axis, side, condition))
-            parts.append(tuple(1 if a == axis else n for a, n in enumerate(grid.shape)))
+    sides = resolve(grid, boundary, patches=True)
+    for axis, side, wall in walls_of(sides):
+        blocks[axis, len(parts)] = wall_slope_terms(grid, axis, side, wall)
+        parts.append(tuple(1 if a == axis else n for a, n in enumerate(grid.shape)))
     walls = Space(None, "walls", grid, parts)
-    return kronecker_operator(walls, grid.faces, blocks, "lift")
+    return kronecker_operator(walls, grid.faces, blocks, f"lift{describe_patches(sides)}")
 
 
 def mask(space: Space, keep: ArrayLike) -> Operator:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import NDArray
 
+from sparsedp.grid.boundary_conditions import MixedWall
 from sparsedp.grid.grid import Grid
 from sparsedp.grid.space import Space
 from sparsedp.operators.operator import Operator
@@ -20,17 +22,20 @@ __all__ = [
     "differences",
     "kronecker_operator",
     "mean_of_faces",
+    "mean_terms",
     "means",
     "one_sided",
     "pick",
+    "slope_terms",
     "slopes",
     "to_faces",
+    "wall_slope_terms",
     "wall_slopes",
     "with_ends",
 ]
 
 
-def along(axis: int, dim: int, factor: Factor | None, scale: float = 1.0) -> tuple[Term]:
+def along(axis: int, dim: int, factor: Factor | None, scale: float = 1.0) -> tuple[Term, ...]:
     """Return a tuple of one Kronecker term: a factor along one axis, and the identity along the others."""
     factors: list[Factor | None] = [None] * dim
     factors[axis] = factor
@@ -45,9 +50,14 @@ def kronecker_operator(domain: Space, codomain: Space, blocks: dict, name: str) 
     return Operator(Kronecker(codomain.parts, domain.parts, blocks), domain, codomain, name)
 
 
-def to_faces(name: str, grid: Grid, factors: Sequence[Factor]) -> Operator:
-    """Return an Operator from cells to faces, given for each axis the factor from its cells to its faces."""
-    blocks = {(axis, 0): along(axis, grid.dim, factor) for axis, factor in enumerate(factors)}
+def to_faces(name: str, grid: Grid, parts: Sequence[Factor | tuple[Term, ...]]) -> Operator:
+    """Return an Operator from cells to faces, given for each axis the factor from its cells to its faces, or terms."""
+    blocks = {}
+    for axis, part in enumerate(parts):
+        if isinstance(part, Factor):
+            blocks[axis, 0] = along(axis, grid.dim, part)
+        else:
+            blocks[axis, 0] = part
     return kronecker_operator(grid.cells, grid.faces, blocks, name)
 
 
@@ -66,11 +76,7 @@ def slopes(grid: Grid, axis: int, sides: Any) -> Factor:
     """
     face, lower, upper = _between(grid, axis)
     step = 1 / grid.spacings(axis)[face]
-
-    def slope(sign, a, b, half):
-        return -sign * a / (a * half + b)
-
-    walls = _walls(grid, axis, sides, slope)
+    walls = _walls(grid, axis, sides, _slope_of_cell)
     return Factor.from_diagonals(_cells_to_faces(grid, axis), (face, upper, step), (face, lower, -step), *walls)
 
 
@@ -82,11 +88,7 @@ def means(grid: Grid, axis: int, sides: Any) -> Factor:
     face, lower, upper = _between(grid, axis)
     h = grid.widths[axis]
     both = h[lower] + h[upper]
-
-    def value(sign, a, b, half):
-        return b / (a * half + b)
-
-    walls = _walls(grid, axis, sides, value)
+    walls = _walls(grid, axis, sides, _share_of_cell)
     return Factor.from_diagonals(
         _cells_to_faces(grid, axis), (face, upper, h[lower] / both), (face, lower, h[upper] / both), *walls
     )
@@ -100,6 +102,85 @@ def wall_slopes(grid: Grid, axis: int, side: int, condition: Any) -> Factor:
     row = np.full(half.size, side * (nodes - 1))
     slope = (2 * side - 1) / (condition.a * half + condition.b)
     return Factor.from_diagonals((nodes, 1), (row, np.zeros_like(row), slope))
+
+
+def slope_terms(grid: Grid, axis: int, sides: Any) -> tuple[Term, ...]:
+    """Return the Kronecker terms of `slopes`, for walls on which conditions may differ from face to face."""
+    return _terms(grid, axis, sides, slopes, _slope_of_cell)
+
+
+def mean_terms(grid: Grid, axis: int, sides: Any) -> tuple[Term, ...]:
+    """Return the Kronecker terms of `means`, for walls on which conditions may differ from face to face."""
+    return _terms(grid, axis, sides, means, _share_of_cell)
+
+
+def wall_slope_terms(grid: Grid, axis: int, side: int, wall: Any) -> tuple[Term, ...]:
+    """Return the Kronecker terms of `wall_slopes`, for a wall on which conditions may differ from face to face."""
+    if not isinstance(wall, MixedWall):
+        return along(axis, grid.dim, wall_slopes(grid, axis, side, wall))
+    terms: list[Term] = []
+    for condition, faces in wall.regions:
+        terms += on_faces(axis, wall_slopes(grid, axis, side, condition), faces)
+    return tuple(terms)
+
+
+def _terms(grid, axis, sides, factor, entry):
+    """Return the terms of a factor from cells to faces: ``factor(grid, axis, sides)`` where no wall is mixed.
+
+    A mixed wall has no entries in this factor. Each of its conditions adds terms that are restricted to its faces.
+    """
+    if not any(isinstance(wall, MixedWall) for wall in sides or ()):
+        return along(axis, grid.dim, factor(grid, axis, sides))
+    plain = tuple(None if isinstance(wall, MixedWall) else wall for wall in sides)
+    terms = list(along(axis, grid.dim, factor(grid, axis, plain)))
+    for side, wall in enumerate(sides):
+        if not isinstance(wall, MixedWall):
+            continue
+        for condition, faces in wall.regions:
+            pair = (condition, None) if side == 0 else (None, condition)
+            at_wall = Factor.from_diagonals(_cells_to_faces(grid, axis), *_walls(grid, axis, pair, entry))
+            if at_wall.matrix.nnz:
+                terms += on_faces(axis, at_wall, faces)
+    return tuple(terms)
+
+
+def on_faces(axis: int, factor: Factor, faces: NDArray[np.bool_]) -> list[Term]:
+    """Return the terms of a factor along `axis` that acts on some lines along this axis only.
+
+    Parameters
+    ----------
+    axis : int
+    factor : Factor
+    faces : bool array
+        The lines, in the shape of a wall without the axis across it.
+    """
+    terms = []
+    for selections in _boxes(faces):
+        factors: list[Factor | None] = [_selection(chosen) for chosen in selections]
+        factors.insert(axis, factor)
+        terms.append(Term(1.0, tuple(factors)))
+    return terms
+
+
+def _boxes(faces: NDArray[np.bool_]) -> Iterator[list[NDArray[np.bool_]]]:
+    """Yield sets of faces that together make up `faces`, each as one boolean array for each axis of the wall.
+
+    Rows that are equal share one set.
+    """
+    if faces.ndim < 2:
+        yield [faces] * faces.ndim
+        return
+    patterns, number = np.unique(faces, axis=0, return_inverse=True)
+    for index, pattern in enumerate(patterns):
+        if pattern.any():
+            yield [number.reshape(-1) == index, pattern]
+
+
+def _selection(chosen):
+    """Return the factor that keeps the chosen entries of an axis; None, the identity, if it keeps all."""
+    if np.all(chosen):
+        return None
+    return Factor(sp.diags_array(chosen.astype(float), format="csr"))
 
 
 def one_sided(grid: Grid, axis: int, upper: bool, condition: Any) -> Factor:
@@ -158,13 +239,25 @@ def _between(grid, axis):
     return face, (face - 1) % max(n, 1), face
 
 
+def _slope_of_cell(sign, a, b, half):
+    """Return the entry of the cell at a wall in the slope along the axis; `sign` is that of the outward normal."""
+    return -sign * a / (a * half + b)
+
+
+def _share_of_cell(sign, a, b, half):
+    """Return the entry of the cell at a wall in the value on the wall."""
+    return b / (a * half + b)
+
+
 def _walls(grid, axis, sides, entry):
-    """Return the (rows, columns, values) of the entries on the two walls; an empty list if there are no walls."""
+    """Return the (rows, columns, values) of the entries on the two walls; a wall with condition None has none."""
     n = grid.shape[axis]
     if sides is None or n == 0:
         return []
     diagonals = []
     for cell, face, sign, condition in ((0, 0, -1.0, sides[0]), (n - 1, n, 1.0, sides[1])):
+        if condition is None:
+            continue
         value = entry(sign, condition.a, condition.b, 0.5 * grid.widths[axis][cell])
         diagonals.append((np.array([face]), np.array([cell]), np.array([value])))
     return diagonals

@@ -10,12 +10,12 @@ import scipy.sparse as sp
 
 from sparsedp._utils.validation import check_choice, check_finite, is_whole
 from sparsedp.errors import ShapeError
-from sparsedp.grid.boundary_conditions import neumann, resolve
+from sparsedp.grid.boundary_conditions import describe_patches, neumann, resolve
 from sparsedp.grid.grid import Grid, check_grid, per_axis, real_numbers
 from sparsedp.grid.space import Space
 from sparsedp.operators.interpolation import linear_weights
 from sparsedp.operators.operator import Operator
-from sparsedp.operators.stencils import along, kronecker_operator, means, to_faces
+from sparsedp.operators.stencils import along, kronecker_operator, mean_terms, to_faces
 from sparsedp.operators.structure.base import Matrix
 from sparsedp.operators.structure.factor import Factor
 from sparsedp.operators.structure.kronecker import Term
@@ -59,8 +59,9 @@ def average(grid: Grid, boundary: Any = neumann) -> Operator:
     >>> average(Grid(3))(np.array([1.0, 2.0, 4.0]))
     array([1. , 1.5, 3. , 4. ])
     """
-    sides = resolve(grid, boundary)
-    return to_faces("average", grid, [means(grid, axis, sides[axis]) for axis in range(grid.dim)])
+    sides = resolve(grid, boundary, patches=True)
+    name = f"average{describe_patches(sides)}"
+    return to_faces(name, grid, [mean_terms(grid, axis, sides[axis]) for axis in range(grid.dim)])
 
 
 def sample(grid: Grid, points: ArrayLike) -> Operator:

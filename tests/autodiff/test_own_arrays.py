@@ -78,6 +78,11 @@ BUILDERS = {
     "gradient": ((SOLID, walls("pressure")), lambda s, b: dp.gradient(GRID, b, s), applied),
     "laplacian": ((SOLID, walls("pressure")), lambda s, b: dp.laplacian(GRID, b, s, dp.dirichlet), applied),
     "robin": ((np.array(2.0), np.array(0.5)), dp.robin, lambda c: dp.laplacian(GRID, c)(CELLS)),
+    "patch": (
+        (np.array([True, False, True, False]),),
+        lambda faces: dp.patch(faces, dp.dirichlet),
+        lambda wall: dp.laplacian(GRID, {"y": wall})(CELLS),
+    ),
     "lift": ((walls("pressure"),), lambda b: dp.lift(GRID, b), applied),
     "average": ((walls("pressure"),), lambda b: dp.average(GRID, b), applied),
     "flux": ((SOLID,), lambda s: dp.flux(GRID, s), applied),

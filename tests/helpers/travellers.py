@@ -314,6 +314,7 @@ NOTHING_TO_CALL = {
     "dirichlet",
     "neumann",
     "robin",
+    "patch",
     "no_slip",
     "free_slip",
     "inflow",

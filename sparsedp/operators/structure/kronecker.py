@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from sparsedp import kernels
 from sparsedp.grid.space import components
-from sparsedp.operators.structure.base import BoundProduct, Structure, compact
+from sparsedp.operators.structure.base import BoundProduct, Structure, compact, rows_of
 from sparsedp.operators.structure.factor import Factor
 
 if TYPE_CHECKING:
@@ -250,6 +250,8 @@ def _fused_pass(terms, shape):
 
 def _pass(term, shape):
     """Return a function ``run(u, out, accumulate)`` that applies a term axis by axis; the last result goes to `out`."""
+    if _is_on_one_plane(term):
+        return _plane_pass(term, shape)
     steps = []
     for axis in term.axes or (0,):
         factor = term.factors[axis] or Factor(sp.eye_array(shape[axis]))
@@ -265,6 +267,51 @@ def _pass(term, shape):
             u = result
         rows, in_shape, out_shape = steps[-1]
         kernels.along_axis(u.reshape(in_shape), out.reshape(out_shape), rows, term.scale, accumulate)
+
+    return run
+
+
+def _is_on_one_plane(term):
+    """Return whether a term has one factor with a single entry, and others that only select entries.
+
+    The boundary conditions on part of a wall are such terms.
+    """
+    factors = [factor for factor in term.factors if factor is not None]
+    if len(factors) < 2 or all(factor.matrix.nnz != 1 for factor in factors):
+        return False
+    others = [factor for factor in factors if not _is_selection(factor)]
+    return not others or (len(others) == 1 and others[0].matrix.nnz == 1)
+
+
+def _is_selection(factor):
+    """Return whether a factor is a diagonal matrix of zeros and ones."""
+    matrix = factor.matrix
+    is_diagonal = matrix.shape[0] == matrix.shape[1] and np.array_equal(rows_of(matrix), matrix.indices)
+    return is_diagonal and bool(np.all(matrix.data == 1))
+
+
+def _plane_pass(term, shape):
+    """Return the function of `_pass` for a term on one plane, which visits only the entries of the plane."""
+    out_shape = []
+    rows = []
+    columns = []
+    value = 1.0
+    for factor, n in zip(term.factors, shape, strict=True):
+        if factor is None:
+            factor = Factor(sp.eye_array(n))
+        out_shape.append(factor.shape[0])
+        rows.append(rows_of(factor.matrix))
+        columns.append(factor.matrix.indices)
+        if factor.matrix.nnz == 1:
+            value = value * factor.matrix.data[0]
+    row = np.ravel_multi_index(np.ix_(*rows), out_shape).reshape(-1)
+    column = np.ravel_multi_index(np.ix_(*columns), shape).reshape(-1)
+    scale = term.scale
+
+    def run(u, out, accumulate):
+        if not accumulate:
+            out[...] = 0
+        out.reshape(-1)[row] += scale * (value * u.reshape(-1)[column])
 
     return run
 
