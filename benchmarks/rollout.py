@@ -7,8 +7,11 @@ Run ``python -m benchmarks.rollout [--quick]`` in the root of the repository.
 """
 
 import argparse
+import os
+import tempfile
 import tracemalloc
 from functools import partial
+from time import perf_counter
 from timeit import repeat
 
 import autograd.numpy as anp
@@ -143,6 +146,41 @@ def memory(shape, n, budgets):
         )
 
 
+# ---------------------------------------------------------------- files
+
+
+def files(shape, n, rows):
+    """Print one block: what states in files save, in bytes, steps run again and seconds."""
+    u, v = np.random.default_rng(0).random(shape), np.full((2, *shape), 0.3)
+    move, dt = dp.transport(dp.Grid(shape, size=1.0, periodic=True), velocity="cells"), 0.4 / sum(shape)
+    print(f"\n{shape[0]} x {shape[1]} cells, {n} upwind steps, a state has {u.nbytes / 1e6:g} MB")
+    print(f"{'memory':>10} {'disk':>8} {'kept':>6} {'in files':>8} {'steps / n':>10} {'peak MB':>8} {'s':>7}  bits")
+    exact = None
+    for budget, limit in rows:
+        runs: list = []
+        with tempfile.TemporaryDirectory() as folder:
+            disk = (folder, limit) if limit else None
+
+            def loss(x, budget=budget, disk=disk, runs=runs):
+                end = dp.rollout(lambda u, v: move(u, v, dt), *x, n, memory=budget, disk=disk, record=runs.append)
+                return anp.sum(end**2)
+
+            tracemalloc.start()
+            begin = perf_counter()
+            slopes = dp.value_and_grad(loss)((u, v))[1]
+            seconds = perf_counter() - begin
+            most = tracemalloc.get_traced_memory()[1]
+            tracemalloc.stop()
+            left = len(os.listdir(folder))
+        bits = b"".join(g.tobytes() for g in slopes)
+        exact = exact or bits
+        forward, back = runs
+        print(
+            f"{budget:>10} {limit or '-':>8} {forward.kept:6} {forward.on_disk:8} {back.factor:10.4f} "
+            f"{most / 1e6:8.1f} {seconds:7.1f}  {'same' if bits == exact else 'OTHER'}{', files left' if left else ''}"
+        )
+
+
 # ---------------------------------------------------------------- overhead
 
 
@@ -180,14 +218,17 @@ def overhead(n=5000):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="small sizes, few repeats")
-    parser.add_argument("--part", choices=("upwind", "memory", "overhead"), help="one part only")
+    parser.add_argument("--part", choices=("upwind", "memory", "files", "overhead"), help="one part only")
     options = parser.parse_args()
-    parts = (options.part,) if options.part else ("overhead", "memory", "upwind")
+    parts = (options.part,) if options.part else ("overhead", "memory", "files", "upwind")
     if "overhead" in parts:
         overhead(1000 if options.quick else 5000)
     if "memory" in parts:
         memory((256, 256), 1000 if options.quick else 10_000, ("1 GB", "100 MB", "20 MB"))
         memory((16, 16), 10_000 if options.quick else 100_000, ("1 GB", "10 MB", "100 kB"))
+    if "files" in parts:
+        rows = (("20 MB", None), ("20 MB", "500 MB"), ("200 MB", None), ("200 MB", "20 GB"))
+        files((256, 256), 1000 if options.quick else 100_000, rows)
     if "upwind" in parts:
         for shape in ((100_000,), (256, 256)) if options.quick else ((1_000_000,), (1024, 1024)):
             upwind(shape, 20 if options.quick else 100, 2)

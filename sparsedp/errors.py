@@ -12,6 +12,7 @@ __all__ = [
     "BudgetWarning",
     "ConvergenceError",
     "DerivativeError",
+    "DiskWarning",
     "GrowthWarning",
     "IncompatibleError",
     "JitError",
@@ -58,6 +59,10 @@ class GrowthWarning(UserWarning):
 
 class BudgetWarning(UserWarning):
     """With at most twice the memory budget, the run would take only a third of the time."""
+
+
+class DiskWarning(UserWarning):
+    """The folder for the states of a rollout has no more space, or contains files of runs that were interrupted."""
 
 
 class NonFiniteGradientWarning(UserWarning):

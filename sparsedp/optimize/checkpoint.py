@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sparsedp._utils.pytree import flatten, leaves, norm
-from sparsedp.autodiff.backend import gathered, process_count
+from sparsedp.autodiff.backend import process_count
 from sparsedp.io.atomic_files import UNFINISHED, load_tree, path_errors, save_tree
+from sparsedp.io.fingerprint import digest, fingerprint
 from sparsedp.optimize.checkpoint_upgrade import FORMAT_0_2, upgraded
 from sparsedp.optimize.result import Evaluation, Failure, Record
 
@@ -146,7 +146,7 @@ class Checkpoint:
     def _add_batch(self, batch):
         """Update the fingerprint of all batches so far with the batch of one more iteration."""
         so_far = self._settings["list of batches"] + fingerprint(batch)
-        self._settings = {**self._settings, "list of batches": _digest(so_far.encode())}
+        self._settings = {**self._settings, "list of batches": digest(so_far.encode())}
 
     def save(self, state: Any, objective: Objective, monitor: Monitor) -> None:
         """Remember the state, and write it if enough time has passed since the last write or if the run stops."""
@@ -179,31 +179,6 @@ class Checkpoint:
         self._unwritten = None
         self._last_write_time = time.perf_counter()
         self._last_write_seconds = self._last_write_time - begin
-
-
-def fingerprint(tree: Any) -> str:
-    """Return a hash of the structure of a tree, and of the type and content of its leaves; functions count by name."""
-    entries, rebuild = flatten(tree)
-    structure = repr(rebuild(range(len(entries))))
-    return _digest("\n".join([structure, *map(_description, entries)]).encode())
-
-
-def _digest(content):
-    """Return the SHA-256 hash of bytes."""
-    return hashlib.sha256(content).hexdigest()
-
-
-def _description(leaf):
-    """Return a text that describes the type and content of a leaf and is the same in every process."""
-    leaf = gathered(leaf)
-    kind = type(leaf).__qualname__
-    if isinstance(leaf, (np.ndarray, np.generic)) and leaf.dtype != object:
-        return f"{kind} {leaf.dtype} {leaf.shape} {_digest(leaf.tobytes())}"
-    if callable(leaf):
-        return f"{getattr(leaf, '__module__', '')} {getattr(leaf, '__qualname__', kind)}"
-    if " at 0x" in repr(leaf):  # a memory address, which differs between processes
-        return kind
-    return f"{kind} {leaf!r}"
 
 
 def _agree(value, stored, size, exact):

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import re
 from bisect import bisect_left
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import comb
 from typing import TYPE_CHECKING
 
@@ -35,6 +35,7 @@ __all__ = [
     "CheckpointPlan",
     "advances",
     "budget_within_reach",
+    "bytes_of",
     "checkpoints",
     "slots_within",
     "stride",
@@ -61,12 +62,38 @@ class CheckpointPlan:
         Memory in bytes for the tapes of steps that the forward pass keeps.
     is_reversing : bool
         Whether only the last state is kept, and the backward pass computes the others by reversed steps.
+    disk_slots : int
+        The number of the `slots` whose states are kept in files.
     """
 
     n: int
     slots: int | None
     tape_bytes: int
     is_reversing: bool = False
+    disk_slots: int = 0
+
+    @property
+    def memory_slots(self) -> int:
+        """Return the largest number of states that may be kept in memory, if `slots` is a number."""
+        assert self.slots is not None
+        return self.slots - self.disk_slots
+
+    def disk_indices(self) -> set[int]:
+        """Return the indices of the states that the forward pass keeps in files.
+
+        The backward pass begins with the last of the kept states and then uses their places again. It finds these in
+        memory. The first state is an argument of the rollout and in memory anyway.
+        """
+        kept = sorted(self.stored_indices())
+        return set(kept[1 : 1 + self.disk_slots])
+
+    def with_files(self, most: int) -> CheckpointPlan:
+        """Return a plan that keeps states in files if they do not fit into the memory; `most` states fit there."""
+        assert self.slots is not None
+        disk_slots = min(most, self.n - self.slots)
+        if disk_slots < 1:
+            return self
+        return replace(self, slots=self.slots + disk_slots, disk_slots=disk_slots)
 
     def stored_indices(self) -> set[int]:
         """Return the indices of the states that the forward pass keeps, the last one included."""
@@ -160,7 +187,7 @@ def slots_within(memory: float | str, state_bytes: int, n: int, beside: int = 0)
         If not even the first state fits, or memory is not a positive number of bytes.
     """
     size = max(state_bytes, 1)
-    slots = (_bytes(memory) - beside) // size - WORKING
+    slots = (bytes_of(memory) - beside) // size - WORKING
     if slots < 1:
         raise ValueError(
             f"rollout cannot work within memory={memory!r}: {WORKING + 1} states of {size} bytes and {beside} bytes "
@@ -183,22 +210,25 @@ def budget_within_reach(memory: float | str, state_bytes: int, n: int, beside: i
     runs = advances(n, slots_within(memory, state_bytes, n, beside)) + 1
     slots = bisect_left(range(n), True, lo=1, key=lambda s: SLOW * (advances(n, s) + 1) <= runs)
     budget = beside + (slots + min(OWN, slots // 15) + WORKING) * state_bytes
-    if slots < n and budget <= 2 * _bytes(memory):
+    if slots < n and budget <= 2 * bytes_of(memory):
         return budget
     return None
 
 
 def tape_bytes_within(memory: float | str, state_bytes: int, n: int, beside: int = 0) -> int:
     """Return the bytes that remain for tapes of steps if all n states are kept; negative if these do not fit."""
-    return _bytes(memory) - beside - (n + WORKING + OWN) * state_bytes
+    return bytes_of(memory) - beside - (n + WORKING + OWN) * state_bytes
 
 
-def _bytes(memory: float | str) -> int:
-    """Return the number of bytes of a memory given as a number or as a string such as "200 MB"."""
+def bytes_of(memory: float | str, name: str = "memory") -> int:
+    """Return the number of bytes of a memory given as a number or as a string such as "200 MB".
+
+    `name` is the argument of `rollout` that error messages refer to.
+    """
     if isinstance(memory, str):
         match = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)\s*([A-Za-z]+)\s*", memory)
         if match and match[2].upper() in UNITS:
             return int(float(match[1]) * UNITS[match[2].upper()])
     elif is_number(memory) and 0 < memory < float("inf"):
         return int(memory)
-    raise ValueError(f'rollout needs memory as bytes > 0 or a text, got {memory!r}; write for example "200 MB"')
+    raise ValueError(f'rollout needs {name} as bytes > 0 or a text, got {memory!r}; write for example "200 MB"')

@@ -7,6 +7,7 @@ and derivatives of higher order differentiate the operations that the two passes
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from copy import copy
 from functools import partial
 from operator import is_
@@ -18,18 +19,22 @@ from sparsedp._utils.counters import count
 from sparsedp._utils.progress import shown_steps
 from sparsedp.autodiff.derivative import checking_derivatives, is_finite, zero_like
 from sparsedp.autodiff.jit import Jitted
-from sparsedp.autodiff.tape import Rule, fit, innermost, through
+from sparsedp.autodiff.tape import Rule, fit, innermost, isbox, through
 from sparsedp.errors import DerivativeError, NonFiniteError
+from sparsedp.trajectory.disk_states import BackwardProgress, DiskStates, state_digest
 from sparsedp.trajectory.record import Record, backward_record, largest
 from sparsedp.trajectory.recorded_steps import recorded_runner
 from sparsedp.trajectory.specification import RolloutSpecification, stacked
 from sparsedp.trajectory.step_runner import State, StepRunner
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    import os
+    from collections.abc import Callable, Iterator, Sequence
 
     from sparsedp.trajectory.checkpoint_plan import CheckpointPlan
     from sparsedp.trajectory.outputs import LastState
+
+    KeptStates = list[State] | DiskStates
 
 __all__ = ["RolloutRule"]
 
@@ -41,17 +46,28 @@ APART = 16  # least number of steps between two measurements, because each of th
 
 
 def run_forward(
-    runner: StepRunner, plan: CheckpointPlan, outputs: LastState, stored: set[int], progress: bool | str
-) -> tuple[State, list[State]]:
-    """Run all steps; return the last state, and the list of the states kept for the backward pass with the last."""
+    runner: StepRunner,
+    plan: CheckpointPlan,
+    outputs: LastState,
+    stored: set[int],
+    progress: bool | str,
+    kept: KeptStates,
+) -> State:
+    """Run all steps; return the last state, and append the states kept for the backward pass, with the last, to `kept`.
+
+    If an interrupted run left states in files, the steps up to the last one of them are not run.
+    """
     is_differentiated = bool(runner.specification.differentiated)
     recorder = runner.recorder
     room = plan.tape_bytes
     tape_bytes = 0
     outputs.start(runner)
     state = outputs.see(runner.first)
-    kept = [state]
-    for i in shown_steps(progress, range(plan.n), "forward"):
+    if isinstance(kept, DiskStates):
+        state = kept.resume(runner, state)
+    else:
+        kept.append(state)
+    for i in shown_steps(progress, range(state.i, plan.n), "forward"):
         start = state
         is_taped = is_differentiated and (i == 0 or tape_bytes <= room)
         if i < 2:
@@ -63,7 +79,8 @@ def run_forward(
             # The step writes into arrays that it has returned, and it may have read one of them after that. Run all
             # steps again with copies of the states.
             runner.copies = True
-            return run_forward(runner, plan, outputs, stored, progress)
+            kept.clear()
+            return run_forward(runner, plan, outputs, stored, progress, kept)
         if is_taped:
             if i < 2:  # estimate the memory of a tape from the first two steps
                 tape_bytes = runner.tape_size(start)
@@ -77,7 +94,9 @@ def run_forward(
             if not is_taped and not outputs.holds_all_states:
                 state = state.owned()
             kept.append(state)
-    return state, kept
+    if isinstance(kept, DiskStates):
+        kept.finish_forward(state)
+    return state
 
 
 def _share_an_array(state: State, start: State) -> bool:
@@ -104,7 +123,7 @@ def run_backward(
     runner: StepRunner,
     plan: CheckpointPlan,
     outputs: LastState,
-    kept: list[State],
+    kept: KeptStates,
     cotangents: list,
     progress: bool | str,
 ) -> tuple[list, list[tuple[int, float]], int]:
@@ -114,7 +133,7 @@ def run_backward(
     ----------
     runner, plan, outputs
         The same objects as in the forward pass.
-    kept : list of State
+    kept : list of State, or DiskStates
         The states that the forward pass kept, with the last one; this function empties the list.
     cotangents : list
         Cotangents of the arrays of the result.
@@ -151,7 +170,13 @@ def run_backward(
         norms = []
     else:
         norms = [(n, largest(total))]
-    for i in shown_steps(progress, range(n - 1, -1, -1), "backward"):
+    first = n - 1
+    digest_of_next = None
+    if isinstance(kept, DiskStates):
+        saved = kept.saved_progress(cotangents)
+        if saved is not None:
+            first, total, recomputed, norms, digest_of_next = _restore(saved, runner, sums, rows)
+    for i in shown_steps(progress, range(first, -1, -1), "backward"):
         if total is None and not outputs.enters_everywhere:
             break  # truncation: earlier states get no cotangent
         is_taped = kept and kept[-1].tape
@@ -167,9 +192,12 @@ def run_backward(
         if total is not None:
             if not is_taped:
                 state = state.with_values(state.values)  # a new object, so that no kept state holds the tape
-                repeated_end = runner.step(state, True).fingerprint()
-                if not plan.is_reversing:
-                    check_repeated(specification, repeated_end, fingerprint)
+                following = runner.step(state, True)
+                if digest_of_next is not None:
+                    check_repeated(specification, [state_digest(following.values)], [digest_of_next])
+                    digest_of_next = None
+                elif not plan.is_reversing:
+                    check_repeated(specification, following.fingerprint(), fingerprint)
             total = runner.pulled_back(total, state, sums, rows)
             if not is_taped:
                 state.tape = None
@@ -177,6 +205,8 @@ def run_backward(
             norms.append((i, largest(total)))
         if outputs.enters_everywhere and i >= specification.first_traced:
             total = _sum(total, source(state))
+        if isinstance(kept, DiskStates) and total is not None:
+            kept.save(partial(_progress, i, total, runner, sums, rows, norms, recomputed, state))
     if last is not None and state.i == 0:
         runner.check_drift(state, last)
     backs = list(total or [None] * len(specification.state.places))
@@ -197,13 +227,51 @@ def run_backward(
     return backs, norms, recomputed
 
 
-def _state_at(i: int, runner: StepRunner, plan: CheckpointPlan, kept: list[State]) -> tuple[State, int]:
+def _progress(
+    i: int,
+    total: list,
+    runner: StepRunner,
+    sums: dict,
+    rows: list[list],
+    norms: list,
+    recomputed: int,
+    state: State,
+) -> BackwardProgress:
+    """Return what the backward pass has computed when the step that begins at a state has been differentiated."""
+    param_sums = []
+    for root in runner.param_roots:
+        if root in sums:
+            param_sums.append(sums[root][0])
+        else:
+            param_sums.append(None)
+    input_rows = [np.stack(row[i:]) for row in rows if row]
+    return BackwardProgress(i - 1, total, param_sums, input_rows, norms, recomputed, state_digest(state.values))
+
+
+def _restore(
+    saved: BackwardProgress, runner: StepRunner, sums: dict, rows: list[list]
+) -> tuple[int, list, int, list, str]:
+    """Put the saved sums and rows in place; return the index of the next step and what belongs to it."""
+    for root, total in zip(runner.param_roots, saved.sums, strict=True):
+        if total is not None:
+            sums[root] = (total, False)
+    for row, saved_rows in zip((row for row in rows if row), saved.rows, strict=True):
+        row[saved.i + 1 :] = list(saved_rows)
+    norms = [(index, norm) for index, norm in saved.norms]
+    return saved.i, saved.total, saved.recomputed, norms, saved.digest
+
+
+def _state_at(i: int, runner: StepRunner, plan: CheckpointPlan, kept: KeptStates) -> tuple[State, int]:
     """Return state i, computed from the nearest kept state before it, and the number of steps that were run."""
     state = kept.pop()
     repeated = 0
     while state.i < i:
         kept.append(state)
-        stop = plan.next_index(state.i, i, len(kept))
+        if isinstance(kept, DiskStates):
+            occupied = kept.occupied()
+        else:
+            occupied = len(kept)
+        stop = plan.next_index(state.i, i, occupied)
         repeated += stop - state.i
         while state.i < stop:
             state = runner.step(state, False)
@@ -239,6 +307,20 @@ def check_repeated(specification: RolloutSpecification, fingerprints: list, earl
     raise DerivativeError(f"the step gives another {name} when it is run again; it must depend on its arguments only")
 
 
+@contextmanager
+def _preserved_if_interrupted(kept: KeptStates) -> Iterator[None]:
+    """Leave the files of states for a later run if Ctrl-C is pressed inside; remove them after another error."""
+    try:
+        yield
+    except BaseException as error:
+        if isinstance(kept, DiskStates):
+            if isinstance(error, KeyboardInterrupt):
+                kept.preserve()
+            else:
+                kept.remove()
+        raise
+
+
 # ---- the rule --------------------------------------------------------------------------------------------------------
 
 
@@ -252,6 +334,8 @@ class RolloutRule(Rule):
     outputs : LastState, SelectedStates, AllStates or FunctionOfStates
     progress : bool or str
     record : callable or None
+    disk : path or None
+        Folder for the files of states that do not fit into the memory.
 
     Attributes
     ----------
@@ -273,6 +357,7 @@ class RolloutRule(Rule):
         outputs: LastState,
         progress: bool | str,
         record: Callable[[Record], Any] | None,
+        disk: str | os.PathLike[str] | None,
     ) -> None:
         self.specification = specification
         self.truncate = specification.truncate
@@ -280,11 +365,12 @@ class RolloutRule(Rule):
         self.outputs = outputs
         self.progress = progress
         self.record = record
+        self.disk = disk
         if specification.differentiated:
             self.stored = plan.stored_indices()
         else:
             self.stored = {0}
-        self._runs: list[tuple[StepRunner, list[State]]] = []  # for the backward pass
+        self._runs: list[tuple[StepRunner, KeptStates]] = []  # for the backward pass
         self._last_fingerprint: list = []
 
     def forward(self, *args: Any) -> Any:
@@ -295,8 +381,9 @@ class RolloutRule(Rule):
             runner = recorded_runner(specification, args)
         if runner is None:
             runner = StepRunner(specification, args)
-        with runner.errors_named():
-            last, kept = run_forward(runner, self.plan, self.outputs, self.stored, self.progress)
+        kept = self._new_store(args)
+        with runner.errors_named(), _preserved_if_interrupted(kept):
+            last = run_forward(runner, self.plan, self.outputs, self.stored, self.progress, kept)
         for value in last.values:
             if not is_finite(value):
                 refuse_nonfinite_step(runner)
@@ -308,18 +395,31 @@ class RolloutRule(Rule):
         count("rollout.step", "forward", specification.n)
         count("rollout", "bytes", n_kept * specification.state.nbytes)
         if self.record is not None:
-            self.record(Record("forward", specification.n, n_kept, 0))
+            record = Record("forward", specification.n, n_kept, 0)
+            if isinstance(kept, DiskStates):
+                record = record._replace(on_disk=kept.written, resumed_at=kept.resumed_at)
+            self.record(record)
         results = self.outputs.finish(last)
         self.count = len(results)
         if self.count != 1:
             return results
         return results[0]
 
+    def _new_store(self, args: Sequence) -> KeptStates:
+        """Return an empty store for the states of a run, with files if states do not fit into the memory."""
+        if self.disk is None or not self.plan.disk_slots or not self.specification.differentiated:
+            return []
+        if any(map(isbox, args)):
+            raise DerivativeError(
+                "rollout with disk has first derivatives only, because files cannot hold traced states; leave disk out"
+            )
+        return DiskStates(self.specification, args, self.plan, self.disk, not self.outputs.enters_everywhere)
+
     def again(self, *args: Any) -> Any:
         """Run the same steps for other arguments, which may be on any trace, without `progress` and `record`."""
         old = self.specification
         specification = RolloutSpecification(old.step, old.forms, old.n, old.truncate, innermost(args))
-        rule = RolloutRule(specification, self.plan, copy(self.outputs), False, None)
+        rule = RolloutRule(specification, self.plan, copy(self.outputs), False, None, self.disk)
         return through(rule, specification.differentiated, *args)
 
     def parts(self, values: Any) -> list:
@@ -368,8 +468,10 @@ class RolloutRule(Rule):
         if runs:
             kept = list(kept)
         runner.recorder.ended = False
-        with runner.errors_named("in the backward pass through step"):
+        with runner.errors_named("in the backward pass through step"), _preserved_if_interrupted(kept):
             backs, norms, recomputed = run_backward(runner, self.plan, self.outputs, kept, g, self.progress)
+        if isinstance(kept, DiskStates):
+            kept.remove()
         runner.recorder.ended = True
         count("rollout.step", "vjp", specification.n)
         count("rollout.step", "recomputed", recomputed)

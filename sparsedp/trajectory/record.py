@@ -41,6 +41,10 @@ class Record(NamedTuple):
         Growth rate per step of the backward pass: the norm behaves like exp(growth * steps). NaN if not measured.
     amplification : float
         Ratio of the largest norm to the first norm that is not zero.
+    on_disk : int
+        Number of states that were written to files.
+    resumed_at : int or None
+        Index of the state from which an interrupted run was continued, in the forward pass; None without such a run.
     """
 
     direction: str
@@ -50,6 +54,8 @@ class Record(NamedTuple):
     norms: tuple = ()
     growth: float = nan
     amplification: float = nan
+    on_disk: int = 0
+    resumed_at: int | None = None
 
     @property
     def factor(self) -> float:

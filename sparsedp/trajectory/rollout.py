@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from typing import TYPE_CHECKING, Any
 
@@ -21,12 +22,14 @@ from sparsedp.trajectory.checkpoint_plan import (
     CheckpointPlan,
     advances,
     budget_within_reach,
+    bytes_of,
     slots_within,
     tape_bytes_within,
 )
+from sparsedp.trajectory.disk_states import free_bytes
 from sparsedp.trajectory.outputs import make_outputs
 from sparsedp.trajectory.passes import RolloutRule
-from sparsedp.trajectory.specification import ArgumentForm, RolloutSpecification, contiguous
+from sparsedp.trajectory.specification import ArgumentForm, RolloutSpecification, contiguous, is_array
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -48,6 +51,7 @@ def rollout(
     keep: str | Sequence[int] | Callable[[int, Any], Any] = "last",
     truncate: int | None = None,
     *,
+    disk: str | os.PathLike[str] | tuple[str | os.PathLike[str], float | str] | None = None,
     progress: bool | str = False,
     record: Callable[[Record], Any] | None = None,
 ) -> Any:
@@ -84,6 +88,11 @@ def rollout(
     truncate : int, optional
         Truncated back-propagation: each state i with 0 < i < n for which n - i is a multiple of `truncate` is treated
         as a constant by the steps after it. This changes derivatives of all orders, not the value.
+    disk : path or (path, number of bytes or text such as "20 GB"), optional
+        Folder for the states that do not fit into `memory`. Up to the given number of bytes, by default half of the
+        free space, are used there, so that fewer steps are run again. The files are removed when the backward pass
+        ends. If it is interrupted or the process is killed, they remain, and the same call continues from them; see
+        Notes.
     progress : bool or str
         True shows progress bars on standard error; a string does so and is their label. Needs the extra `plot`.
     record : callable, optional
@@ -100,7 +109,7 @@ def rollout(
     TypeError
         If n is not an integer; a float such as 3.0 is not one.
     ValueError
-        If n, memory, keep or truncate is out of range, or if the step changes one of its arguments.
+        If n, memory, disk, keep or truncate is out of range, or if the step changes one of its arguments.
     ShapeError
         If a state differs from the first one in tree structure, shape or dtype, or if the first axis of an array of
         inputs does not have n entries.
@@ -109,7 +118,9 @@ def rollout(
     DerivativeError
         If the step or `keep` uses a traced value that is not one of its arguments; if a traced value that the step or
         `keep` stored is used after the call; if a derivative is requested but the state has no floating values; if a
-        step or `keep` returns a different result when it is run again.
+        step or `keep` returns a different result when it is run again; if a second derivative is requested with `disk`.
+    OSError
+        If a file cannot be written or read in the folder `disk`.
     ImportError
         If `progress` is used and tqdm is not installed.
 
@@ -141,6 +152,12 @@ def rollout(
     again on a tape, it compares the next state with the one that it used before, by fingerprints of 64 bits. With
     memory="reverse" only the first state is compared, up to rounding.
 
+    With `disk`, an interrupted run is continued if the arguments and the step are the same. A step is the same if its
+    name, its code, and the numbers and arrays in its closure are; global variables are not compared, but the steps
+    between the last two states in files are run again, and must give the same state. States are written as the run
+    proceeds, and the cotangents of the backward pass at most every 30 seconds. Only keep="last", with a state of
+    floating arrays, can be continued. Use a folder on a local disk; several runs may use it at the same time.
+
     References
     ----------
     A. Griewank, A. Walther, ACM Trans. Math. Softw. 26 (2000) 19-45 (binomial checkpoints).
@@ -167,7 +184,7 @@ def rollout(
         if memory != "reverse" and not isinstance(step, Jitted):
             jitted = Jitted(step, falls_back=True)
         return opaque(rollout)(
-            jitted, state, params, n, inputs, memory, keep, truncate, progress=progress, record=record
+            jitted, state, params, n, inputs, memory, keep, truncate, disk=disk, progress=progress, record=record
         )
     trees = {"state": state, "params": params}
     if inputs is not None:
@@ -195,17 +212,48 @@ def rollout(
         check_whole("truncate of rollout", truncate, 1, "; leave it out and nothing is cut")
     outputs = make_outputs(keep, forms[0], n)
     plan = _checkpoint_plan(step, memory, max(forms[0].nbytes, 1), n, memory_beside, outputs.holds_all_states)
+    folder = None
+    if disk is not None:
+        folder, limit = _folder_and_limit(disk)
+        _check_disk(memory, outputs.holds_all_states, args)
+        plan = plan.with_files(limit // max(forms[0].nbytes, 1))
     outputs.is_exact = not plan.is_reversing
     specification = RolloutSpecification(step, forms, n, truncate, innermost(args))
     _check_values(specification, args, traced)
-    if specification.differentiated and plan.slots:
+    if specification.differentiated and plan.slots and not plan.disk_slots:
         _warn_of_repeats(memory, max(forms[0].nbytes, 1), n, memory_beside)
-    rule = RolloutRule(specification, plan, outputs, progress, record)
+    rule = RolloutRule(specification, plan, outputs, progress, record, folder)
     for hook in thread.loop_hooks:
         hook(step, state, params, inputs, n)
     arguments = tuple(trees.values())
     result = collectively("rollout", arguments, through, rule, specification.differentiated, *args)
     return outputs.tree(rule.parts(result))
+
+
+def _folder_and_limit(disk: Any) -> tuple[Any, int]:
+    """Return the path of the folder in the argument `disk`, and the bytes that may be used there."""
+    folder = disk
+    limit = None
+    if isinstance(disk, tuple) and len(disk) == 2:
+        folder, limit = disk
+    if not isinstance(folder, (str, os.PathLike)) or not os.fspath(folder):
+        raise TypeError(f'disk of rollout must be a path or a pair (path, "20 GB"), got {disk!r}')
+    if limit is None:
+        return folder, free_bytes(folder)
+    return folder, bytes_of(limit, "disk")
+
+
+def _check_disk(memory: Any, holds_all_states: bool, args: Sequence) -> None:
+    """Raise an error for arguments that cannot be used together with `disk`."""
+    if memory is None or memory == "reverse":
+        raise ValueError(
+            f"disk of rollout needs memory as bytes or text, got memory={memory!r}; write memory='2 GB', and the "
+            "states that do not fit into it go to files"
+        )
+    if holds_all_states:
+        raise ValueError("keep='all' returns every state in memory, so that disk has no effect; leave disk out")
+    if not all(is_array(plain(arg)) for arg in args):
+        raise TypeError("disk of rollout cannot be used with distributed fields; leave it out")
 
 
 def _check_inputs(inputs: Any, n: int) -> None:

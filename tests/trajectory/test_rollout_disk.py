@@ -1,0 +1,378 @@
+"""rollout with states in files: the same bits, files that disappear, and runs that continue after an interruption."""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+
+import sparsedp as dp
+from sparsedp._utils.pytree import leaves
+from sparsedp.errors import DerivativeError, DiskWarning
+from sparsedp.trajectory import disk_states
+from sparsedp.trajectory.checkpoint_plan import CheckpointPlan
+
+N = 30
+U = np.random.default_rng(0).random(40)
+P = np.random.default_rng(1).random(40)
+FORCES = np.random.default_rng(2).random((N, 40))
+MEMORY = 11 * U.nbytes  # five states beside params and the arrays in use
+
+
+def bend(u, p):
+    return u + 0.1 * anp.sin(p * u) * anp.roll(u, 1)
+
+
+def push(u, p, force):
+    return bend(u, p) + 0.01 * force
+
+
+class Interrupted:
+    """A step that is interrupted at one of its calls."""
+
+    def __init__(self, step=bend, at=None):
+        self.step = step
+        self.at = at
+        self.calls = 0
+
+    def __call__(self, *args):
+        self.calls += 1
+        if self.calls == self.at:
+            raise KeyboardInterrupt
+        return self.step(*args)
+
+
+def gradient(folder, step=bend, n=N, **options):
+    """Return the value and the gradient in state and params as one list of arrays."""
+    settings = {"memory": MEMORY, "disk": folder, **options}
+    loss = lambda x: anp.sum(dp.rollout(step, *x, n, **settings) ** 2)
+    value, (first, params) = dp.value_and_grad(loss)((U, P))
+    return [value, first, params]
+
+
+def same(one, other):
+    return all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+WANTED = gradient(None, memory=None)
+
+
+@pytest.mark.parametrize("keep", ["last", [3, 7, N], lambda i, u: anp.sum(u**2)], ids=["last", "some", "each"])
+@pytest.mark.parametrize("limit", [None, 1, 5])
+def test_the_gradient_has_the_bits_of_a_run_in_memory(tmp_path, limit, keep):
+    disk = tmp_path if limit is None else (tmp_path, limit * U.nbytes)
+
+    def loss(x, **options):
+        result = dp.rollout(bend, *x, N, keep=keep, **options)
+        return sum(result) if isinstance(result, tuple) else anp.sum(result**2)
+
+    records = []
+    wanted = dp.value_and_grad(loss)((U, P))
+    value, slopes = dp.value_and_grad(lambda x: loss(x, memory=MEMORY, disk=disk, record=records.append))((U, P))
+    assert value == wanted[0] and same(slopes, wanted[1])
+    assert records[0].on_disk == (limit or N - 5)
+    assert (records[1].recomputed == 0) == (limit is None)
+    assert not os.listdir(tmp_path)
+
+
+def test_no_file_is_written_if_all_states_fit_into_the_memory(tmp_path, monkeypatch):
+    monkeypatch.setattr(disk_states, "write_state", None)
+    assert same(gradient(tmp_path, memory="1 MB"), WANTED)
+
+
+def test_no_file_is_written_without_a_gradient(tmp_path, monkeypatch):
+    monkeypatch.setattr(disk_states, "write_state", None)
+    dp.rollout(bend, U, P, N, memory=MEMORY, disk=tmp_path)
+
+
+def test_files_disappear_with_a_result_that_nobody_differentiates(tmp_path):
+    _, pull = dp.vjp(lambda u: dp.rollout(bend, u, P, N, memory=MEMORY, disk=tmp_path), U)
+    assert len(list(tmp_path.glob("rollout-*/state-*"))) > 20
+    del pull
+    assert not os.listdir(tmp_path)
+
+
+def test_files_disappear_after_an_error_of_the_step(tmp_path):
+    calls = []
+
+    def step(u, p):
+        calls.append(1)
+        if len(calls) == 12:
+            raise ZeroDivisionError
+        return bend(u, p)
+
+    with pytest.raises(ZeroDivisionError):
+        gradient(tmp_path, step)
+    assert not os.listdir(tmp_path)
+
+
+STATES = {
+    "tree": ({"a": U, "b": (np.float32(2.0), 1.5)}, lambda s, p: {"a": bend(s["a"], p), "b": s["b"]}),
+    "integers": ((U, 0, "name"), lambda s, p: (bend(s[0], p), s[1] + 1, s[2])),
+    "complex": (U + 1j * P, lambda u, p: u + 0.1 * p * u * anp.roll(u, 1)),
+    "single": (U.astype(np.float32), lambda u, p: anp.float32(0.5) * u + 0.1 * anp.sin(u)),
+    "empty": ((U, np.zeros((0, 2))), lambda s, p: (bend(s[0], p), s[1])),
+    "number": (0.3, lambda u, p: u + 0.1 * anp.sin(u) * p[0]),
+}
+
+
+@pytest.mark.parametrize("name", STATES)
+def test_states_of_every_kind(tmp_path, name):
+    state, step = STATES[name]
+
+    def loss(x, **options):
+        end = dp.rollout(step, x, P, N, **options)
+        while isinstance(end, (tuple, dict)):
+            end = end["a"] if isinstance(end, dict) else end[0]
+        return anp.sum(anp.abs(end) ** 2)
+
+    memory = P.nbytes + 9 * (sum(np.asarray(leaf).nbytes for leaf in leaves(state) if not isinstance(leaf, (int, str))))
+    records = []
+    options = {"memory": memory, "disk": tmp_path, "record": records.append}
+    wanted, slope = dp.value_and_grad(loss)(state)
+    value, other = dp.value_and_grad(lambda x: loss(x, **options))(state)
+    assert value == wanted and records[0].on_disk > 0
+    assert repr(other) == repr(slope)
+
+
+def test_a_jitted_step(tmp_path):
+    jitted = dp.jit(bend)
+    assert same(gradient(tmp_path, jitted), gradient(None, jitted, memory=None))
+    assert not os.listdir(tmp_path)
+
+
+@pytest.mark.parametrize("limit", [None, 4])
+@pytest.mark.parametrize("options", [{}, {"inputs": FORCES}, {"truncate": 7}], ids=["plain", "inputs", "truncated"])
+def test_an_interrupted_run_continues(tmp_path, limit, options, monkeypatch):
+    monkeypatch.setattr(disk_states, "INTERVAL", 0.0)
+    monkeypatch.setattr(disk_states, "SHARE", np.inf)
+    disk = tmp_path if limit is None else (tmp_path, limit * U.nbytes)
+    if "inputs" in options:
+        options = {**options, "memory": MEMORY + FORCES.nbytes}
+    step = Interrupted(push if "inputs" in options else bend)
+    wanted = gradient(None, step, **{**options, "memory": None})
+    step.calls = 0
+    assert same(gradient(disk, step, **options), wanted)
+    whole = step.calls
+    saved = 0
+    for at in range(3, whole, 9):
+        step.calls, step.at = 0, at
+        with pytest.raises(KeyboardInterrupt):
+            gradient(disk, step, **options)
+        step.calls, step.at = 0, None
+        records = []
+        assert same(gradient(disk, step, record=records.append, **options), wanted)
+        assert not os.listdir(tmp_path)
+        saved += whole - step.calls
+        assert (records[0].resumed_at or 0) > 0 or at < N
+    assert saved > 0
+
+
+def test_a_second_interruption_and_another_cotangent(tmp_path, monkeypatch):
+    monkeypatch.setattr(disk_states, "INTERVAL", 0.0)
+    monkeypatch.setattr(disk_states, "SHARE", np.inf)
+    step = Interrupted()
+    loss = lambda weight: lambda u: weight * anp.sum(dp.rollout(step, u, P, N, memory=MEMORY, disk=tmp_path) ** 2)
+    for at in (20, 25, 15):
+        step.calls, step.at = 0, at
+        with pytest.raises(KeyboardInterrupt):
+            dp.grad(loss(1.0))(U)
+    step.at = None
+    assert np.array_equal(dp.grad(loss(3.0))(U), dp.grad(lambda u: 3.0 * anp.sum(dp.rollout(bend, u, P, N) ** 2))(U))
+    assert not os.listdir(tmp_path)
+
+
+def test_a_changed_step_does_not_continue_the_old_run(tmp_path):
+    step = Interrupted()
+    step.at = N + 10
+    with pytest.raises(KeyboardInterrupt):
+        gradient(tmp_path, step)
+    step.at = None
+    step.step = lambda u, p: 0.99 * bend(u, p)  # an attribute of an object: not part of the hash
+    wanted = gradient(None, step, memory=None)
+    assert same(gradient(tmp_path, step), wanted)
+    assert not os.listdir(tmp_path)
+
+
+def test_code_and_closure_belong_to_the_run(tmp_path):
+    specification = lambda step: type(
+        "S", (), {"step": step, "n": 1, "truncate": None, "differentiated": [0], "forms": []}
+    )
+    key = lambda step: disk_states.run_key(specification(step), [U])
+
+    def make(factor):
+        return lambda u, p: factor * u
+
+    def other(factor):
+        return lambda u, p: factor * u * u
+
+    assert key(make(1.0)) == key(make(1.0)) == key(dp.jit(make(1.0)))
+    assert len({key(make(1.0)), key(make(2.0)), key(make(U)), key(other(1.0))}) == 4
+
+
+def test_files_of_other_arguments_are_kept_and_reported(tmp_path):
+    step = Interrupted(at=20)
+    with pytest.raises(KeyboardInterrupt):
+        gradient(tmp_path, step)
+    before = os.listdir(tmp_path)
+    with pytest.warns(DiskWarning, match="holds 1 rollout folders of .* MB, of runs that were interrupted"):
+        gradient(tmp_path, step, n=N - 1)
+    assert os.listdir(tmp_path) == before
+
+
+def test_two_runs_with_the_same_arguments_at_the_same_time(tmp_path):
+    run = lambda: dp.vjp(lambda u: dp.rollout(bend, u, P, N, memory=MEMORY, disk=tmp_path), U)
+    (end, pull), (_, other) = run(), run()
+    assert len(os.listdir(tmp_path)) == 2
+    assert np.array_equal(pull(end), other(end))
+    assert not os.listdir(tmp_path)
+
+
+def test_a_pullback_that_is_called_twice(tmp_path):
+    end, pull = dp.vjp(lambda u: dp.rollout(bend, u, P, N, memory=MEMORY, disk=tmp_path), U)
+    assert np.array_equal(pull(end), pull(end))
+    assert not os.listdir(tmp_path)
+
+
+@pytest.mark.parametrize("at", [0, 3, 20])
+def test_a_full_disk_costs_time_only(tmp_path, at, monkeypatch):
+    write = disk_states.write_state
+    calls = []
+
+    def limited(path, state):
+        calls.append(path)
+        if len(calls) > at:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        write(path, state)
+
+    monkeypatch.setattr(disk_states, "write_state", limited)
+    records = []
+    with pytest.warns(DiskWarning, match=f"the disk is full: .* holds {at} states of this rollout, the other steps"):
+        found = gradient(tmp_path, record=records.append)
+    assert same(found, WANTED) and records[1].recomputed > 0
+    assert not os.listdir(tmp_path)
+
+
+def test_a_partial_write_leaves_no_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(disk_states, "_bytes_of", lambda value: (_ for _ in ()).throw(OSError(errno.ENOSPC, "full")))
+    monkeypatch.setattr(disk_states, "state_digest", lambda values: "")
+    with pytest.raises(OSError):
+        disk_states.write_state(tmp_path / "state-1", disk_states.State(1, [U], ()))
+    assert not os.listdir(tmp_path)
+
+
+def test_a_file_that_was_changed_is_an_error(tmp_path):
+    end, pull = dp.vjp(lambda u: dp.rollout(bend, u, P, N, memory=MEMORY, disk=tmp_path), U)
+    [file] = tmp_path.glob("rollout-*/state-000000000009")
+    content = bytearray(file.read_bytes())
+    content[-1] ^= 1
+    file.write_bytes(content)
+    with pytest.raises(OSError, match="state-000000000009 was changed or removed during the rollout; run it again"):
+        pull(end)
+    assert not os.listdir(tmp_path)
+
+
+def test_a_damaged_file_of_an_interrupted_run_is_not_used(tmp_path):
+    step = Interrupted(at=N + 10)
+    with pytest.raises(KeyboardInterrupt):
+        gradient(tmp_path, step)
+    file = max(tmp_path.glob("rollout-*/state-*"))
+    file.write_bytes(file.read_bytes()[:-8])
+    step.at = None
+    assert same(gradient(tmp_path, step), WANTED)
+
+
+def test_plan_with_files():
+    plan = CheckpointPlan(100, 10, -1).with_files(20)
+    assert (plan.slots, plan.disk_slots, plan.memory_slots) == (30, 20, 10)
+    assert plan.disk_indices() == set(sorted(plan.stored_indices())[1:21])
+    assert CheckpointPlan(100, 10, -1).with_files(1000).slots == 100
+    assert CheckpointPlan(5, 5, -1).with_files(1000).disk_slots == 0
+
+
+KILLED = """
+import sys
+import numpy as np, autograd.numpy as anp, sparsedp as dp
+from sparsedp.trajectory import disk_states
+disk_states.INTERVAL, disk_states.SHARE = 0.02, 1.0
+rng = np.random.default_rng(0)
+u, p = rng.random(2000), rng.random(2000)
+def step(u, p):
+    return u + 0.01 * anp.sin(p * u) * anp.roll(u, 1)
+records = []
+disk = None if len(sys.argv) < 2 else (sys.argv[1], 1500 * u.nbytes)
+loss = lambda x: anp.sum(dp.rollout(step, *x, 4000, memory="1 MB" if disk else None, disk=disk,
+                                    record=records.append) ** 2)
+print("ready", flush=True)
+value, (a, b) = dp.value_and_grad(loss)((u, p))
+print(value.hex(), a.tobytes().hex()[:4000], float(np.sum(b)).hex(), records[0].resumed_at)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+def test_killed_at_random_moments(tmp_path):
+    """20 times, each run continued by the next one: no result changes, and no file remains."""
+    command = [sys.executable, "-c", KILLED]
+    begin = time.perf_counter()
+    wanted = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[1:-1]
+    seconds = time.perf_counter() - begin
+    rng = np.random.default_rng(0)
+    killed = 0
+    continued = 0
+    while killed < 20:
+        child = subprocess.Popen([*command, tmp_path], stdout=subprocess.PIPE, text=True)
+        assert child.stdout.readline() == "ready\n"
+        time.sleep(rng.uniform(0.0, 0.4 * seconds))
+        child.send_signal(signal.SIGKILL)
+        words = child.stdout.read().split()
+        child.wait()
+        if words:  # it ended before
+            assert words[:-1] == wanted
+            assert not os.listdir(tmp_path)
+            continued += words[-1] != "None"
+        else:
+            killed += 1
+            assert len(os.listdir(tmp_path)) <= 1
+    last = subprocess.run([*command, tmp_path], capture_output=True, text=True, check=True).stdout.split()[1:]
+    assert last[:-1] == wanted
+    assert continued or last[-1] != "None"
+    assert not os.listdir(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"memory": None}, ValueError, "disk of rollout needs memory as bytes or text, got memory=None; write memory="),
+        ({"keep": "all"}, ValueError, "keep='all' returns every state in memory, so that disk has no effect; leave"),
+        ({"disk": 3}, TypeError, "disk of rollout must be a path or a pair .path, .20 GB.., got 3"),
+        ({"disk": ""}, TypeError, "disk of rollout must be a path or a pair"),
+        ({"disk": ("x", "many")}, ValueError, "rollout needs disk as bytes > 0 or a text, got 'many'; write for"),
+    ],
+)
+def test_arguments_that_do_not_fit(tmp_path, options, error, message):
+    with pytest.raises(error, match=message):
+        gradient(tmp_path, **options)
+
+
+def test_a_file_instead_of_a_folder(tmp_path):
+    path = Path(tmp_path, "file")
+    path.write_text("")
+    with pytest.raises(OSError, match="give the path of a folder, this is a file"):
+        gradient(path)
+
+
+def test_second_derivatives_are_refused(tmp_path):
+    loss = lambda u: anp.sum(dp.rollout(bend, u, P, N, memory=MEMORY, disk=tmp_path) ** 2)
+    with pytest.raises(
+        DerivativeError, match="rollout with disk has first derivatives only, because files cannot hold"
+    ):
+        dp.hvp(loss, U, U)
+    assert dp.jvp(loss, U, U) == dp.jvp(lambda u: anp.sum(dp.rollout(bend, u, P, N) ** 2), U, U)
+    assert not os.listdir(tmp_path)
