@@ -7,7 +7,6 @@ and derivatives of higher order differentiate the operations that the two passes
 
 from __future__ import annotations
 
-from contextlib import contextmanager
 from copy import copy
 from functools import partial
 from operator import is_
@@ -29,7 +28,7 @@ from sparsedp.trajectory.step_runner import State, StepRunner
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Sequence
 
     from sparsedp.trajectory.checkpoint_plan import CheckpointPlan
     from sparsedp.trajectory.outputs import LastState
@@ -198,6 +197,7 @@ def run_backward(
                     digest_of_next = None
                 elif not plan.is_reversing:
                     check_repeated(specification, following.fingerprint(), fingerprint)
+                del following  # its arrays take memory
             total = runner.pulled_back(total, state, sums, rows)
             if not is_taped:
                 state.tape = None
@@ -307,18 +307,13 @@ def check_repeated(specification: RolloutSpecification, fingerprints: list, earl
     raise DerivativeError(f"the step gives another {name} when it is run again; it must depend on its arguments only")
 
 
-@contextmanager
-def _preserved_if_interrupted(kept: KeptStates) -> Iterator[None]:
-    """Leave the files of states for a later run if Ctrl-C is pressed inside; remove them after another error."""
-    try:
-        yield
-    except BaseException as error:
-        if isinstance(kept, DiskStates):
-            if isinstance(error, KeyboardInterrupt):
-                kept.preserve()
-            else:
-                kept.remove()
-        raise
+def release(kept: KeptStates, error: BaseException) -> None:
+    """Leave the files of states for a later run if Ctrl-C was pressed; remove them after another error."""
+    if isinstance(kept, DiskStates):
+        if isinstance(error, KeyboardInterrupt):
+            kept.preserve()
+        else:
+            kept.remove()
 
 
 # ---- the rule --------------------------------------------------------------------------------------------------------
@@ -381,9 +376,15 @@ class RolloutRule(Rule):
             runner = recorded_runner(specification, args)
         if runner is None:
             runner = StepRunner(specification, args)
-        kept = self._new_store(args)
-        with runner.errors_named(), _preserved_if_interrupted(kept):
-            last = run_forward(runner, self.plan, self.outputs, self.stored, self.progress, kept)
+        kept: KeptStates = []
+        if self.disk is not None:
+            kept = self._new_store(args)
+        with runner.errors_named():
+            try:
+                last = run_forward(runner, self.plan, self.outputs, self.stored, self.progress, kept)
+            except BaseException as error:
+                release(kept, error)
+                raise
         for value in last.values:
             if not is_finite(value):
                 refuse_nonfinite_step(runner)
@@ -407,7 +408,7 @@ class RolloutRule(Rule):
 
     def _new_store(self, args: Sequence) -> KeptStates:
         """Return an empty store for the states of a run, with files if states do not fit into the memory."""
-        if self.disk is None or not self.plan.disk_slots or not self.specification.differentiated:
+        if not self.plan.disk_slots or not self.specification.differentiated:
             return []
         if any(map(isbox, args)):
             raise DerivativeError(
@@ -468,8 +469,12 @@ class RolloutRule(Rule):
         if runs:
             kept = list(kept)
         runner.recorder.ended = False
-        with runner.errors_named("in the backward pass through step"), _preserved_if_interrupted(kept):
-            backs, norms, recomputed = run_backward(runner, self.plan, self.outputs, kept, g, self.progress)
+        with runner.errors_named("in the backward pass through step"):
+            try:
+                backs, norms, recomputed = run_backward(runner, self.plan, self.outputs, kept, g, self.progress)
+            except BaseException as error:
+                release(kept, error)
+                raise
         if isinstance(kept, DiskStates):
             kept.remove()
         runner.recorder.ended = True
