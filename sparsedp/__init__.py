@@ -45,6 +45,7 @@ _PUBLIC_NAMES = {
     "trajectory.rollout": "rollout",
     "optimize.update_direction": "update_direction",
     "optimize.minimize": "minimize",
+    "optimize.laplace": "laplace",
     "optimize.physical_gradient": "physical_gradient",
     "kernels": "set_threads",
     "report.plots": "animate convergence plot v_curve",

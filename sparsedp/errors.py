@@ -19,6 +19,7 @@ __all__ = [
     "JitWarning",
     "NonFiniteError",
     "NonFiniteGradientWarning",
+    "PosteriorWarning",
     "ShapeError",
     "SparsedpError",
     "UnstableStepError",
@@ -71,6 +72,10 @@ class NonFiniteGradientWarning(UserWarning):
     `grad`, `value_and_grad`, `vjp`, `jvp` and `hvp` issue this warning. To raise an error instead, call
     ``warnings.filterwarnings("error", category=sparsedp.errors.NonFiniteGradientWarning)``.
     """
+
+
+class PosteriorWarning(UserWarning):
+    """A posterior of `dp.laplace` has variances that are too large, or its mean is not the mode."""
 
 
 class ConvergenceError(SparsedpError, RuntimeError):

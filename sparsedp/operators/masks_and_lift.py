@@ -202,7 +202,7 @@ def diagonal(space: Space, values: ArrayLike) -> Operator:
 
     See Also
     --------
-    mask, identity
+    mask, identity, laplace
 
     Notes
     -----

@@ -199,7 +199,7 @@ def minimize(
     See Also
     --------
     value_and_grad, update_direction, physical_gradient, smoothness, total_variation, certified, convergence, flatten,
-    ensemble
+    ensemble, laplace
 
     Notes
     -----

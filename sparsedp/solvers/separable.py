@@ -146,6 +146,49 @@ class AxisBasis:
             return partial(TRANSFORMS_ON_ONE_THREAD[name][backward], **options)
         return partial(TRANSFORMS[name][backward], **options, workers=workers)
 
+    def diagonal(self, values: NDArray[Any], axis: int, length: int, is_halved: bool) -> NDArray[Any]:
+        """Return the diagonal along one axis of the matrix with these eigenvalues: see `Spectrum.diagonal`.
+
+        Parameters
+        ----------
+        values : array
+            Eigenvalues along `axis`; along other axes eigenvalues or entries of the diagonal.
+        axis : int
+        length : int
+            Number of entries along the axis.
+        is_halved : bool
+            Whether only the first half of the values of a Fourier axis is given; the others are equal to these.
+        """
+        if self.kind == "identity":
+            return values
+        if self.matrices is not None:
+            return _multiply_along(self.matrices[1] * self.matrices[0].T, axis, np.ascontiguousarray(values))
+        values = np.moveaxis(values, axis, -1)
+        if self.kind == "fourier":  # all entries of an eigenvector have the same magnitude
+            counts = np.ones(values.shape[-1])
+            if is_halved:
+                counts[1 : (length + 1) // 2] = 2.0
+            return np.moveaxis(values @ counts[:, None] / length, -1, axis)
+        return np.moveaxis(self._diagonal_of_waves(values), -1, axis)
+
+    def _diagonal_of_waves(self, values):
+        """Return the diagonal along the last axis, for eigenvectors that are cosines or sines.
+
+        The square of cos(t) or sin(t) is (1 + cos(2 t)) / 2 or (1 - cos(2 t)) / 2. The frequencies 2 t above the
+        largest of a cosine transform are reflected.
+        """
+        n = values.shape[-1]
+        shift = {"dct-2": 0, "dst-2": 2, "dct-4": 1, "dst-4": 1}[self.kind]
+        doubled = 2 * np.arange(n) + shift
+        weights = np.where(doubled % (2 * n) == 0, 0.5, 1.0) * values / n
+        coefficients = np.zeros((*values.shape[:-1], n + 1))
+        coefficients[..., doubled[doubled <= n]] += weights[..., doubled <= n]
+        coefficients[..., 2 * n - doubled[doubled > n]] -= weights[..., doubled > n]
+        coefficients = coefficients[..., :n]
+        waves = 0.5 * (fft.dct(coefficients, type=3, axis=-1) + coefficients[..., :1])
+        sign = 1.0 if self.kind.startswith("dct") else -1.0
+        return np.sum(weights, axis=-1, keepdims=True) + sign * waves
+
 
 def _multiply_along(matrix, axis, x):
     """Multiply the lines of a field along one axis with a matrix."""
@@ -346,6 +389,18 @@ class Spectrum:
         for transform in self._from_coefficients[transposed]:
             y = transform(y)
         return y.reshape(-1)
+
+    def diagonal(self, weights: NDArray[Any]) -> NDArray[Any]:
+        """Return the diagonal of f(A) as a flat array, given the values of f at the eigenvalues.
+
+        Along each axis, entry i of the diagonal is the sum over k of V[i, k] V^-1[k, i] f(e_k).
+        """
+        first_length = len(self.axes[0].eigenvalues) if 0 not in self.fourier_axes else weights.shape[0]
+        values = np.broadcast_to(weights, (first_length, *weights.shape[1:]))
+        for number, axis in enumerate(self.axes):
+            is_halved = bool(self.fourier_axes) and number == self.fourier_axes[-1]
+            values = axis.diagonal(values, number, self.shape[number], is_halved)
+        return np.array(np.broadcast_to(values, self.shape)).reshape(-1)
 
     def has_same_basis(self, other: Spectrum) -> bool:
         """Whether another spectrum has the same eigenvectors."""

@@ -91,7 +91,7 @@ def matrix_power(op: Operator, exponent: float) -> Operator:
 
     See Also
     --------
-    matrix_exponential, matrix_function, inverse
+    matrix_exponential, matrix_function, inverse, laplace
 
     Notes
     -----

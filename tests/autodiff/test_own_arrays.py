@@ -255,7 +255,7 @@ def test_every_builder_is_here():
     unbuilt += (
         "sponge identity divergence curl upwind component prolong harmonic_average from_functions from_linear_operator"
     )
-    calls = "matrix_function from_blackbox minimize certify certified explain stress work_precision rollout"
+    calls = "matrix_function from_blackbox minimize laplace certify certified explain stress work_precision rollout"
     calls += " jit grad value_and_grad vjp jvp hvp differentiable set_threads steady distribute gather"
     shown = "animate plot convergence v_curve update_direction save load from_image"
     public = {name for name in dir(dp) if callable(getattr(dp, name)) and name.islower() and name[0] != "_"}

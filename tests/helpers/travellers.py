@@ -321,6 +321,7 @@ NOTHING_TO_CALL = {
     "outflow",
     "rollout",
     "minimize",
+    "laplace",
     "update_direction",
     "set_threads",
     "convergence",

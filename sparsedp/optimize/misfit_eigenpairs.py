@@ -1,0 +1,437 @@
+"""Eigenpairs of the Hessian of a misfit in the metric of a prior covariance.
+
+Notes
+-----
+With the Hessian H of the misfit and the prior covariance C, the pairs H v = lambda C^-1 v are computed from products
+with H and C only. Let v = C w. Then H C w = lambda w, and H C is self-adjoint in the inner product u^T C w.
+
+If there are few residuals, or few unknowns, the eigenpairs of the small matrix J C J^T give all of them. Otherwise they
+are found in a block Krylov space of H C. It starts with products of H and random samples, like the first pass of a
+randomized method. Each product with H serves twice: as the next block of the basis, and, like the second pass, for the
+matrix of H C in this basis. When all eigenpairs above the tolerance have converged, new random samples show whether
+others were missed, for example of a multiple eigenvalue.
+
+References
+----------
+N. Halko, P. G. Martinsson, J. A. Tropp, Finding structure with randomness, SIAM Review 53, 2011: a bound on a matrix
+from products with random vectors, section 4.3.
+A. K. Saibaba, J. Lee, P. K. Kitanidis, Randomized algorithms for generalized Hermitian eigenvalue problems,
+Numer. Linear Algebra Appl. 23, 2016.
+C. Musco, C. Musco, Randomized block Krylov methods for stronger and faster approximate singular value decomposition,
+NIPS 2015.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from sparsedp._utils.validation import EPS
+from sparsedp.errors import DerivativeError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from sparsedp.optimize.prior_covariance import PriorCovariance
+
+__all__ = ["MisfitEigenpairs", "eigenpairs_of_jacobian", "eigenpairs_of_products"]
+
+FIRST_BLOCKS = 2  # convergence is not tested before the space has this number of blocks
+SMALLEST = np.finfo(float).tiny
+BLOCK = 10  # random samples, and vectors in a block of the Krylov space
+ROUNDING = 1e3 * EPS  # eigenvalues below this multiple of the largest are lost in rounding
+SHARE_OF_RESIDUALS = 0.1  # share of the tolerance for the residuals of the eigenpairs
+ASYMMETRY = 1e-2  # relative asymmetry of the Hessian above which its products are wrong
+NEGATIVE = (
+    "the Hessian of the loss has the eigenvalue {:.3g} in the metric of the prior, so x is not a minimum of the "
+    "posterior; continue minimize from x, or return residuals, whose Gauss-Newton Hessian has no negative eigenvalue"
+)
+NOT_SYMMETRIC = (
+    "products with the Hessian are not symmetric (relative difference {:.1e}); dp.check.gradient(loss, x) tests the "
+    "derivatives of the function"
+)
+
+
+class MisfitEigenpairs(NamedTuple):
+    """Eigenpairs in descending order of the magnitude of the eigenvalues, and what is known about the others.
+
+    Attributes
+    ----------
+    values : (k,) array
+    vectors : (k, n) array
+        The rows v, with v^T C^-1 v = 1.
+    duals : (k, n) array
+        The rows w = C^-1 v.
+    neglected : float
+        Estimate of the largest magnitude of the other eigenvalues.
+    residual : float
+        Bound on the relative error of variances due to the residuals of the eigenpairs.
+    products : int
+        Number of products with the Hessian, or of products with J or J^T if J was computed.
+    kind : str
+        What was counted.
+    is_complete : bool
+        Whether the others are below the tolerance.
+    lost_in_rounding : bool
+        Whether they are not, because of rounding errors.
+    """
+
+    values: NDArray
+    vectors: NDArray
+    duals: NDArray
+    neglected: float
+    residual: float
+    products: int
+    kind: str
+    is_complete: bool
+    lost_in_rounding: bool
+
+
+def eigenpairs_of_jacobian(jacobian: NDArray, prior: PriorCovariance, tolerance: float) -> MisfitEigenpairs:
+    """Return all eigenpairs for the Gauss-Newton Hessian J^T J, from the eigenpairs of J C J^T.
+
+    Parameters
+    ----------
+    jacobian : (m, n) array
+    prior : PriorCovariance
+    tolerance : float
+        For `is_complete`.
+    """
+    products = min(jacobian.shape)
+    rows = jacobian
+    if rows.shape[0] > rows.shape[1]:
+        rows = scipy.linalg.qr(jacobian, mode="r", check_finite=False)[0][: rows.shape[1]]
+    images = prior.apply(rows)
+    gram = images @ rows.T
+    asymmetry = _checked_asymmetry(gram)
+    values, vectors = scipy.linalg.eigh(0.5 * (gram + gram.T))
+    largest = np.max(values, initial=0.0)
+    rounding = max(ROUNDING * largest, asymmetry)
+    kept = np.flatnonzero(values > rounding)[::-1]
+    values = values[kept]
+    weights = vectors[:, kept].T / np.sqrt(values)[:, None]
+    neglected = 0.0 if len(kept) == len(gram) else rounding
+    return MisfitEigenpairs(
+        values,
+        weights @ images,
+        weights @ rows,
+        float(neglected),
+        0.0,
+        products,
+        "products with the Jacobian",
+        bool(neglected <= tolerance),
+        bool(neglected > tolerance),
+    )
+
+
+def eigenpairs_of_products(
+    product: Callable[[NDArray], NDArray], prior: PriorCovariance, rank: int, tolerance: float, seed: int
+) -> MisfitEigenpairs:
+    """Return the eigenpairs above the tolerance, from products with the Hessian.
+
+    Parameters
+    ----------
+    product : callable
+        ``product(rows)`` returns H times each row of an array of shape (m, n).
+    prior : PriorCovariance
+    rank : int
+        Largest number of eigenpairs.
+    tolerance : float
+    seed : int
+        Of the random samples.
+
+    Raises
+    ------
+    ValueError
+        If an eigenvalue is -1 or less: then H + C^-1 is not positive definite.
+    DerivativeError
+        If the products with H are not symmetric.
+    """
+    space = KrylovSpace(product, prior, tolerance, most=min(prior.size, 2 * (rank + BLOCK)))
+    rng = np.random.default_rng(seed)
+    count = min(BLOCK, prior.size)
+    least = min(FIRST_BLOCKS * count, prior.size)
+    while True:
+        known = space.informative
+        outside = space.start(_random_rows(prior, rng, count), prior.has_root)
+        if outside <= space.threshold:
+            return space.result(rank, is_complete=True)
+        has_converged = space.grow_until_converged(rank, least)
+        if not has_converged or space.informative > rank:
+            return space.result(rank, is_complete=False)
+        if space.informative == known:  # new random samples did not show another eigenpair
+            return space.result(rank, is_complete=True)
+
+
+def _random_rows(prior, rng, count):
+    """Return samples of the prior; where they would take an iteration, C times random rows, scaled like samples."""
+    if prior.has_root:
+        return prior.samples(rng, count)
+    rows = rng.standard_normal((count, prior.size))
+    images = prior.apply(rows)
+    squares = np.einsum("ij,ij->i", rows, images)
+    return images * np.sqrt(prior.size / np.maximum(squares, SMALLEST))[:, None]
+
+
+class Block(NamedTuple):
+    """Rows q that are orthonormal in the inner product u^T C w, and their images C q."""
+
+    rows: NDArray
+    images: NDArray
+
+    @property
+    def dimension(self) -> int:
+        """The number of rows."""
+        return len(self.rows)
+
+
+class KrylovSpace:
+    """A growing block Krylov space of H C, with a basis Q that is orthonormal in the inner product u^T C w.
+
+    Parameters
+    ----------
+    product, prior, tolerance
+        As for `eigenpairs_of_products`.
+    most : int
+        Largest dimension.
+
+    Attributes
+    ----------
+    matrix : (m, m) array
+        Q^T C H C Q.
+    values : (m,) array
+        Eigenvalues of the matrix (Ritz values).
+    residuals : (m,) array
+        Norms of H C w - lambda w, relative to sqrt(1 + lambda).
+    threshold : float
+        The tolerance, or the size of rounding errors of eigenvalues if it is larger.
+    products : int
+        Number of products with H.
+    """
+
+    def __init__(
+        self, product: Callable[[NDArray], NDArray], prior: PriorCovariance, tolerance: float, most: int
+    ) -> None:
+        self._product = product
+        self._prior = prior
+        self._tolerance = tolerance
+        self._most = most
+        self._blocks: list[Block] = []
+        self._next = Block(np.zeros((0, prior.size)), np.zeros((0, prior.size)))  # extends the space
+        self._continues = False  # whether the next block has the components of the last one outside of the space
+        self._open: list[tuple[slice, NDArray]] = []  # components of H C Q outside of the space, by blocks
+        self.dimension = 0
+        self.matrix = np.zeros((0, 0))
+        self.values = np.zeros(0)
+        self.residuals = np.zeros(0)
+        self.asymmetry = 0.0
+        self.products = 0
+        self._vectors = np.zeros((0, 0))
+
+    @property
+    def threshold(self) -> float:
+        """The magnitude above which eigenpairs are wanted."""
+        return max(self._tolerance, self._rounding)
+
+    @property
+    def _rounding(self):
+        return max(ROUNDING * np.max(np.abs(self.values), initial=0.0), self.asymmetry)
+
+    @property
+    def informative(self) -> int:
+        """The number of Ritz values above the threshold."""
+        return int(np.count_nonzero(np.abs(self.values) > self.threshold))
+
+    @property
+    def settled(self) -> int:
+        """The number of eigenpairs above the threshold that have converged."""
+        return int(np.count_nonzero((np.abs(self.values) > self.threshold) & self._are_converged()))
+
+    def _are_converged(self):
+        goal = SHARE_OF_RESIDUALS * self._tolerance / np.sqrt(max(1, self.informative))
+        return 2 * self.residuals <= np.maximum(goal, self._rounding)
+
+    def start(self, rows: NDArray, are_samples: bool) -> float:
+        """Begin a new sequence of blocks with H times random rows; return an estimate of the norm of H C outside.
+
+        If the rows are samples of the prior, the norm is at most ten times the estimate with probability
+        1 - 10^-BLOCK. For other rows, infinity is returned unless nothing remains.
+        """
+        images = self._product(rows)
+        self.products += len(rows)
+        remainder = self._projected(images)
+        squares = np.einsum("ij,ij->i", remainder, self._prior.apply(remainder))
+        self._next, _ = self._orthonormalized(remainder)
+        self._continues = False
+        if not self._next.dimension:
+            return 0.0
+        if not are_samples:
+            return np.inf
+        return float(np.sqrt(np.max(np.maximum(squares, 0.0))))
+
+    def grow_until_converged(self, rank: int, least: int) -> bool:
+        """Add blocks until all eigenpairs above the threshold have converged; return whether they have.
+
+        It ends without convergence when more than `rank` have converged, or when there is no room.
+
+        Parameters
+        ----------
+        rank : int
+        least : int
+            The smallest dimension at which convergence is tested.
+        """
+        while self._next.dimension:
+            if self.dimension + self._next.dimension > self._most:
+                return False
+            self._grow()
+            if self.settled > rank:
+                return False
+            if self.dimension >= least and self.settled == self.informative:
+                break
+        return True
+
+    def _grow(self):
+        """Add the next block to the space, multiply it by H C, and update the Ritz values and residuals."""
+        block = self._next
+        place = slice(self.dimension, self.dimension + block.dimension)
+        self._blocks.append(block)
+        self.dimension = place.stop
+        products = self._product(block.images)
+        self.products += block.dimension
+        self._extend_matrix(products, place)
+        # The components outside of the space form the next block, and their coefficients give the residuals.
+        self._next, components = self._orthonormalized(self._projected(products))
+        if self._continues:
+            self._open.pop()  # the components of the previous block are in this block
+        self._continues = True
+        self._open.append((place, components))
+        self._update_ritz_pairs()
+
+    def _extend_matrix(self, products, place):
+        columns = np.concatenate([block.images @ products.T for block in self._blocks])
+        matrix = np.zeros((place.stop, place.stop))
+        matrix[: place.start, : place.start] = self.matrix
+        matrix[:, place] = columns
+        matrix[place, : place.start] = columns[: place.start].T
+        corner = matrix[place, place]
+        self.asymmetry = max(self.asymmetry, _checked_asymmetry(corner, np.max(np.abs(matrix), initial=0.0)))
+        matrix[place, place] = 0.5 * (corner + corner.T)
+        self.matrix = matrix
+
+    def _update_ritz_pairs(self):
+        self.values, self._vectors = scipy.linalg.eigh(self.matrix)
+        if len(self.values) and self.values[0] <= -1:  # eigenvalues are at most as large as Ritz values
+            raise ValueError(NEGATIVE.format(self.values[0]))
+        squares = np.zeros(len(self.values))
+        for place, components in self._open:
+            squares += np.sum((components.T @ self._vectors[place]) ** 2, axis=0)
+        self.residuals = np.sqrt(squares / (1 + self.values))
+
+    def _projected(self, rows, blocks=None):
+        """Return rows without their components in the space; they are orthogonalized twice because of rounding."""
+        for _ in range(2):
+            for block in self._blocks if blocks is None else blocks:
+                rows = rows - (rows @ block.images.T) @ block.rows
+        return rows
+
+    def _orthonormalized(self, rows):
+        """Return an orthonormal Block for rows outside of the space, and the components of the rows in it.
+
+        Directions shorter than a fraction of the tolerance are dropped. A Gram matrix resolves directions that are
+        shorter than the longest one by up to six digits. If there are others, they are found in the remainder.
+        """
+        dropped = max(0.01 * SHARE_OF_RESIDUALS * self._tolerance, self._rounding)
+        found: list[Block] = []
+        components = np.zeros((len(rows), 0))
+        has_more = True
+        while has_more:
+            basis, coefficients, has_more = self._by_gram_matrix(rows, dropped)
+            if not basis.dimension:
+                break
+            rows = rows - coefficients @ basis.rows
+            # Small directions have components in the space because of rounding: remove them and normalize again.
+            basis, change, _ = self._by_gram_matrix(self._projected(self._projected(basis.rows), found), 0.5)
+            found.append(basis)
+            components = np.concatenate([components, coefficients @ change], axis=1)
+        if not found:
+            return Block(rows[:0], rows[:0]), components
+        return Block(*map(np.concatenate, zip(*found, strict=True))), components
+
+    def _by_gram_matrix(self, rows, dropped):
+        """Return a Block for the longest directions, the components, and whether there are shorter directions."""
+        images = self._prior.apply(rows)
+        squares, vectors = scipy.linalg.eigh(_symmetric(rows @ images.T))
+        resolved = ROUNDING * np.max(squares, initial=0.0)
+        kept = squares > max(dropped**2, resolved)
+        lengths = np.sqrt(squares[kept])
+        vectors = vectors[:, kept]
+        weights = (vectors / lengths).T
+        return Block(weights @ rows, weights @ images), vectors * lengths, resolved > dropped**2 and not np.all(kept)
+
+    def result(self, rank: int, is_complete: bool) -> MisfitEigenpairs:
+        """Return the eigenpairs that have converged, at most `rank`.
+
+        Parameters
+        ----------
+        rank : int
+        is_complete : bool
+            Whether all eigenpairs above the threshold are in the space and have converged.
+        """
+        magnitudes = np.abs(self.values)
+        is_whole = self.dimension == self._prior.size
+        wanted = 2 * self.residuals <= max(self._tolerance, self._rounding)
+        if not is_whole:
+            wanted &= magnitudes > self.threshold
+        kept = np.flatnonzero(wanted)
+        kept = kept[np.argsort(-magnitudes[kept], kind="stable")][:rank]
+        others = np.ones(len(self.values), bool)
+        others[kept] = False
+        if is_whole:
+            neglected = np.max(magnitudes[others], initial=0.0)
+        elif is_complete:
+            neglected = self.threshold
+        else:
+            neglected = max(self.threshold, np.max((magnitudes + self.residuals)[others], initial=0.0))
+        vectors = np.zeros((len(kept), self._prior.size))
+        duals = np.zeros_like(vectors)
+        start = 0
+        for block in self._blocks:
+            weights = self._vectors[start : start + block.dimension, kept].T
+            duals += weights @ block.rows
+            vectors += weights @ block.images
+            start += block.dimension
+        return MisfitEigenpairs(
+            self.values[kept],
+            vectors,
+            duals,
+            float(neglected),
+            2 * float(np.linalg.norm(self.residuals[kept])),
+            self.products,
+            "products with the Hessian",
+            bool(neglected <= self._tolerance),
+            is_complete,
+        )
+
+
+def _symmetric(matrix):
+    return 0.5 * (matrix + matrix.T)
+
+
+def _checked_asymmetry(matrix, scale=None):
+    """Return the norm of the difference of a matrix from its transpose.
+
+    Raises
+    ------
+    DerivativeError
+        If it is large relative to the matrix, or to the given scale.
+    """
+    difference = float(np.linalg.norm(matrix - matrix.T))
+    if scale is None:
+        scale = float(np.max(np.abs(matrix), initial=0.0))
+    if difference > ASYMMETRY * scale:
+        raise DerivativeError(NOT_SYMMETRIC.format(difference / scale))
+    return difference

@@ -1,0 +1,350 @@
+"""Posterior: the normal distribution that `laplace` returns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sparsedp._utils.base_classes import Frozen
+from sparsedp._utils.html import facts
+from sparsedp._utils.validation import check_finite, check_function, check_whole
+from sparsedp.autodiff.derivative import pullback
+from sparsedp.errors import DerivativeError
+from sparsedp.grid.space import Space
+from sparsedp.operators.given import from_functions
+from sparsedp.operators.operator import Operator
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from sparsedp.autodiff.flattening import Packing
+    from sparsedp.optimize.misfit_eigenpairs import MisfitEigenpairs
+    from sparsedp.optimize.prior_covariance import PriorCovariance
+
+__all__ = ["Posterior"]
+
+SHOWN = 8  # eigenvalues in the table
+
+
+class Posterior(Frozen):
+    """The posterior of `laplace`: a normal distribution with mean x. Immutable.
+
+    Attributes
+    ----------
+    x : tree
+        The mean.
+    eigenvalues : (k,) array
+        The eigenvalues lambda of the Hessian of the misfit in the metric of the prior, in descending order. Data reduce
+        the variance along an eigenvector by the factor 1 / (1 + lambda).
+    neglected : float
+        Estimate of the largest neglected eigenvalue. Variances are too large by at most the factor 1 + neglected.
+    error : float
+        Bound on the relative error of all variances, if the prior variances are exact: `neglected`, and the residuals
+        of the eigenpairs.
+    information_gain : float
+        Kullback-Leibler divergence of the posterior from the prior [nat], for the data at hand and with g the gradient
+        of the misfit at the mode x: (sum of log(1 + lambda) - lambda / (1 + lambda), plus g^T C g) / 2. Here g^T C g is
+        the squared distance of x from the prior mean in the metric C^-1.
+    expected_information_gain : float
+        Its mean over data, if the function is linear: sum of log(1 + lambda) / 2.
+    shift : float
+        The distance from x to the mode of the quadratic model of the posterior, in posterior standard deviations: the
+        largest along an eigenvector, or the root mean square of a leaf in the directions that the data do not reduce.
+    step : tree
+        The step from x to this mode (a Newton step). For a linear function, x + step is the mode.
+    mean_square : float or None
+        The mean square of the residuals. It is about 1 if they were divided by the standard deviation of the noise;
+        None for a loss.
+    products : int
+        Number of products with the Hessian, or with the Jacobian if it was computed.
+    seconds : float
+    covariance : Operator
+        The covariance (H + C^-1)^-1 as an Operator for the array x, or for the flattened x of a tree.
+    """
+
+    x: Any
+    eigenvalues: NDArray[np.float64]
+    neglected: float
+    error: float
+    information_gain: float
+    expected_information_gain: float
+    shift: float
+    step: Any
+    mean_square: float | None
+    products: int
+    seconds: float
+    _pairs: MisfitEigenpairs
+    _prior: PriorCovariance
+    _packing: Packing
+    attribute_suggestions = {
+        "mean": "posterior.x",
+        "cov": "posterior.covariance, an Operator",
+        "std": "posterior.std_of(lambda x: x), or np.sqrt(posterior.variance())",
+        "samples": "posterior.sample(count, seed)",
+    }
+
+    def __init__(
+        self,
+        x: Any,
+        pairs: MisfitEigenpairs,
+        prior: PriorCovariance,
+        packing: Packing,
+        gradient: NDArray,
+        offset: NDArray,
+        tolerance: float,
+        mean_square: float | None,
+        seconds: float,
+    ) -> None:
+        values = pairs.values
+        preconditioned = prior.apply(gradient[None])[0]
+        divergence = np.log1p(values) - values / (1 + values)
+        step, shift = _newton_step(offset + preconditioned, pairs, prior)
+        super().__init__(
+            x=x,
+            eigenvalues=values,
+            neglected=pairs.neglected,
+            error=pairs.neglected + pairs.residual,
+            information_gain=0.5 * float(np.sum(divergence) + max(gradient @ preconditioned, 0.0)),
+            expected_information_gain=0.5 * float(np.sum(np.log1p(values))),
+            shift=shift,
+            step=_tree(packing, step),
+            mean_square=mean_square,
+            products=pairs.products,
+            seconds=seconds,
+            _tolerance=tolerance,
+            _pairs=pairs,
+            _prior=prior,
+            _packing=packing,
+        )
+
+    @cached_property
+    def covariance(self) -> Operator:
+        """The covariance as an Operator."""
+        values = self._packing.values
+        space = Space(values[0].shape if len(values) == 1 else self._packing.size)
+        block = self._prior.blocks[0]
+        if len(values) == 1 and isinstance(block.covariance, Operator) and block.covariance.domain.shape == space.shape:
+            space = block.covariance.domain
+        apply = partial(_covariance_of_field, self._pairs, self._prior)
+        return from_functions(apply, apply, space, space, name="posterior covariance")
+
+    def variance(self, probes: int = 64) -> Any:
+        """Return the variance of each entry of x, a tree like x with None in place of constants.
+
+        Parameters
+        ----------
+        probes : int
+            Number of random vectors with which prior variances are estimated where they are not known exactly.
+
+        Notes
+        -----
+        Prior variances are exact for numbers, diagonals, sparse matrices, functions of separable operators, and up to
+        1024 unknowns. Otherwise the diagonal of C - sum of v v^T is estimated by the XDiag method, with 2 `probes`
+        products with C. See `variance_error`.
+
+        References
+        ----------
+        E. N. Epperly, J. A. Tropp, R. J. Webber, XTrace: making the most of every sample in stochastic trace
+        estimation, SIAM J. Matrix Anal. Appl. 45, 2024.
+        """
+        probes = check_whole("probes of variance", probes, 2, "; the default is 64")
+        return _tree(self._packing, self._variances(probes)[0])
+
+    def variance_error(self, probes: int = 64) -> Any:
+        """Return the standard error of each entry of ``variance(probes)``, a tree like it; 0 for exact entries."""
+        probes = check_whole("probes of variance_error", probes, 2, "; the default is 64")
+        return _tree(self._packing, self._variances(probes)[1])
+
+    def _variances(self, probes):
+        """Return the variances and their standard errors as flat vectors."""
+        if probes not in self._known_variances:
+            self._known_variances[probes] = self._computed_variances(probes)
+        return self._known_variances[probes]
+
+    @cached_property
+    def _known_variances(self):
+        return {}
+
+    def _computed_variances(self, probes):
+        vectors = self._pairs.vectors
+        informed = np.sum(vectors**2 / (1 + self.eigenvalues)[:, None], axis=0)
+        # The variance that the data do not reduce, C - sum of v v^T, is 0 if there is an eigenpair for each unknown.
+        others = np.zeros(self._prior.size)
+        errors = np.zeros(self._prior.size)
+        if len(vectors) < self._prior.size:
+            for block in self._prior.blocks:
+                part = block.part
+                if block.diagonal is not None:
+                    others[part] = block.diagonal - np.sum(vectors[:, part] ** 2, axis=0)
+                elif block.size:
+                    others[part], errors[part] = _estimated_diagonal(block, vectors[:, part], probes)
+        return informed + np.maximum(others, 0.0), errors
+
+    def std_of(self, quantity: Callable[[Any], Any]) -> Any:
+        """Return the standard deviation of a quantity that is computed from x.
+
+        Parameters
+        ----------
+        quantity : callable
+            ``quantity(x)`` returns a real number or an array, differentiable. It is replaced by its linearization at x.
+
+        Returns
+        -------
+        float or array
+            In the shape of the quantity. An array takes one VJP and one product with C for each entry.
+        """
+        check_function("std_of", quantity, "lambda x: np.mean(x)")
+        value, pull = pullback(quantity, self._packing.unpack(self._packing.pack(self.x)))
+        if np.iscomplexobj(value):
+            raise DerivativeError("std_of takes a real quantity, got a complex one; take its real part")
+        check_finite("the quantity of std_of", value)
+        variances = np.zeros(np.size(value))
+        for number in range(variances.size):
+            cotangent = np.zeros(variances.size, np.asarray(value).dtype)
+            cotangent[number] = 1
+            gradient = self._packing.pack_gradient(pull(cotangent.reshape(np.shape(value))))
+            variances[number] = self._variance_along(gradient)
+        deviations = np.sqrt(variances).reshape(np.shape(value))
+        return float(deviations) if deviations.ndim == 0 else deviations
+
+    def _variance_along(self, gradient):
+        """Return g^T (H + C^-1)^-1 g."""
+        components = self._pairs.vectors @ gradient
+        informed = np.sum(components**2 / (1 + self.eigenvalues))
+        if len(components) == self._prior.size:
+            return informed
+        others = gradient @ self._prior.apply(gradient[None])[0] - np.sum(components**2)
+        return informed + max(others, 0.0)
+
+    def sample(self, count: int, seed: int = 0) -> list:
+        """Return samples of the posterior.
+
+        Parameters
+        ----------
+        count : int
+        seed : int
+            The same seed gives the same samples.
+
+        Returns
+        -------
+        list of trees like x
+
+        Raises
+        ------
+        ConvergenceError
+            If the square root of the prior is computed by a Lanczos iteration that does not converge. Then give
+            `prior_root`.
+        """
+        count = check_whole("count of sample", count, 0)
+        seed = check_whole("seed of sample", seed, 0, "; the default is 0")
+        rows = self._prior.samples(np.random.default_rng(seed), count)
+        components = rows @ self._pairs.duals.T
+        vectors = self._pairs.vectors
+        if len(vectors) == self._prior.size:
+            deviations = (components / np.sqrt(1 + self.eigenvalues)) @ vectors
+        else:
+            deviations = rows - (components * _reduction(self.eigenvalues)) @ vectors
+        mean = self._packing.pack(self.x)
+        return [self._packing.unpack(mean + deviation) for deviation in deviations]
+
+    def __str__(self):
+        lines = [f"{name + ':':42}{text}" for name, text in self._facts().items()]
+        return "\n".join(["posterior of laplace", *lines])
+
+    __repr__ = __str__
+
+    def _repr_html_(self):
+        """Return HTML for notebooks."""
+        return facts("posterior of laplace", self._facts())
+
+    def _facts(self):
+        values = self.eigenvalues
+        shown = ", ".join(f"{value:.3g}" for value in values[:SHOWN])
+        if len(values) > SHOWN:
+            shown += f", ..., {values[-1]:.3g}"
+        entries = {
+            "unknowns": str(self._prior.size),
+            "eigenvalues": f"{len(values)}: {shown}" if len(values) else "0",
+            "largest neglected eigenvalue, about": f"{self.neglected:.2g}",
+            "variances are too large by at most": f"{100 * self.error:.2g} %",
+            "information gain": f"{self.information_gain:.4g} nat",
+            "expected information gain": f"{self.expected_information_gain:.4g} nat",
+            "distance of x from the mode": f"{self.shift:.1e} standard deviations",
+        }
+        if self.mean_square is not None:
+            entries["mean square of the residuals"] = f"{self.mean_square:.3g} (about 1 is expected)"
+        entries["prior variances"] = "exact"
+        if any(block.diagonal is None for block in self._prior.blocks):
+            entries["prior variances"] = "estimated, see variance_error()"
+        entries[self._pairs.kind] = str(self.products)
+        entries["seconds"] = f"{self.seconds:.2f}"
+        return entries
+
+
+def _reduction(values):
+    """Return 1 - (1 + lambda)^(-1/2), without cancellation for small lambda."""
+    return -np.expm1(-0.5 * np.log1p(values))
+
+
+def _covariance_of_field(pairs, prior, field):
+    """Return the posterior covariance times a field."""
+    vector = np.asarray(field, float).reshape(1, -1)
+    components = vector @ pairs.vectors.T
+    if len(pairs.values) == prior.size:
+        product = (components / (1 + pairs.values)) @ pairs.vectors
+    else:
+        product = prior.apply(vector) - (components * pairs.values / (1 + pairs.values)) @ pairs.vectors
+    return product.reshape(np.shape(field))
+
+
+def _newton_step(residual, pairs, prior):
+    """Return the step to the mode of the quadratic model, and its length in posterior standard deviations.
+
+    Parameters
+    ----------
+    residual : (n,) array
+        C times the gradient of the negative logarithm of the posterior, x - mean + C g.
+    pairs : MisfitEigenpairs
+    prior : PriorCovariance
+    """
+    components = pairs.duals @ residual
+    lengths = np.abs(components) / np.sqrt(1 + pairs.values)
+    shift = np.max(lengths, initial=0.0)
+    others = residual - components @ pairs.vectors
+    if len(components) == prior.size:
+        others = np.zeros_like(residual)
+    step = -others - (components / (1 + pairs.values)) @ pairs.vectors
+    for block, trace in zip(prior.blocks, prior.traces(), strict=True):
+        remaining = trace - np.sum(pairs.vectors[:, block.part] ** 2)
+        if remaining > 1e-6 * trace:
+            shift = max(shift, np.linalg.norm(others[block.part]) / np.sqrt(remaining))
+    return step, float(shift)
+
+
+def _estimated_diagonal(block, vectors, probes):
+    """Return an estimate of the diagonal of C - sum of v v^T, and its standard errors, by the XDiag method.
+
+    Each random vector is tested with a low-rank approximation that was computed from the other vectors.
+    """
+    signs = np.random.default_rng(3).choice([-1.0, 1.0], (min(probes, block.size), block.size))
+
+    def product(rows):
+        return block.apply(rows) - (rows @ vectors.T) @ vectors
+
+    q, r = np.linalg.qr(product(signs).T)
+    images = product(np.ascontiguousarray(q.T)).T
+    inverse = np.linalg.pinv(r).T
+    directions = inverse / np.linalg.norm(inverse, axis=0)
+    left_out = q @ directions
+    corrections = signs.T * left_out * np.sum(directions * r, axis=0) - left_out * (images @ directions)
+    diagonal = np.sum(q * images, axis=1) + np.mean(corrections, axis=1)
+    return diagonal, np.std(corrections, axis=1, ddof=1) / np.sqrt(corrections.shape[1])
+
+
+def _tree(packing, vector):
+    """Return a flat vector as a tree of float64 arrays like x, with None in place of constants."""
+    arrays = [part.reshape(value.shape) for part, value in zip(packing.split(vector), packing.values)]
+    return packing.build([array if array.ndim else float(array) for array in arrays], [None] * len(packing.statics))
