@@ -98,8 +98,8 @@ WRONG = [
     (
         on(of_matrix(ROTATED)),
         ValueError,
-        "the prior is not symmetric (relative difference 2.0e-01); for a power of an operator on a stretched grid write "
-        "C @ dp.diagonal(grid.cells, 1 / grid.volumes)",
+        "the prior is not symmetric (relative difference 2.0e-01); for a power of an operator on a stretched grid "
+        "write C @ dp.diagonal(grid.cells, 1 / grid.volumes)",
     ),
     (
         on(of_matrix(np.diag([1.0, 2.0, -0.5]))),
