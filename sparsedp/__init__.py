@@ -44,6 +44,7 @@ _PUBLIC_NAMES = {
     "integrators.leapfrog": "sponge",
     "trajectory.rollout": "rollout",
     "optimize.update_direction": "update_direction",
+    "optimize.constraints": "equal",
     "optimize.minimize": "minimize",
     "optimize.laplace": "laplace",
     "optimize.physical_gradient": "physical_gradient",

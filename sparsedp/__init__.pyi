@@ -58,6 +58,7 @@ from .operators.transfer import component as component
 from .operators.transfer import prolong as prolong
 from .operators.transfer import restrict as restrict
 from .operators.transfer import sample as sample
+from .optimize.constraints import equal as equal
 from .optimize.laplace import laplace as laplace
 from .optimize.minimize import minimize as minimize
 from .optimize.physical_gradient import physical_gradient as physical_gradient

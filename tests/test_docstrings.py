@@ -185,7 +185,7 @@ def test_options_of_minimize_are_those_of_its_table():
 @pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
 def test_methods_of_minimize_document_their_options(method):
     doc = inspect.getdoc(method)
-    parameters = doc[doc.index("Parameters\n---") : doc.index("Notes\n---")]
+    parameters = doc.partition("Parameters\n---")[2].partition("Notes\n---")[0]
     for field in dataclasses.fields(method):
         assert re.search(rf"(?m)^(\w+, )*{field.name}\b", parameters), field.name
     assert "References\n---" in doc

@@ -376,6 +376,7 @@ RANGES = {
     "": lambda value: True,
     "> 0": lambda value: value > 0,
     ">= 0": lambda value: value >= 0,
+    "> 1": lambda value: value > 1,
     "between 0 and 1": lambda value: 0 < value < 1,
     "from 0 to 1": lambda value: 0 <= value <= 1,
     "from 0 to below 1": lambda value: 0 <= value < 1,

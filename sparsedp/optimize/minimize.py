@@ -15,18 +15,24 @@ from sparsedp._utils.validation import check_choice, check_function, check_numbe
 from sparsedp.autodiff.backend import backend_of, collectively
 from sparsedp.autodiff.flattening import Packing
 from sparsedp.optimize.admm import ADMM
+from sparsedp.optimize.augmented_lagrangian import AugmentedLagrangian
 from sparsedp.optimize.batches import Batches
 from sparsedp.optimize.box import Box, pair_of_bounds
 from sparsedp.optimize.checkpoint import Checkpoint
+from sparsedp.optimize.constrained_run import ConstrainedMethod, minimize_constrained
 from sparsedp.optimize.first_order import Adam, GradientDescent
+from sparsedp.optimize.ipopt import Ipopt
 from sparsedp.optimize.lbfgs import LBFGS
 from sparsedp.optimize.least_squares import GaussNewton, HalfInverse, LevenbergMarquardt
+from sparsedp.optimize.mma import MMA
 from sparsedp.optimize.monitor import Monitor
 from sparsedp.optimize.newton_cg import NewtonCG
 from sparsedp.optimize.objective import Objective
 from sparsedp.optimize.physical_gradient import PhysicalGradient
 from sparsedp.optimize.projection import Projection
 from sparsedp.optimize.result import NO_RESIDUALS, Minimum, NoStepFound, Record
+from sparsedp.optimize.slsqp import SLSQP
+from sparsedp.optimize.trust_constr import TrustConstr
 
 if TYPE_CHECKING:
     import os
@@ -36,7 +42,7 @@ if TYPE_CHECKING:
 __all__ = ["METHODS", "minimize"]
 
 INTERRUPTED = "minimize was interrupted; call it again, with start=best.x"
-METHODS: dict[str, type[Method] | type[ADMM]] = {
+METHODS: dict[str, type[Method] | type[ADMM] | type[ConstrainedMethod]] = {
     method.name: method
     for method in (
         LBFGS,
@@ -48,8 +54,14 @@ METHODS: dict[str, type[Method] | type[ADMM]] = {
         HalfInverse,
         PhysicalGradient,
         ADMM,
+        AugmentedLagrangian,
+        MMA,
+        SLSQP,
+        TrustConstr,
+        Ipopt,
     )
 }
+CONSTRAINED = [name for name, method in METHODS.items() if issubclass(method, ConstrainedMethod)]
 
 
 def minimize(
@@ -65,6 +77,7 @@ def minimize(
     project: Callable[[Any], Any] | None = None,
     batches: Sequence[Any] | Callable[[int], Any] | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
+    constraints: Any = None,
     **options: Any,
 ) -> Minimum:
     """Minimize a loss whose argument is an array or a nested structure (pytree) of arrays.
@@ -82,7 +95,9 @@ def minimize(
     method : str
         "lbfgs", "gd", "adam", "newton_cg", "gauss_newton", "levenberg_marquardt", "half_inverse",
         "physical_gradient", or "admm". The method "admm" adds weight |K x|_1 to the loss; use it for results that are
-        sparse or piecewise constant.
+        sparse or piecewise constant. Methods for `constraints`: "augmented_lagrangian" (many unknowns), "mma" (many
+        unknowns and few inequalities; requires the extra `design`), "slsqp" and "trust_constr" (up to about 1000
+        unknowns), "ipopt" (requires cyipopt).
     maxiter : int
         Maximum number of iterations. With 0 the loss is evaluated at the start, and the start is returned.
     tolerance : float or callable
@@ -117,6 +132,11 @@ def minimize(
         Folder in which the last two states of the run are stored. If the run was killed, interrupted, or stopped by
         its callback or by maxiter, the same call continues from the last stored state and gives bitwise the same
         result as a run without interruption. A new problem needs a new folder.
+    constraints : callable, or a list, tuple or dict of callables, optional
+        Each function ``g(x)`` returns a number or an array that is <= 0 at a feasible point; `equal` of a function
+        stands for g(x) == 0. A NonlinearConstraint or LinearConstraint of SciPy is used with its limits lb and ub; its
+        function takes the flat vector of unknowns, and its `jac` is used if it is a function. The start may violate the
+        constraints. If the sign of a function is wrong, the opposite set is feasible.
     **options
         Options of the method, listed in the table below. Any other option raises TypeError.
 
@@ -166,6 +186,28 @@ def minimize(
         sum of (K x - target)^2; bounds cannot be used with it. With prox the reported values contain the loss only.
         For admm a tolerance of about 1e-4 is usual.
 
+        The options of the methods for constraints:
+
+        ====================  ===================  =======  ==========================================================
+        method                option               default  meaning
+        ====================  ===================  =======  ==========================================================
+        augmented_lagrangian  penalty              10.0     initial penalty parameter, in units of loss / constraint^2
+        augmented_lagrangian  growth               10.0     its factor if the violation has not fallen enough
+        augmented_lagrangian  inner                50       maximum number of steps between updates of the multipliers
+        augmented_lagrangian  memory, line_search  same     as for lbfgs
+        mma                   model                "mma"    "mma" (NLopt's LD_MMA), or "quadratic" (LD_CCSAQ)
+        trust_constr          radius               1.0      initial trust radius, in units of x
+        trust_constr          barrier              0.1      initial barrier parameter of inequalities and bounds
+        ipopt                 settings             None     dict of options of Ipopt
+        ====================  ===================  =======  ==========================================================
+
+        With constraints, the run has converged when both the feasibility and the optimality of `Minimum` are at most
+        `tolerance`. With a function as tolerance, the feasibility must be at most 1e-6 as well. The methods work with
+        scaled numbers: each leaf of x is divided by the root mean square of its entries at the start (by the largest
+        finite bound if they are 0), the loss by the norm of its gradient with respect to the scaled x, and the values
+        of each constraint function by one unit (see `Minimum`). Put constraints of different size into different
+        functions. The units are powers of two. For mma a tolerance of about 1e-6 is usual.
+
     Returns
     -------
     Minimum
@@ -173,7 +215,11 @@ def minimize(
         `message`, `converged` and `evaluations`. For least-squares problems, `covariance` is s^2 (J^T J)^(-1) with
         s^2 = |r|^2 / (m - n), or (J^T J)^(-1) with absolute_sigma=True. str() of the result is a table of the history.
         Ctrl-C ends the run; the best point so far is returned, with the message "interrupted". A second Ctrl-C raises
-        KeyboardInterrupt at once.
+        KeyboardInterrupt at once. With constraints, `multipliers`, `constraint_values`, `feasibility` and `optimality`
+        belong to x. The best point is then the one that met the tolerance; without such a point, among the points with
+        a feasibility of at most 1e-6 the one with the lowest loss, and if there is none, the one with the smallest
+        violation. If there is none, the sum of the squares of the violations is minimized from there; if a point that
+        violates the constraints is a minimum of this sum, it is returned, and the message begins with "infeasible".
 
     Raises
     ------
@@ -183,8 +229,9 @@ def minimize(
     DerivativeError
         If the result of `gradient` has another tree structure than start.
     ValueError
-        If the method is unknown; if maxiter, tolerance, bounds or an option is out of range; or if the checkpoint
-        folder contains a run with another method, options, bounds, start (constant leaves included), loss or batches.
+        If the method is unknown, or takes no constraints or no equalities; if maxiter, tolerance, bounds or an option
+        is out of range; or if the checkpoint folder contains a run with another method, options, bounds, start
+        (constant leaves included), loss or batches.
     KeyboardInterrupt
         If Ctrl-C is pressed before the loss has been evaluated at the start, or a second time.
     TypeError
@@ -194,12 +241,12 @@ def minimize(
         an infinite loss: the method tries a point closer to the current one, and the record of the iteration lists the
         rejected point.
     ImportError
-        If `progress` is given and tqdm is not installed.
+        If `progress` is given and tqdm is not installed, or if the library of the method is not installed.
 
     See Also
     --------
-    value_and_grad, update_direction, physical_gradient, smoothness, total_variation, certified, convergence, flatten,
-    ensemble, laplace
+    equal, value_and_grad, update_direction, physical_gradient, smoothness, total_variation, certified, convergence,
+    flatten, ensemble, laplace
 
     Notes
     -----
@@ -228,11 +275,17 @@ def minimize(
         "project": project,
         "batches": batches,
         "checkpoint": checkpoint,
+        "constraints": constraints,
     }
     implementation = backend_of(leaves(start)).implementation(minimize)
     if implementation is not minimize:
         other_arguments = {**options, **other_arguments}
         return implementation(loss, start, method, maxiter, tolerance, callback, bounds, other_arguments)
+    if isinstance(chosen, ConstrainedMethod):
+        arguments = loss, start, chosen, maxiter, tolerance, callback, bounds
+        return minimize_constrained(*arguments, other_arguments)
+    if constraints is not None:
+        raise ValueError(f"{method} takes no constraints; write method= one of {', '.join(CONSTRAINED)}")
     if isinstance(chosen, ADMM):
         _check_unused("admm", {**other_arguments, "tolerance": callable(tolerance)})
         return chosen.minimize(loss, start, maxiter, tolerance, callback, bounds, minimize)

@@ -63,7 +63,8 @@ class Record(NamedTuple):
         The loss. It is infinite if it overflows, and 0 if it underflows.
     gradient_norm : float
         Euclidean norm of the gradient, or, with bounds, of the projected gradient: its entries are 0 where a bound
-        prevents a step along the negative gradient. Infinite on overflow, 0 on underflow.
+        prevents a step along the negative gradient. With constraints, the same norm of the gradient of the Lagrangian.
+        Infinite on overflow, 0 on underflow.
     seconds : float
         Time since the start of the run.
     evaluations : int
@@ -72,6 +73,10 @@ class Record(NamedTuple):
         The trial points of this iteration at which the loss raised an error or was not finite, as (error, message).
     solves : int
         Number of linear solves, forward and adjoint, in this thread since the start of the run.
+    feasibility : float
+        With constraints: the largest violation, in the units of the constraints (see `Minimum`).
+    optimality : float, optional
+        With constraints: the relative residual of the optimality conditions (see `Minimum`).
     """
 
     iteration: int
@@ -81,10 +86,14 @@ class Record(NamedTuple):
     evaluations: int
     failed: tuple[Failure, ...] = ()
     solves: int = 0
+    feasibility: float = 0.0
+    optimality: float | None = None
 
     def summary(self) -> str:
         """Return a short text for a progress bar."""
         words = f"loss {self.value:.6g}, gradient {self.gradient_norm:.1e}"
+        if self.optimality is not None:
+            words = f"loss {self.value:.6g}, feasibility {self.feasibility:.1e}, optimality {self.optimality:.1e}"
         if self.failed:
             words += f", {len(self.failed)} refused"
         return words
@@ -110,6 +119,18 @@ class Minimum(Frozen):
         Number of evaluations of the loss and its gradient, including those that failed.
     resumed : str
         A sentence that says whether the run continued from the checkpoint folder; empty if there is no such folder.
+    multipliers : tree
+        With constraints: the Lagrange multipliers, in the structure of the argument `constraints`; None for methods
+        without constraints. See the notes.
+    constraint_values : tree
+        The values of the constraint functions at x, in the same structure.
+    feasibility : float
+        The largest violation of a constraint, divided by the unit of its function; 0 for methods without constraints.
+        The unit is the larger of two numbers at the start: the largest absolute value of the constraint, and the change
+        of the constraint if each unknown changes by its own size. It is rounded up to a power of two.
+    optimality : float
+        The residual of the optimality conditions (Karush-Kuhn-Tucker), relative to the larger of the norms of the
+        gradient of the loss at the start and at x; None for methods without constraints. See the notes.
     covariance : (n, n) array
         Covariance of the n unknowns of a least-squares problem, in the order of the leaves of x. With the m residuals
         r and their Jacobian J at x it is
@@ -121,6 +142,18 @@ class Minimum(Frozen):
         entries are infinite if the rank of J is less than n. Access raises ValueError, with the reason in its message,
         if the covariance is not available: for methods other than least squares, with batches, if J is not formed, if
         n > 4000, or if m <= n without absolute_sigma.
+
+    Notes
+    -----
+    The multipliers belong to the Lagrangian L = loss + sum(multiplier * constraint). They are >= 0 for constraints that
+    are <= 0, and 0 for those that are not active; for equalities they have any sign. If a limit is relaxed, from
+    constraint <= 0 to constraint <= b, the smallest loss changes by -multiplier * b to first order. The multiplier of a
+    NonlinearConstraint with lower and upper limits has the shape of its value: it is > 0 where the upper limit is
+    active, and < 0 where the lower limit is active.
+
+    The optimality conditions are grad L = 0, except for entries of x at a bound that the negative gradient would move
+    out, and multiplier * constraint = 0 for inequalities. Their residuals are measured after each leaf of x was divided
+    by its size at the start, and the loss and the constraints by their units.
     """
 
     x: Any
@@ -131,6 +164,10 @@ class Minimum(Frozen):
     converged: bool
     evaluations: int
     resumed: str = ""
+    multipliers: Any = None
+    constraint_values: Any = None
+    feasibility: float = 0.0
+    optimality: float | None = None
     _covariance: Any = NO_RESIDUALS  # the array, or a sentence that says why it is not available
     attribute_suggestions = {
         "fun": "best.value",

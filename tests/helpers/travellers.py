@@ -294,6 +294,7 @@ def travellers():
     yield "jit", "", dp.jit(loss), lambda f: [f(numbers((5, 4))).tobytes()]
     yield "grad", "", dp.grad(loss), lambda f: [f(numbers(7)).tobytes()]
     yield "differentiable", "", dp.differentiable("cube", cube, cube_vjp, cube_jvp), lambda f: bits(f, numbers(7))
+    yield "equal", "", dp.equal(cube), lambda f: bits(f, numbers(7))
     yield "physical_gradient", "", dp.physical_gradient(cube, root_of_cube), of_physical
     yield "from_blackbox", "", dp.from_blackbox(foreign), of_adopted
     yield "ensemble", "", dp.ensemble(misfit_of, [1.0, 2.0], weights=[1, 3], chunk=2), of_total

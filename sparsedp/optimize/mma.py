@@ -1,0 +1,114 @@
+"""The method of moving asymptotes, by NLopt. Only this module imports nlopt (extra `design`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from sparsedp._utils.validation import check_choice
+from sparsedp.optimize.constrained_run import ConstrainedMethod
+
+if TYPE_CHECKING:
+    from sparsedp.optimize.constrained_run import ConstrainedProblem, ConstrainedRun
+
+__all__ = ["MMA"]
+
+LEAST_STEP = 1e-15  # NLopt stops when a step changes no unknown by more than this fraction
+
+
+@dataclass
+class MMA(ConstrainedMethod):
+    """The method of moving asymptotes (MMA), globally convergent, by NLopt.
+
+    Parameters
+    ----------
+    model : "mma" or "quadratic"
+        The separable convex approximation of the functions: with moving asymptotes (NLopt's LD_MMA), or quadratic
+        (LD_CCSAQ).
+
+    Notes
+    -----
+    In each iteration the loss and the constraints are replaced by convex functions that are sums of functions of one
+    unknown, and the dual of this problem, which has one unknown for each constraint, is solved. The method suits many
+    unknowns with bounds and few constraints. It takes inequalities only.
+
+    An iteration is an evaluation at a new point, also if the method rejects this point. The multipliers are a
+    least-squares estimate from the gradients, because NLopt does not return those of the dual problem.
+
+    References
+    ----------
+    K. Svanberg, A class of globally convergent optimization methods based on conservative convex separable
+    approximations, SIAM J. Optim. 12, 2002; S. G. Johnson, The NLopt nonlinear-optimization package.
+    """
+
+    name: ClassVar[str] = "mma"
+    takes_equalities: ClassVar[bool] = False
+    model: str = "mma"
+
+    def __post_init__(self) -> None:
+        check_choice("model of mma", self.model, ("mma", "quadratic"))
+
+    def check_available(self) -> None:
+        """Raise ImportError if NLopt is not installed."""
+        _nlopt()
+
+    def run(self, problem: ConstrainedProblem, run: ConstrainedRun) -> str:
+        """Iterate until NLopt ends; see `ConstrainedMethod`."""
+        nlopt = _nlopt()
+        algorithm = nlopt.LD_MMA if self.model == "mma" else nlopt.LD_CCSAQ
+        size = problem.start.z.size
+        optimizer = nlopt.opt(algorithm, size)
+        optimizer.set_lower_bounds(np.broadcast_to(problem.box.lower, (size,)))
+        optimizer.set_upper_bounds(np.broadcast_to(problem.box.upper, (size,)))
+        optimizer.set_xtol_rel(LEAST_STEP)
+        errors: list[BaseException] = []
+
+        def stopping(function: Any) -> Any:
+            """Return the function with exceptions stored, because NLopt does not pass them on reliably."""
+
+            def guarded(*arguments):
+                try:
+                    return function(*arguments)
+                except BaseException as error:
+                    errors.append(error)
+                    raise nlopt.ForcedStop from None
+
+            return guarded
+
+        def loss(z, gradient):
+            functions = problem.functions(z)
+            if functions.usable is not run.last:
+                run.record(functions.usable)
+            if gradient.size:
+                gradient[:] = functions.gradient
+            return functions.value
+
+        def rows(result, z, jacobian):
+            functions = problem.functions(z)
+            result[:] = functions.rows
+            if jacobian.size:
+                jacobian[:] = functions.jacobian
+
+        optimizer.set_min_objective(stopping(loss))
+        if problem.start.rows.size:
+            optimizer.add_inequality_mconstraint(stopping(rows), np.zeros(problem.start.rows.size))
+        try:
+            optimizer.optimize(problem.start.z)
+        except Exception as error:
+            if errors:
+                raise errors[0] from None
+            return f"NLopt stopped ({error})"
+        if errors:
+            raise errors[0]
+        return "NLopt found no step that changes x"
+
+
+def _nlopt():
+    """Import nlopt; raise ImportError that names the extra."""
+    try:
+        import nlopt
+    except ImportError as error:
+        raise ImportError("the method mma needs nlopt; install sparsedp[design]") from error
+    return nlopt
