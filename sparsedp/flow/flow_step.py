@@ -59,7 +59,7 @@ from sparsedp.flow.projection_setup import mask_of_faces
 from sparsedp.flow.scalars import Scalar
 from sparsedp.flow.settings import FlowSettings
 from sparsedp.grid.boundary_conditions import inflow as inflow_side
-from sparsedp.grid.boundary_conditions import no_slip
+from sparsedp.grid.boundary_conditions import no_slip, occurring
 from sparsedp.grid.grid import check_grid
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.operators.masks_and_lift import mask
@@ -336,7 +336,7 @@ class FlowStep(Reconstructible):
 
     def _inflow_mask(self, sides: tuple) -> Operator:
         """Return the mask of the faces whose normal velocity is given by `inflow`."""
-        if not any(condition == inflow_side for pair in sides for condition in pair or ()):
+        if inflow_side not in occurring(sides):
             raise ValueError("flow_step got inflow= without a side of dp.inflow in boundary=; give both or none")
         solid = self.settings.solid
         inside = mask_of_faces(self.grid, sides, solid, lambda condition: False)

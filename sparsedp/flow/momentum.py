@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from functools import cached_property
 from itertools import product
+from math import prod
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -23,7 +24,19 @@ from sparsedp._utils.base_classes import ReconstructibleFunction
 from sparsedp._utils.pytree import copied
 from sparsedp._utils.validation import check_on
 from sparsedp.flow.projection_setup import mask_of_faces
-from sparsedp.grid.boundary_conditions import dirichlet, free_slip, no_slip, outflow, resolve
+from sparsedp.grid.boundary_conditions import (
+    MixedWall,
+    describe_patches,
+    dirichlet,
+    free_slip,
+    inflow,
+    mixed_wall,
+    neumann,
+    no_slip,
+    outflow,
+    resolve,
+    walls_of,
+)
 from sparsedp.grid.grid import Grid
 from sparsedp.grid.space import Space
 from sparsedp.operators.difference import divergence, gradient
@@ -34,14 +47,16 @@ from sparsedp.operators.stencils import (
     differences,
     kronecker_operator,
     mean_of_faces,
-    means,
+    mean_terms,
+    on_faces,
+    slope_terms,
     slopes,
     wall_slopes,
     with_ends,
 )
 from sparsedp.operators.structure.base import Matrix
 from sparsedp.operators.structure.factor import Factor
-from sparsedp.operators.structure.kronecker import Kronecker
+from sparsedp.operators.structure.kronecker import Kronecker, Term
 from sparsedp.operators.structure.lazy import Mask, compose, total
 
 if TYPE_CHECKING:
@@ -58,6 +73,7 @@ __all__ = [
     "face_laplacian",
     "face_lift",
     "free_faces",
+    "inflow_points",
     "stresses",
     "wall_sides",
     "wall_stresses",
@@ -75,7 +91,8 @@ def face_laplacian(
     grid : Grid
     boundary : flow condition or dict
         no_slip, free_slip, inflow or outflow, for all bounded sides or as {"x": (lower, upper), ...}. Walls are at rest
-        here; add the contribution of moving walls with `face_lift`.
+        here; add the contribution of moving walls with `face_lift`. For an opening in part of a wall write a `patch`.
+        The tangential velocity at the end of a patch is that of the no_slip or inflow boundary, if there is one.
     solid : bool array, shape `grid.shape`, optional
         Obstacles.
     solid_boundary : no_slip or free_slip
@@ -107,14 +124,14 @@ def face_laplacian(
     >>> L(np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
     array([ 0.,  0., -4., -4.,  0.,  0.,  0.,  0.,  0.,  0.,  0.,  0.])
     """
-    sides = resolve(grid, boundary, no_slip, name="face_laplacian")
+    sides = resolve(grid, boundary, no_slip, patches=True)
     free = Mask(free_faces(grid, sides, solid))
     stress = stresses(grid, sides, solid, solid_boundary)
     if solid is None:
         structure = compose(free, stress)
     else:
         structure = Matrix(free.explicit() @ stress.explicit())
-    return Operator(structure, grid.faces, grid.faces, "face_laplacian")
+    return Operator(structure, grid.faces, grid.faces, f"face_laplacian{describe_patches(sides)}")
 
 
 def face_lift(grid: Grid, boundary: Any = no_slip, solid: ArrayLike | None = None) -> Operator:
@@ -125,7 +142,8 @@ def face_lift(grid: Grid, boundary: Any = no_slip, solid: ArrayLike | None = Non
     grid : Grid
     boundary : flow condition or dict
         As for `face_laplacian`. Only no_slip and inflow boundaries have a tangential velocity; the domain has no
-        entries for free_slip and outflow boundaries.
+        entries for free_slip and outflow boundaries. A wall with such a boundary on a part of it has entries on its
+        whole length; those on other parts are not used.
     solid : bool array, shape `grid.shape`, optional
         As for `face_laplacian`. The result is 0 on faces that touch an obstacle.
 
@@ -156,9 +174,10 @@ def face_lift(grid: Grid, boundary: Any = no_slip, solid: ArrayLike | None = Non
     >>> B(B.domain.join(0.0, 0.0, 0.0, 1.0))  # y-upper moves along x: a lid
     array([0., 0., 0., 2., 0., 0., 0., 0., 0., 0., 0., 0.])
     """
-    sides = resolve(grid, boundary, no_slip, name="face_lift")
+    sides = resolve(grid, boundary, no_slip, patches=True)
     structure = compose(Mask(free_faces(grid, sides, solid)), wall_stresses(grid, sides))
-    return Operator(structure, wall_velocities(grid, sides), grid.faces, "face_lift")
+    name = f"face_lift{describe_patches(sides)}"
+    return Operator(structure, wall_velocities(grid, sides), grid.faces, name)
 
 
 def convection(grid: Grid, boundary: Any = no_slip, solid: ArrayLike | None = None) -> Callable[..., Any]:
@@ -220,11 +239,11 @@ def convection(grid: Grid, boundary: Any = no_slip, solid: ArrayLike | None = No
     >>> float(np.max(np.abs(convect(v, v, walls.join(0.5, 1.0)))))  # v at x-lower, u at y-lower
     0.0
     """
-    sides = resolve(grid, boundary, no_slip, name="convection")
+    sides = resolve(grid, boundary, no_slip, patches=True)
     fluxes = MomentumFluxes(grid, sides)
     gain = fluxes.gain
     free = Mask(free_faces(grid, sides, solid))
-    C = Operator(compose(free, gain.structure), gain.domain, grid.faces, "gain")
+    C = Operator(compose(free, gain.structure), gain.domain, grid.faces, f"gain{describe_patches(sides)}")
 
     def convect(v, w, walls=None):
         # w needs no wall velocities: they would matter only in fluxes to faces that are not free, which C sets to 0.
@@ -248,7 +267,7 @@ def stresses(grid: Grid, sides: tuple, solid: ArrayLike | None, solid_boundary: 
         for component in range(grid.dim):
             terms: tuple = ()
             for axis in range(grid.dim):
-                terms += along(axis, grid.dim, _second_differences(grid, component, axis, sides))
+                terms += _second_differences(grid, component, axis, sides)
             blocks[component, component] = terms
         return Kronecker(grid.faces.parts, grid.faces.parts, blocks)
     closed = grid.faces.split(np.logical_or(*solid_faces(grid, check_solid(grid, solid))))
@@ -283,18 +302,19 @@ class MomentumFluxes:
         numbers = {pair: number for number, pair in enumerate(product(range(grid.dim), repeat=2))}
         for (c, a), number in numbers.items():  # component c through the sides across axis a
             if a == c:
-                carried_mean = carrier_mean = _nodes_to_centres(grid, c)
+                centres = _nodes_to_centres(grid, c)
+                carried[number, c] = carrier[number, c] = along(c, grid.dim, centres)
                 back = _centres_to_nodes(grid, c)
+                count = centres.shape[0]
             else:
-                carried_mean = means(grid, a, _conditions_along(sides[a]))
-                carrier_mean = means(grid, c, _conditions_along(sides[c]))
+                carried[number, c] = mean_terms(grid, a, _conditions_along(grid, sides, a, c))
+                carrier[number, a] = mean_terms(grid, c, _conditions_along(grid, sides, c, a))
                 back = differences(grid, a)
-            carried[number, c] = along(a, grid.dim, carried_mean)
-            carrier[number, a] = along(c, grid.dim, carrier_mean)
+                count = grid.node_count(a)
             gain[c, number] = along(a, grid.dim, back)
-            sites.append(tuple(carried_mean.shape[0] if b == a else n for b, n in enumerate(grid.face_shape(c))))
+            sites.append(tuple(count if b == a else n for b, n in enumerate(grid.face_shape(c))))
         for part, (a, side, c) in enumerate(wall_sides(grid, sides)):
-            at_wall = along(a, grid.dim, _wall_to_faces(grid, a, side))
+            at_wall = _at_wall(grid, sides, WallSide(a, side, c), _wall_to_faces(grid, a, side))
             wall_carried[numbers[c, a], part] = at_wall
             wall_carrier[numbers[a, c], part] = at_wall
         fluxes = Space(None, "fluxes", grid, sites)
@@ -340,14 +360,13 @@ class WallSide(NamedTuple):
 
 
 def wall_sides(grid: Grid, sides: tuple) -> list[WallSide]:
-    """Return one entry for each tangential component of each no_slip or inflow boundary."""
-    return [
-        WallSide(axis, side, component)
-        for axis in range(grid.dim)
-        for side, condition in enumerate(sides[axis] or ())
-        for component in range(grid.dim)
-        if component != axis and condition.along == dirichlet
-    ]
+    """Return one entry for each tangential component of each wall with a no_slip or inflow boundary."""
+    entries = []
+    for axis, side, wall in walls_of(sides):
+        for component in range(grid.dim):
+            if component != axis and _at_points(grid, wall, axis, component) != neumann:
+                entries.append(WallSide(axis, side, component))
+    return entries
 
 
 def wall_velocities(grid: Grid, sides: tuple) -> Space:
@@ -356,6 +375,19 @@ def wall_velocities(grid: Grid, sides: tuple) -> Space:
     for axis, _, component in wall_sides(grid, sides):
         parts.append(tuple(1 if b == axis else n for b, n in enumerate(grid.face_shape(component))))
     return Space(None, "moving walls", grid, parts)
+
+
+def inflow_points(grid: Grid, sides: tuple) -> NDArray[np.bool_]:
+    """Return the flat mask of the tangential wall velocities at inflow boundaries."""
+    masks = [np.zeros(0, bool)]
+    for (axis, side, component), part in zip(wall_sides(grid, sides), wall_velocities(grid, sides).parts, strict=True):
+        wall = sides[axis][side]
+        if isinstance(wall, MixedWall):
+            touching = points_touching(grid, wall, axis, component, lambda condition: condition == inflow)
+            masks.append(touching.reshape(-1))
+        else:
+            masks.append(np.full(prod(part), wall == inflow))
+    return np.concatenate(masks)
 
 
 def check_walls(name: str, walls: Any, space: Space) -> None:
@@ -369,7 +401,7 @@ def wall_stresses(grid: Grid, sides: tuple) -> Kronecker:
     blocks: dict = {}
     for part, (axis, side, component) in enumerate(wall_sides(grid, sides)):
         factor = differences(grid, axis) @ wall_slopes(grid, axis, side, dirichlet)
-        blocks[component, part] = along(axis, grid.dim, factor)
+        blocks[component, part] = _at_wall(grid, sides, WallSide(axis, side, component), factor)
     return Kronecker(grid.faces.parts, wall_velocities(grid, sides).parts, blocks)
 
 
@@ -381,18 +413,62 @@ def free_faces(grid: Grid, sides: tuple, solid: ArrayLike | None) -> NDArray[np.
 # ---- 1-D factors -----------------------------------------------------------------------------------------------------
 
 
-def _conditions_along(pair: tuple | None) -> tuple | None:
-    """Return the conditions of the tangential velocity at both walls of an axis; None if the axis is periodic."""
+def _conditions_along(grid: Grid, sides: tuple, axis: int, component: int) -> tuple | None:
+    """Return the conditions of a tangential component at both walls of an axis; None if the axis is periodic."""
+    pair = sides[axis]
     if pair is None:
         return None
-    return tuple(condition.along for condition in pair)
+    return tuple(_at_points(grid, wall, axis, component) for wall in pair)
 
 
-def _second_differences(grid: Grid, component: int, axis: int, sides: tuple) -> Factor:
-    """Return the second differences of a component along an axis."""
+def _at_points(grid: Grid, wall: Any, axis: int, component: int) -> Any:
+    """Return the condition of a tangential component at a wall, or a MixedWall of its points there.
+
+    Along their own axis, the points of the component lie between two faces of the wall. At the end of a patch these
+    have different conditions: the point is part of the no_slip or inflow boundary if one of them is.
+    """
+    if not isinstance(wall, MixedWall):
+        return wall.along
+    is_fixed = points_touching(grid, wall, axis, component, lambda condition: condition.along == dirichlet)
+    return mixed_wall([(dirichlet, is_fixed), (neumann, ~is_fixed)])
+
+
+def points_touching(
+    grid: Grid, wall: MixedWall, axis: int, component: int, accepts: Callable[[Any], bool]
+) -> NDArray[np.bool_]:
+    """Return the points of a tangential component at a wall that touch a face whose condition the function accepts.
+
+    Returns
+    -------
+    bool array
+        In the shape of the face field's component, without the axis across the wall.
+    """
+    faces = wall.faces_with(accepts)
+    position = component if component < axis else component - 1
+    if grid.periodic[component]:
+        return faces | np.roll(faces, 1, position)
+    width = [(0, 0)] * faces.ndim
+    width[position] = (1, 1)
+    padded = np.moveaxis(np.pad(faces, width), position, 0)
+    return np.moveaxis(padded[:-1] | padded[1:], 0, position)
+
+
+def _at_wall(grid: Grid, sides: tuple, entry: WallSide, factor: Factor) -> tuple[Term, ...]:
+    """Return the terms of a factor along the axis across a wall, at the points that have the velocity of the wall."""
+    wall = _at_points(grid, sides[entry.axis][entry.side], entry.axis, entry.component)
+    if isinstance(wall, MixedWall):
+        return tuple(on_faces(entry.axis, factor, wall.faces_with(lambda condition: condition == dirichlet)))
+    return along(entry.axis, grid.dim, factor)
+
+
+def _second_differences(grid: Grid, component: int, axis: int, sides: tuple) -> tuple[Term, ...]:
+    """Return the second differences of a component along an axis, as Kronecker terms."""
     if axis == component:
-        return slopes(grid, component, sides[component] and (dirichlet, dirichlet)) @ differences(grid, component)
-    return differences(grid, axis) @ slopes(grid, axis, _conditions_along(sides[axis]))
+        wall_values = sides[component] and (dirichlet, dirichlet)
+        return along(axis, grid.dim, slopes(grid, component, wall_values) @ differences(grid, component))
+    (difference,) = along(axis, grid.dim, differences(grid, axis))
+    across = slope_terms(grid, axis, _conditions_along(grid, sides, axis, component))
+    return tuple(difference @ slope for slope in across)
 
 
 def _laplacian_around(grid: Grid, c: int, sides: tuple, closed: NDArray, condition: Any) -> sp.csr_array:
@@ -402,12 +478,12 @@ def _laplacian_around(grid: Grid, c: int, sides: tuple, closed: NDArray, conditi
     """
     spacing = [np.ones(n) if a == c else grid.widths[a] for a, n in enumerate(grid.face_shape(c))]
     lattice = Grid(grid.face_shape(c), spacing=spacing, periodic=grid.periodic)
-    conditions = {name: _conditions_along(sides[a]) for a, name in enumerate(grid.axes) if sides[a] and a != c}
+    conditions = {n: _conditions_along(grid, sides, a, c) for a, n in enumerate(grid.axes) if sides[a] and a != c}
     across = Mask(lattice.join(*(a != c for a in range(grid.dim))))
     slope = gradient(lattice, conditions, closed, condition).structure
     laplacian_across = compose(divergence(lattice).structure, compose(across, slope))
     # Along the component's own axis no condition is needed, because the closed faces hold the obstacle's velocity.
-    blocks = {(0, 0): along(c, grid.dim, _second_differences(grid, c, c, sides))}
+    blocks = {(0, 0): _second_differences(grid, c, c, sides)}
     laplacian_along = Kronecker(lattice.cells.parts, lattice.cells.parts, blocks)
     return total(laplacian_across, laplacian_along).explicit()
 

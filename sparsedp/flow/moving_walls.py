@@ -20,8 +20,8 @@ import scipy.sparse as sp
 from sparsedp.autodiff.backend import gathered
 from sparsedp.autodiff.program_trace import check_values
 from sparsedp.autodiff.tape import cast
-from sparsedp.flow.momentum import check_walls, face_lift, free_faces, wall_sides, wall_stresses, wall_velocities
-from sparsedp.grid.boundary_conditions import inflow
+from sparsedp.flow.momentum import check_walls, face_lift, free_faces, inflow_points, wall_stresses, wall_velocities
+from sparsedp.grid.boundary_conditions import inflow, occurring
 from sparsedp.operators.masks_and_lift import mask
 from sparsedp.operators.operator import Operator
 from sparsedp.operators.structure.base import Matrix
@@ -100,8 +100,7 @@ class ConstantWalls(WallsAtRest):
         grid = settings.grid
         # Set to 0 on faces that are not free, because an implicit viscosity would spread these values into the fluid.
         self._lifted = mask(grid.faces, free_faces(grid, sides, settings.solid))(settings.walls)
-        has_inflow = any(condition == inflow for pair in sides for condition in pair or ())
-        if settings.convective and has_inflow:
+        if settings.convective and inflow in occurring(sides):
             self.constant = velocities_from_lift(settings.walls, grid, sides)
 
     def laplacian_part(self, velocities: Any) -> Any:
@@ -163,8 +162,7 @@ def velocities_from_lift(lifted: Any, grid: Grid, sides: tuple) -> Any:
     """
     lift = compose(Mask(free_faces(grid, sides, None)), wall_stresses(grid, sides)).explicit().tocsr()
     walls = wall_velocities(grid, sides)
-    is_inflow = np.array([sides[axis][side] == inflow for axis, side, _ in wall_sides(grid, sides)], bool)
-    wanted = np.repeat(is_inflow, np.diff(walls.offsets))  # mask of the wall velocities at inflow boundaries
+    wanted = inflow_points(grid, sides)
     wall_count = np.diff(lift.indptr)  # number of wall velocities that each face depends on
     at_inflow = abs(lift) @ wanted > 0
     check_values(partial(_check_separate, at_inflow & (wall_count > 1)), lifted)

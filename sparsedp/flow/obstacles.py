@@ -271,7 +271,7 @@ class Forces(Reconstructible):
         self, grid: Grid, solid: ArrayLike | None, boundary: Any, solid_boundary: Any, cells: Any, about: Any
     ) -> None:
         self._arguments = (grid, solid, boundary, solid_boundary, cells, about)
-        self._sides = resolve(grid, boundary, no_slip, name="forces")
+        self._sides = resolve(grid, boundary, no_slip, patches=True)
         if cells is None:
             obstacle = check_solid(grid, solid)
         else:

@@ -24,7 +24,7 @@ import numpy as np
 from sparsedp._utils.base_classes import Frozen
 from sparsedp.errors import ShapeError
 from sparsedp.flow.projection_setup import ProjectionSetup
-from sparsedp.grid.boundary_conditions import no_slip
+from sparsedp.grid.boundary_conditions import describe_patches, no_slip
 from sparsedp.grid.grid import check_grid
 from sparsedp.operators.operator import Operator
 from sparsedp.solvers.choose_method import check_settings
@@ -55,7 +55,8 @@ def projection(
         Obstacles. The result is 0 on faces that touch an obstacle.
     boundary : flow condition or dict
         no_slip, free_slip (here equivalent: the normal velocity is 0), inflow (the normal velocity is kept) or outflow
-        (pressure 0), for all bounded sides or as {"x": (lower, upper), ...}; axes that are not named are no_slip.
+        (pressure 0), for all bounded sides or as {"x": (lower, upper), ...}; axes that are not named are no_slip. An
+        opening in part of a wall is written with `patch`.
     method, rtol, maxiter, **options
         Arguments of the pressure solve, as in `inverse`.
 
@@ -81,7 +82,7 @@ def projection(
 
     See Also
     --------
-    divergence, flow_step, no_slip, free_slip, inflow, outflow
+    divergence, flow_step, no_slip, free_slip, inflow, outflow, patch
 
     Notes
     -----
@@ -123,7 +124,8 @@ class Projection(Operator):
 
     def __init__(self, setup: ProjectionSetup) -> None:
         faces = setup.grid.faces
-        super().__init__(setup.structure(), faces, faces, "projection", "matrix-free")
+        name = f"projection{describe_patches(setup.sides)}"
+        super().__init__(setup.structure(), faces, faces, name, "matrix-free")
         Frozen.__init__(self, setup=setup)
 
     def recipe(self) -> tuple:

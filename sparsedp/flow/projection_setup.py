@@ -24,7 +24,7 @@ from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.validation import check_finite, place
 from sparsedp.errors import NonFiniteError
 from sparsedp.flow.projection_passes import CompiledPasses, OperatorPasses, compiled_passes
-from sparsedp.grid.boundary_conditions import inflow, no_slip, resolve
+from sparsedp.grid.boundary_conditions import MixedWall, inflow, mapped_wall, no_slip, occurring, resolve, walls_of
 from sparsedp.grid.grid import Grid
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.operators.masks_and_lift import check_solid, solid_faces
@@ -78,7 +78,7 @@ class ProjectionSetup(Reconstructible):
 
     def __init__(self, grid: Grid, solid: ArrayLike | None, boundary: Any, settings: SolveSettings) -> None:
         self.grid = grid
-        self.sides = resolve(grid, boundary, no_slip, name="projection")
+        self.sides = resolve(grid, boundary, no_slip, patches=True)
         if solid is None:
             self.solid = None
         else:
@@ -216,13 +216,13 @@ class ProjectionSetup(Reconstructible):
     @cached_property
     def nothing_flows(self) -> bool:
         """Whether 0 is the only divergence-free flow: a line of cells with closed ends. P is then 0 up to rounding."""
-        closed = all(pair and all(condition.closed for condition in pair) for pair in self.sides)
+        closed = all(self.sides) and all(condition.closed for condition in occurring(self.sides))
         return closed and sum(n > 1 for n in self.grid.shape) <= 1
 
     @cached_property
     def symmetric(self) -> bool:
         """Whether P equals its transpose."""
-        return all(self.grid.uniform) and all(condition.closed for pair in self.sides for condition in pair or ())
+        return all(self.grid.uniform) and all(condition.closed for condition in occurring(self.sides))
 
     def _check_inflow_can_leave(self) -> None:
         """Raise ValueError if an inflow enters a region without an outflow."""
@@ -235,11 +235,15 @@ class ProjectionSetup(Reconstructible):
         closed = system.whole(closed).reshape(self.grid.shape)
         if self.solid is not None:
             closed = closed & ~self.solid
-        for axis, pair in enumerate(self.sides):
-            for side, condition in zip((0, -1), pair or (), strict=False):
-                if condition == inflow and np.take(closed, side, axis).any():
-                    name = f"{('lower', 'upper')[side]} {self.grid.axes[axis]} side"
-                    raise ValueError(f"the inflow on the {name} enters a region without an outflow; open a side of it")
+        for axis, side, wall in walls_of(self.sides):
+            enters = np.take(closed, -side, axis)
+            if isinstance(wall, MixedWall):
+                enters = enters & wall.faces_with(lambda condition: condition == inflow)
+            elif wall != inflow:
+                continue
+            if enters.any():
+                name = f"{('lower', 'upper')[side]} {self.grid.axes[axis]} side"
+                raise ValueError(f"the inflow on the {name} enters a region without an outflow; open a side of it")
 
 
 class ProjectionStructure(Transposable):
@@ -270,7 +274,11 @@ class PressureStructure(Transposable):
 def pressure_conditions(grid: Grid, sides: tuple) -> dict[str, tuple]:
     """Return the pressure conditions as `gradient` takes them: p = 0 at outflows, a slope of 0 on all other sides."""
     pairs = zip(grid.axes, sides, strict=True)
-    return {axis: tuple(condition.pressure for condition in pair) for axis, pair in pairs if pair}
+    return {axis: tuple(mapped_wall(wall, _pressure_condition) for wall in pair) for axis, pair in pairs if pair}
+
+
+def _pressure_condition(condition: Any) -> Any:
+    return condition.pressure
 
 
 def mask_of_faces(
@@ -290,9 +298,13 @@ def mask_of_faces(
         ``open_side(condition)`` returns whether faces on a side with this condition are True.
     """
     flat = np.ones(grid.faces.size, dtype=bool)
-    for axis, (pair, part) in enumerate(zip(sides, grid.split(flat), strict=True)):
-        for side, condition in zip((0, -1), pair or (), strict=False):
-            np.moveaxis(part, axis, 0)[side] = open_side(condition)  # a view: this sets `flat`
+    parts = grid.split(flat)
+    for axis, side, wall in walls_of(sides):
+        if isinstance(wall, MixedWall):
+            is_open: Any = wall.faces_with(open_side)
+        else:
+            is_open = open_side(wall)
+        np.moveaxis(parts[axis], axis, 0)[-side] = is_open  # a view: this sets `flat`
     if solid is None:
         return flat
     return flat & ~np.logical_or(*solid_faces(grid, check_solid(grid, solid)))

@@ -25,12 +25,12 @@ import numpy as np
 
 from sparsedp._utils.base_classes import Value
 from sparsedp._utils.validation import check_number, check_type
-from sparsedp.autodiff.tape import isbox
+from sparsedp.autodiff.tape import dtype_of, isbox
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
 from sparsedp.grid.grid import AXES, Grid
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -43,10 +43,12 @@ __all__ = [
     "describe_patches",
     "dirichlet",
     "free_slip",
-    "has_patches",
     "inflow",
+    "mapped_wall",
+    "mixed_wall",
     "neumann",
     "no_slip",
+    "occurring",
     "outflow",
     "patch",
     "resolve",
@@ -296,7 +298,7 @@ no_slip = FlowCondition(
 
     See Also
     --------
-    free_slip, inflow, outflow, projection, flow_step, face_lift
+    free_slip, inflow, outflow, patch, projection, flow_step, face_lift
 
     Examples
     --------
@@ -327,7 +329,7 @@ free_slip = FlowCondition(
 
     See Also
     --------
-    no_slip, inflow, outflow, projection, flow_step, conservation_law
+    no_slip, inflow, outflow, patch, projection, flow_step, conservation_law
 
     Examples
     --------
@@ -360,7 +362,7 @@ inflow = FlowCondition(
 
     See Also
     --------
-    no_slip, free_slip, outflow, projection, flow_step, face_lift, conservation_law
+    no_slip, free_slip, outflow, patch, projection, flow_step, face_lift, conservation_law
 
     Examples
     --------
@@ -394,7 +396,7 @@ outflow = FlowCondition(
 
     See Also
     --------
-    no_slip, free_slip, inflow, projection, flow_step, conservation_law
+    no_slip, free_slip, inflow, patch, projection, flow_step, conservation_law
 
     Examples
     --------
@@ -477,7 +479,7 @@ class Patch(Value):
                     f"values of a patch takes {name} as a number or an array of shape {faces.shape}, one entry for "
                     f"each face of the wall, got shape {np.shape(value)}"
                 )
-        return anp.where(faces, inside, elsewhere)
+        return anp.where(faces, _spread(inside, faces.shape), _spread(elsewhere, faces.shape))
 
     def __call__(self, value: Any) -> NoReturn:
         """Raise TypeError, because a condition takes no value; boundary values are arguments of `lift`."""
@@ -536,7 +538,7 @@ def patch(where: Any, condition: Any, elsewhere: Any = None) -> Patch:
 
     See Also
     --------
-    dirichlet, neumann, robin, lift, gradient, laplacian
+    dirichlet, neumann, robin, no_slip, free_slip, inflow, outflow, lift, gradient, laplacian, projection
 
     Notes
     -----
@@ -550,8 +552,9 @@ def patch(where: Any, condition: Any, elsewhere: Any = None) -> Patch:
     returns an array that is 20 on the faces of the patch `heated`, and 0 on the others.
 
     These functions accept patches: `gradient`, `laplacian`, `lift`, `average` and `upwind`, and with them `inverse` and
-    `elliptic_solver`. All others refuse them. Operators with patches are not sums of 1-D operators: `inverse` uses
-    sparse factors or multigrid for them, and method "separable" does not apply. Distributed grids have no patches.
+    `elliptic_solver`; for flows `projection`, `flow_step`, `face_laplacian`, `face_lift`, `convection` and `forces`.
+    All others refuse them, and so do distributed grids. Operators with patches are not sums of 1-D operators: `inverse`
+    uses sparse factors or multigrid for them, and method "separable" does not apply.
 
     Examples
     --------
@@ -585,6 +588,13 @@ def patch(where: Any, condition: Any, elsewhere: Any = None) -> Patch:
     if not isinstance(base, kind):
         raise TypeError(f"patch of {condition} needs {kind.choices} or a patch of them as elsewhere=, got {base!r}")
     return Patch(_checked_where(where), condition, elsewhere)
+
+
+def _spread(value, shape):
+    """Return a traced number as an array, because autograd's where does not add up the gradient of a number."""
+    if isbox(value) and np.shape(value) == ():
+        return value * np.ones(shape, dtype_of(value))
+    return value
 
 
 class MixedWall(Value):
@@ -635,7 +645,7 @@ class MixedWall(Value):
         return f"<{self.description}>"
 
 
-def mixed_wall(regions: list) -> Any:
+def mixed_wall(regions: Sequence[tuple[Any, NDArray[np.bool_]]]) -> Any:
     """Return a MixedWall of pairs (condition, faces), or a condition if only one occurs; equal ones are merged."""
     merged: dict = {}
     for condition, faces in regions:
@@ -653,16 +663,23 @@ def walls_of(sides: tuple) -> Iterator[tuple[int, int, Any]]:
             yield axis, side, condition
 
 
-def conditions_of(wall: Any) -> tuple:
+def conditions_of(wall: Any) -> tuple[Any, ...]:
     """Return the conditions that occur on a wall."""
     if isinstance(wall, MixedWall):
         return tuple(condition for condition, _ in wall.regions)
     return (wall,)
 
 
-def has_patches(sides: tuple) -> bool:
-    """Return whether a wall has more than one condition, given the result of `resolve`."""
-    return any(isinstance(wall, MixedWall) for _, _, wall in walls_of(sides))
+def occurring(sides: tuple) -> set:
+    """Return the conditions that occur on the walls, given the result of `resolve`."""
+    return {condition for _, _, wall in walls_of(sides) for condition in conditions_of(wall)}
+
+
+def mapped_wall(wall: Any, change: Callable[[Any], Any]) -> Any:
+    """Return ``change(condition)`` for a condition, or a MixedWall with the results for its conditions."""
+    if isinstance(wall, MixedWall):
+        return wall.map(change)
+    return change(wall)
 
 
 def describe_patches(sides: tuple) -> str:

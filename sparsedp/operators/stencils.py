@@ -24,6 +24,7 @@ __all__ = [
     "mean_of_faces",
     "mean_terms",
     "means",
+    "on_faces",
     "one_sided",
     "pick",
     "slope_terms",
