@@ -718,6 +718,42 @@ BUGS = {
         "np.sqrt(mean_square)",
         "tests/optimize/test_minimize.py",
     ),
+    "a first curvature that is not measured in the metric": Bug(
+        "optimize",
+        "metric.square(changes[-1], metric.representer(changes[-1]))",
+        "np.dot(changes[-1], changes[-1])",
+        "tests/optimize/test_metric.py",
+    ),
+    "a recursion that begins without the metric": Bug(
+        "optimize",
+        "direction = metric.representer(remainder)",
+        "direction = remainder",
+        "tests/optimize/test_metric.py",
+    ),
+    "a trust region that is not measured in the metric": Bug(
+        "optimize",
+        "direction_image = -residual + next_square",
+        "direction_image = -representer + next_square",
+        "tests/optimize/test_metric.py",
+    ),
+    "a dual norm with the metric in place of its inverse": Bug(
+        "optimize",
+        "self.length(scaled, self.representer(scaled))",
+        'self.length(scaled, self._mapped(scaled, "apply"))',
+        "tests/optimize/test_metric.py",
+    ),
+    "a checkpoint that does not compare the metric": Bug(
+        "optimize",
+        'for name in {**self._settings, "metric": None}:',
+        'for name in {**self._settings, "method": None}:',
+        "tests/optimize/test_metric.py",
+    ),
+    "a metric of free entries that takes the place of others": Bug(
+        "optimize",
+        "return self._metric.representer(whole)[self._free]",
+        "return self._metric.representer(whole)[: len(gradient)]",
+        "tests/optimize/test_metric.py",
+    ),
     "a wrong derivative that passes for rounding": Bug(
         "optimize",
         "lost_in_rounding = decreases[0] <= ROUNDINGS",

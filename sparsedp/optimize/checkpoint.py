@@ -87,8 +87,8 @@ class Checkpoint:
             self.resumed = f"nothing to resume in {self._folder}{skipped}"
             return None
         self.resumed = f"resumed from iteration {content['iteration']} in {self._folder}{skipped}"
-        for name, setting in self._settings.items():
-            self._check_same(name, setting == content["settings"].get(name))
+        for name in {**self._settings, "metric": None}:  # only runs with a metric have this setting
+            self._check_same(name, self._settings.get(name) == content["settings"].get(name))
         history = [_record(fields) for fields in content["history"]]
         start = template.current
         exact = content["ranks"] == process_count() and content["format"] == FORMAT
@@ -108,7 +108,7 @@ class Checkpoint:
     def _check_start(self, start, record, objective, exact):
         """Raise ValueError if the loss or gradient norm at the start differs from the stored record."""
         value = objective.in_units_of_loss(start.value)
-        gradient_norm = objective.in_units_of_loss(norm(objective.projected_gradient(start)))
+        gradient_norm = objective.in_units_of_loss(objective.gradient_norm(start))
         same = _agree(value, record.value, record.value, exact)
         same = same and _agree(gradient_norm, record.gradient_norm, record.gradient_norm, exact)
         self._check_same("loss at the start", same)

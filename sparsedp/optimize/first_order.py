@@ -10,6 +10,7 @@ import numpy as np
 from sparsedp._utils.pytree import norm, power_of_two
 from sparsedp._utils.validation import check_choice, check_number, is_number
 from sparsedp.optimize.method import Method
+from sparsedp.optimize.metric import EUCLIDEAN
 from sparsedp.optimize.result import Evaluation, NoStepFound
 from sparsedp.solvers.scaling import largest
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from sparsedp.optimize.metric import Euclidean
     from sparsedp.optimize.objective import Objective
 
 __all__ = ["Adam", "AdamState", "DescentState", "GradientDescent", "admissible", "backtracked", "first_length"]
@@ -65,7 +67,8 @@ class GradientDescent(Method):
 
     Notes
     -----
-    Each iteration computes v <- momentum v - rate g and x <- x + v, where g is the gradient of the loss at x.
+    Each iteration computes v <- momentum v - rate M^-1 g and x <- x + v, where g is the gradient of the loss at x, and
+    M is the metric.
 
     References
     ----------
@@ -75,6 +78,7 @@ class GradientDescent(Method):
     """
 
     name: ClassVar[str] = "gd"
+    uses_metric: ClassVar[bool] = True
     rate: float | None = None
     momentum: float = 0.0
     line_search: str | None = None
@@ -96,34 +100,39 @@ class GradientDescent(Method):
         if self.rate is not None:
             return DescentState(first, velocity, self.rate, 1.0, 1.0)
         gradient_unit = power_of_two(norm(first.gradient))
-        rate = first_length(first) / (norm(first.gradient / gradient_unit) or 1.0)
+        rate = first_length(first, self.metric) / (self.metric.dual_norm(first.gradient / gradient_unit) or 1.0)
         return DescentState(first, velocity, rate, 1.0, gradient_unit)
 
     def advance(self, state: DescentState, objective: Objective) -> DescentState:
         """Return the state after one iteration. Raises NoStepFound if no admissible point is found."""
         gradient = objective.projected_gradient(state.current) / state.gradient_unit
-        step = self.momentum * state.velocity - state.rate * gradient
+        direction = self.metric.representer(gradient)
+        step = self.momentum * state.velocity - state.rate * direction
         if not self.compares_losses:
             evaluation, share, next_share = admissible(state.current.point, step, state.share, objective)
             return state._replace(current=evaluation, velocity=share * step, share=next_share)
         if np.dot(step, gradient) >= 0:
-            step = -state.rate * gradient  # momentum made this an ascent direction: restart without it
-        direction = "the projected gradient" if objective.box.bounded else "the gradient"
-        evaluation, share, _ = backtracked(state.current, step, objective, direction)
+            step = -state.rate * direction  # momentum made this an ascent direction: restart without it
+        name = "the projected gradient" if objective.box.bounded else "the gradient"
+        evaluation, share, _ = backtracked(state.current, step, objective, name)
         factor = share if share < 1 else 2.0
         return state._replace(current=evaluation, velocity=share * step, rate=state.rate * factor)
 
 
-def first_length(first: Evaluation) -> float:
+def first_length(first: Evaluation, metric: Euclidean = EUCLIDEAN) -> float:
     """Return the length of the first step: the smaller of |f| / |g|, with which a linear loss becomes 0, and |x|.
 
-    A length that is 0 or infinite is ignored. If neither can be used, return 1.
+    A length that is 0 or infinite is ignored. If neither can be used, return the length of a step whose Euclidean norm
+    is 1. The other norms are those of the metric.
     """
-    gradient_norm = norm(first.gradient)
-    lengths = [norm(first.point)]
+    gradient_norm = metric.dual_norm(first.gradient)
+    lengths = [metric.norm(first.point)]
     if gradient_norm:
         lengths.append(abs(first.value) / gradient_norm)
-    return min((length for length in lengths if 0 < length < np.inf), default=1.0)
+    lengths = [length for length in lengths if 0 < length < np.inf]
+    if lengths:
+        return min(lengths)
+    return gradient_norm / norm(metric.representer(first.gradient)) if gradient_norm else 1.0
 
 
 def backtracked(

@@ -6,19 +6,20 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
-from scipy.optimize import LbfgsInvHessProduct
 
 from sparsedp._utils.pytree import norm, power_of_two
 from sparsedp._utils.validation import check_whole
 from sparsedp.optimize.first_order import first_length
 from sparsedp.optimize.line_search import line_search
 from sparsedp.optimize.method import Method
+from sparsedp.optimize.metric import EUCLIDEAN
 from sparsedp.optimize.objective import ROUNDINGS
 from sparsedp.optimize.result import Evaluation, NoStepFound, RoundingReached
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from sparsedp.optimize.metric import Euclidean
     from sparsedp.optimize.objective import Objective
 
 __all__ = ["LBFGS", "LBFGSState", "quasi_newton_step"]
@@ -64,8 +65,10 @@ class LBFGS(Method):
     Notes
     -----
     Each iteration computes x <- x - t H g, where H is the inverse Hessian approximation by Nocedal's two-loop recursion
-    over the last steps. The length of the first step is the smaller of |f| / |g|, with which a linear loss becomes 0,
-    and |x|. No threshold is absolute: if the loss or x is multiplied by a power of two, the run takes the same steps.
+    over the last steps. The recursion begins with M^-1, the inverse of the metric, times s.y / y.M^-1 y, with the last
+    step s and change y of the gradient. The length of the first step is the smaller of |f| / |g|, with which a linear
+    loss becomes 0, and |x|. No threshold is absolute: if the loss or x is multiplied by a power of two, the run takes
+    the same steps.
 
     An entry that is at a bound, and that the negative gradient would move out of it, is held fixed. The step of the
     other entries uses only their components of the memory, and trial points of the line search are clipped to the
@@ -78,6 +81,7 @@ class LBFGS(Method):
     """
 
     name: ClassVar[str] = "lbfgs"
+    uses_metric: ClassVar[bool] = True
     memory: int = 10
     line_search: int = 20
 
@@ -110,7 +114,7 @@ class LBFGS(Method):
     def _searched(self, state, objective):
         """Return the state after a line search, None if it failed; and whether rounding hides the expected decrease."""
         current = state.current
-        step = _step_inside(state, objective.box)
+        step = _step_inside(state, objective.box, self.metric)
         predicted = -float(np.dot(current.gradient, step))
         lost_in_rounding = abs(predicted / 2) <= ROUNDINGS * current.rounding
         if not predicted > 0:
@@ -129,21 +133,29 @@ class LBFGS(Method):
         return state._replace(current=evaluation, steps=steps, changes=changes)
 
 
-def _step_inside(state, box):
+def _step_inside(state, box, metric):
     """Return the quasi-Newton step of the free entries; entries held at a bound get 0."""
     current = state.current
     free = box.free(current.point, current.gradient)
     if free.all():
         free = slice(None)
+        free_metric = metric
+    else:
+        free_metric = metric.restricted(free)
     gradient = current.gradient / state.gradient_unit
-    initial_scale = first_length(current) / (norm(gradient) or 1.0)
+    initial_scale = first_length(current, metric) / (metric.dual_norm(gradient) or 1.0)
     step = np.zeros_like(current.point)
-    step[free] = quasi_newton_step(gradient[free], state.steps[:, free], state.changes[:, free], initial_scale)
+    steps, changes = state.steps[:, free], state.changes[:, free]
+    step[free] = quasi_newton_step(gradient[free], steps, changes, initial_scale, free_metric)
     return step
 
 
 def quasi_newton_step(
-    gradient: NDArray[np.float64], steps: NDArray[np.float64], changes: NDArray[np.float64], initial_scale: float
+    gradient: NDArray[np.float64],
+    steps: NDArray[np.float64],
+    changes: NDArray[np.float64],
+    initial_scale: float,
+    metric: Euclidean = EUCLIDEAN,
 ) -> NDArray[np.float64]:
     """Return -H g, where H is the L-BFGS approximation of the inverse Hessian.
 
@@ -153,7 +165,8 @@ def quasi_newton_step(
     steps, changes : (k, n) array
         The past steps and changes of the gradient, oldest first. Pairs with too little curvature are ignored.
     initial_scale : float
-        If no pair is usable, H is this number times the identity.
+        If no pair is usable, H is this number times the inverse of the metric.
+    metric : Euclidean or Metric
 
     Returns
     -------
@@ -170,5 +183,16 @@ def quasi_newton_step(
         curvatures = curvatures[usable]
     scale = initial_scale
     if len(steps):
-        scale = curvatures[-1] / np.dot(changes[-1], changes[-1])
-    return -scale * LbfgsInvHessProduct(steps / scale, changes).matvec(gradient)
+        scale = curvatures[-1] / metric.square(changes[-1], metric.representer(changes[-1]))
+    # The two-loop recursion for H / scale, whose steps are divided by `scale`.
+    steps = steps / scale
+    weights = 1 / np.einsum("ij,ij->i", steps, changes)
+    remainder = gradient
+    shares = np.empty(len(steps))
+    for i in reversed(range(len(steps))):
+        shares[i] = weights[i] * np.dot(steps[i], remainder)
+        remainder = remainder - shares[i] * changes[i]
+    direction = metric.representer(remainder)
+    for i in range(len(steps)):
+        direction = direction + steps[i] * (shares[i] - weights[i] * np.dot(changes[i], direction))
+    return -scale * direction

@@ -5,6 +5,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from sparsedp.optimize.metric import EUCLIDEAN, Euclidean
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -27,10 +29,16 @@ class Method(ABC):
         The value of the argument `method` of `minimize`.
     uses_residuals : bool
         True for least-squares methods: the loss returns residuals, and half the sum of their squares is minimized.
+    uses_metric : bool
+        Whether steps depend on the inner product of the unknowns.
+    metric : Euclidean or Metric
+        This inner product. `minimize` sets it.
     """
 
     name: ClassVar[str]
     uses_residuals: ClassVar[bool] = False
+    uses_metric: ClassVar[bool] = False
+    metric: Euclidean = EUCLIDEAN
 
     @property
     def compares_losses(self) -> bool:

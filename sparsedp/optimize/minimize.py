@@ -24,6 +24,7 @@ from sparsedp.optimize.first_order import Adam, GradientDescent
 from sparsedp.optimize.ipopt import Ipopt
 from sparsedp.optimize.lbfgs import LBFGS
 from sparsedp.optimize.least_squares import GaussNewton, HalfInverse, LevenbergMarquardt
+from sparsedp.optimize.metric import Metric
 from sparsedp.optimize.mma import MMA
 from sparsedp.optimize.monitor import Monitor
 from sparsedp.optimize.newton_cg import NewtonCG
@@ -62,6 +63,7 @@ METHODS: dict[str, type[Method] | type[ADMM] | type[ConstrainedMethod]] = {
     )
 }
 CONSTRAINED = [name for name, method in METHODS.items() if issubclass(method, ConstrainedMethod)]
+WITH_METRIC = [name for name, method in METHODS.items() if getattr(method, "uses_metric", False)]
 
 
 def minimize(
@@ -78,6 +80,7 @@ def minimize(
     batches: Sequence[Any] | Callable[[int], Any] | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
     constraints: Any = None,
+    metric: Any = None,
     **options: Any,
 ) -> Minimum:
     """Minimize a loss whose argument is an array or a nested structure (pytree) of arrays.
@@ -101,8 +104,9 @@ def minimize(
     maxiter : int
         Maximum number of iterations. With 0 the loss is evaluated at the start, and the start is returned.
     tolerance : float or callable
-        The run has converged when the Euclidean norm of the gradient is at most `tolerance` times its value at the
-        start. There is no absolute tolerance. A function ``tolerance(record, first_record)`` returns True if the run
+        The run has converged when the norm of the gradient is at most `tolerance` times its value at the start. The
+        norm is Euclidean, or with a `metric` M that of the search direction, sqrt(g.M^-1 g). There is no absolute
+        tolerance. A function ``tolerance(record, first_record)`` returns True if the run
         has converged. With `certified` as tolerance, minimize also chooses the accuracy of the linear solves in the
         loss.
     callback : callable, optional
@@ -137,6 +141,11 @@ def minimize(
         stands for g(x) == 0. A NonlinearConstraint or LinearConstraint of SciPy is used with its limits lb and ub; its
         function takes the flat vector of unknowns, and its `jac` is used if it is a function. The start may violate the
         constraints. If the sign of a function is wrong, the opposite set is feasible.
+    metric : Operator, or tree of Operators and None, optional
+        The inner product of the unknowns, for lbfgs, gd and newton_cg: a symmetric positive definite operator M with
+        <u, v> = u.M v. For a tree, each array of start has its own operator; None stands for u.v. Search directions are
+        then those of M^-1 g, so that the number of iterations does not grow with the number of cells, see the notes. M
+        may be an `inverse`; its operator is then applied instead of a solve. With bounds M must be diagonal.
     **options
         Options of the method, listed in the table below. Any other option raises TypeError.
 
@@ -230,8 +239,8 @@ def minimize(
         If the result of `gradient` has another tree structure than start.
     ValueError
         If the method is unknown, or takes no constraints or no equalities; if maxiter, tolerance, bounds or an option
-        is out of range; or if the checkpoint folder contains a run with another method, options, bounds, start
-        (constant leaves included), loss or batches.
+        is out of range; if the metric is not symmetric, not positive definite or singular; or if the checkpoint folder
+        contains a run with another method, options, bounds, metric, start (constant leaves included), loss or batches.
     KeyboardInterrupt
         If Ctrl-C is pressed before the loss has been evaluated at the start, or a second time.
     TypeError
@@ -251,6 +260,14 @@ def minimize(
     Notes
     -----
     For complex unknowns see docs/guides/complex_numbers.md.
+    Metric: the gradient g is a list of derivatives. The direction of steepest descent in the inner product of M is
+    -M^-1 g (M^-1 g is the Riesz representer of the derivative). With ``L2 = dp.diagonal(grid.cells, grid.volumes)``
+    the inner product of L2 has the metric L2, and that of H1 ``L2 @ (dp.identity(grid.cells) - dp.laplacian(grid))``.
+    gd steps along -M^-1 g, lbfgs begins its recursion with M^-1, and newton_cg preconditions its conjugate gradients
+    with M^-1 and measures steps in the norm of M. A factor of M does not change the run, except for gd with a rate. The
+    inverse of M is set up once, by `inverse`. gd needs one solve with M in an iteration, lbfgs up to three, newton_cg
+    one for each Hessian product. Test vectors check that M is symmetric and positive definite.
+    With `project` the search directions are those of M^-1 times the gradient of loss(project(x)).
 
     Examples
     --------
@@ -266,6 +283,8 @@ def minimize(
     if callback is not None:
         check_function("callback of minimize", callback, "lambda record, x: False")
     chosen = _method(method, options)
+    if metric is not None and not getattr(chosen, "uses_metric", False):
+        raise TypeError(f"{method} takes no metric; leave it out, or write method= one of {', '.join(WITH_METRIC)}")
     maxiter = check_whole("maxiter of minimize", maxiter, 0, "; the default is 100")
     _check_tolerance(tolerance)
     bounds = pair_of_bounds(bounds)
@@ -276,6 +295,7 @@ def minimize(
         "batches": batches,
         "checkpoint": checkpoint,
         "constraints": constraints,
+        "metric": metric,
     }
     implementation = backend_of(leaves(start)).implementation(minimize)
     if implementation is not minimize:
@@ -294,6 +314,8 @@ def minimize(
     batches_by_iteration = _batches(batches, method, chosen)
     packing = Packing(start, "start")
     box = Box(bounds, packing)
+    if metric is not None:
+        chosen.metric = _metric(metric, box, packing)
     loss = chosen.composed(loss)
     projection = None
     if project is not None:
@@ -302,13 +324,15 @@ def minimize(
         if gradient is not None:
             gradient = projection.gradient(gradient)
     residual_options = chosen if chosen.uses_residuals else None
-    objective = Objective(loss, gradient, packing, box, batches_by_iteration, residual_options)
+    objective = Objective(loss, gradient, packing, box, batches_by_iteration, residual_options, chosen.metric)
     settings = {
         "method": method,
         "set of options": sorted(options.items()),
         "pair of bounds": (box.lower, box.upper),
         "start": start,
     }
+    if metric is not None:
+        settings["metric"] = chosen.metric.fingerprint
     checkpoints = Checkpoint(checkpoint, settings)
     monitor = Monitor(objective, packing, tolerance, callback)
     steps = shown_steps(progress, range(maxiter), "minimize")
@@ -387,6 +411,17 @@ def _projection(project, box, packing, start):
             "of them out"
         )
     return Projection(project, packing, start)
+
+
+def _metric(metric, box, packing):
+    """Return the inner product of the unknowns; raise ValueError if it cannot be used with the bounds."""
+    inner_product = Metric(metric, packing)
+    if box.bounded and not inner_product.diagonal:
+        raise ValueError(
+            "with bounds the metric must be diagonal, such as dp.diagonal(grid.cells, grid.volumes): the direction of "
+            "another one leads out of them; leave bounds or metric out"
+        )
+    return inner_product
 
 
 def _check_unused(method, arguments):

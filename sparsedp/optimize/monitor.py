@@ -7,7 +7,6 @@ from math import inf
 from typing import TYPE_CHECKING, Any
 
 from sparsedp._utils.counters import thread
-from sparsedp._utils.pytree import norm
 from sparsedp.optimize.result import (
     NO_RESIDUALS,
     Evaluation,
@@ -121,7 +120,7 @@ class Monitor:
 
     def _gradient_norm(self, evaluation):
         """Return the norm of the projected gradient, in the units of the evaluations."""
-        return norm(self._objective.projected_gradient(evaluation))
+        return self._objective.gradient_norm(evaluation)
 
     def _test_convergence(self, gradient_norm):
         """Set `converged` and `message` if the tolerance is met.
@@ -190,7 +189,8 @@ class Monitor:
         if gradient_norm <= STATIONARY * self._first_gradient_norm:
             return True
         x = self._last.point
-        length = max(norm(x), norm(x - self._first.point))
+        metric = self._objective.metric
+        length = max(metric.norm(x), metric.norm(x - self._first.point))
         return length > 0 and gradient_norm <= STATIONARY * (abs(self._last.value) / length)
 
     def minimum(self, x: Any, method: str, resumed: str = "", covariance: Any = NO_RESIDUALS) -> Minimum:

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
-from sparsedp._utils.pytree import norm, power_of_two
 from sparsedp._utils.validation import check_whole
 from sparsedp.optimize.first_order import first_length
 from sparsedp.optimize.method import Method
+from sparsedp.optimize.metric import EUCLIDEAN
 from sparsedp.optimize.result import Evaluation
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from sparsedp.optimize.metric import Euclidean
     from sparsedp.optimize.objective import Objective
 
 __all__ = ["NewtonCG", "NewtonState", "truncated_cg"]
@@ -39,7 +40,7 @@ class NewtonState(NamedTuple):
         Radius of the trust region; 0 means unlimited.
     first_gradient_norm : float
     length_unit : float
-        A power of two near |x| at the start.
+        A power of two near |x| at the start; with a metric, |x| itself.
     """
 
     current: Evaluation
@@ -61,7 +62,8 @@ class NewtonCG(Method):
     -----
     The step p approximately minimizes the model g.p + p.H p / 2 subject to |p| <= radius. Inside the region, the
     conjugate gradient iteration stops when |g + H p| <= min(0.1, sqrt(|g| / |g0|)) |g|, where g0 is the gradient at the
-    start. The radius is increased or decreased according to the ratio of the actual and the predicted decrease.
+    start. The radius is increased or decreased according to the ratio of the actual and the predicted decrease. Norms
+    are those of the metric, which is also the preconditioner of the conjugate gradients.
 
     References
     ----------
@@ -70,6 +72,7 @@ class NewtonCG(Method):
     """
 
     name: ClassVar[str] = "newton_cg"
+    uses_metric: ClassVar[bool] = True
     inner: int = 200
 
     def __post_init__(self) -> None:
@@ -77,16 +80,18 @@ class NewtonCG(Method):
 
     def begin(self, first: Evaluation) -> NewtonState:
         """Return the state at the start."""
-        length_unit = power_of_two(norm(first.point) or first_length(first))
-        return NewtonState(first, 0.0, norm(first.gradient), length_unit)
+        length_unit = self.metric.unit(self.metric.norm(first.point) or first_length(first, self.metric))
+        return NewtonState(first, 0.0, self.metric.dual_norm(first.gradient), length_unit)
 
     def advance(self, state: NewtonState, objective: Objective) -> NewtonState:
         """Return the state after one iteration. Raises NoStepFound if no trust region gives a lower point."""
         current = state.current
         hessian_product = objective.hessian_product(current)
-        gradient_unit = power_of_two(norm(current.gradient))
+        metric = self.metric
+        gradient_norm = metric.dual_norm(current.gradient)
+        gradient_unit = metric.unit(gradient_norm)
         gradient = objective.projected_gradient(current) / gradient_unit
-        accuracy = min(0.1, np.sqrt(norm(current.gradient) / (state.first_gradient_norm or 1.0)))
+        accuracy = min(0.1, np.sqrt(gradient_norm / (state.first_gradient_norm or 1.0)))
 
         def scaled_product(direction):
             return hessian_product(state.length_unit * direction) / gradient_unit
@@ -95,10 +100,13 @@ class NewtonCG(Method):
             """Yield the minimizer of the model in trust regions of decreasing radius."""
             radius = state.radius or np.inf
             for _ in range(MOST_REGIONS):
-                step, decrease, on_boundary = truncated_cg(gradient, scaled_product, radius, accuracy, self.inner)
+                step, decrease, on_boundary = truncated_cg(
+                    gradient, scaled_product, radius, accuracy, self.inner, metric
+                )
+                length = metric.norm(step)
                 point = objective.box.nearest(current.point + state.length_unit * step)
-                yield point, decrease * gradient_unit * state.length_unit, (radius, norm(step), on_boundary)
-                radius = norm(step) / 4
+                yield point, decrease * gradient_unit * state.length_unit, (radius, length, on_boundary)
+                radius = length / 4
 
         failure = "no trust region gives a lower point"
         evaluation, share_of_decrease, region = objective.first_lower(current, candidates(), failure)
@@ -118,6 +126,7 @@ def truncated_cg(
     radius: float,
     accuracy: float,
     limit: int,
+    metric: Euclidean = EUCLIDEAN,
 ) -> tuple[NDArray[np.float64], float, bool]:
     """Minimize the model g.p + p.H p / 2 subject to |p| <= radius, by conjugate gradients.
 
@@ -133,6 +142,8 @@ def truncated_cg(
         The iteration stops when |g + H p| is at most this multiple of |g|.
     limit : int
         Maximum number of products.
+    metric : Euclidean or Metric
+        The norms of p and of gradients, and the preconditioner.
 
     Returns
     -------
@@ -143,30 +154,43 @@ def truncated_cg(
         Whether |p| is the radius.
     """
     p = np.zeros_like(gradient)
+    p_image = p  # M p; the recursions below need no product with M
     residual = gradient
-    direction = -gradient
+    representer = metric.representer(residual)
+    direction = -representer
+    direction_image = -residual
+    square = metric.square(residual, representer)
+    goal = accuracy * metric.length(gradient, representer)
     decrease = 0.0
     on_boundary = False
     for _ in range(limit):
         product = hessian_product(direction)
-        square = float(np.dot(residual, residual))
         curvature = float(np.dot(direction, product))
         t = np.inf
         if curvature > 0:
             t = square / curvature
-        on_boundary = not (np.isfinite(t) and norm(p + t * direction) < radius)
+        on_boundary = not (np.isfinite(t) and metric.length(p + t * direction, p_image + t * direction_image) < radius)
         if on_boundary:
             # If the curvature is not positive and the region is unlimited, stop at twice the current length of p.
             boundary = radius
             if not np.isfinite(radius):
-                boundary = max(1.0, 2 * norm(p))
+                boundary = max(1.0, 2 * metric.length(p, p_image))
             # t is the larger root of |p + t d|^2 = boundary^2.
-            coefficients = [np.dot(direction, direction), 2 * np.dot(p, direction), np.dot(p, p) - boundary**2]
+            coefficients = [
+                np.dot(direction, direction_image),
+                2 * np.dot(p, direction_image),
+                np.dot(p, p_image) - boundary**2,
+            ]
             t = np.max(np.roots(coefficients).real)
         p = p + t * direction
+        p_image = p_image + t * direction_image
         residual = residual + t * product
+        representer = metric.representer(residual)
         decrease = decrease + t * (square - 0.5 * t * curvature)
-        if on_boundary or norm(residual) <= accuracy * norm(gradient):
+        if on_boundary or metric.length(residual, representer) <= goal:
             break
-        direction = -residual + float(np.dot(residual, residual)) / square * direction
+        next_square = metric.square(residual, representer)
+        direction = -representer + next_square / square * direction
+        direction_image = -residual + next_square / square * direction_image
+        square = next_square
     return p, decrease, on_boundary

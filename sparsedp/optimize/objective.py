@@ -10,6 +10,7 @@ from sparsedp._utils.pytree import norm, safe_unit
 from sparsedp.autodiff.derivative import check_loss, checking_derivatives, pullback, unwarned, value_and_grad
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, UnstableStepError
 from sparsedp.optimize.linearization import Linearization
+from sparsedp.optimize.metric import EUCLIDEAN
 from sparsedp.optimize.result import NO_RESIDUALS, Evaluation, Failure, NoStepFound, RoundingReached
 from sparsedp.solvers.cache import Cache
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from sparsedp.autodiff.flattening import Packing
     from sparsedp.optimize.batches import Batches
     from sparsedp.optimize.box import Box
+    from sparsedp.optimize.metric import Euclidean
 
 __all__ = ["SMALLEST", "SUFFICIENT", "Objective"]
 
@@ -49,6 +51,7 @@ class Objective:
         If given, the loss returns residuals r, and the objective is |r / s|^2 / 2. The power of two s prevents
         underflow and overflow of squared residuals. The attributes `apart`, `forms_jacobian` and `absolute_sigma` of
         this object are the options for the Jacobian and the covariance.
+    metric : Euclidean or Metric
 
     Attributes
     ----------
@@ -74,12 +77,14 @@ class Objective:
         box: Box,
         batches: Batches,
         residual_options: Any = None,
+        metric: Euclidean = EUCLIDEAN,
     ):
         self._loss = loss
         self._gradient = gradient
         self._packing = packing
         self._residual_options = residual_options
         self._linearizations = Cache(1)
+        self.metric = metric
         self.box = box
         self.batches = batches
         self.iteration = 0
@@ -259,6 +264,10 @@ class Objective:
     def projected_gradient(self, evaluation: Evaluation) -> Any:
         """Return the gradient with entries set to 0 for unknowns that are held at a bound (see `free`)."""
         return np.where(self.free(evaluation), evaluation.gradient, 0.0)
+
+    def gradient_norm(self, evaluation: Evaluation) -> float:
+        """Return the norm of the projected gradient, in the units of the evaluations; see `Record`."""
+        return self.metric.dual_norm(self.projected_gradient(evaluation))
 
     def pop_failures(self) -> tuple[Failure, ...]:
         """Return the failed points since the last call, and clear the list."""

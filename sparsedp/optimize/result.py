@@ -63,8 +63,8 @@ class Record(NamedTuple):
         The loss. It is infinite if it overflows, and 0 if it underflows.
     gradient_norm : float
         Euclidean norm of the gradient, or, with bounds, of the projected gradient: its entries are 0 where a bound
-        prevents a step along the negative gradient. With constraints, the same norm of the gradient of the Lagrangian.
-        Infinite on overflow, 0 on underflow.
+        prevents a step along the negative gradient. With constraints, the same norm of the gradient of the Lagrangian;
+        with a metric M, sqrt(g.M^-1 g) of this gradient g. Infinite on overflow, 0 on underflow.
     seconds : float
         Time since the start of the run.
     evaluations : int

@@ -9,6 +9,8 @@ import pytest
 import sparsedp as dp
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
 
+LINE = dp.Grid(2)
+
 
 def run(loss=lambda x: anp.sum(x**2), start=(0.5, 0.5), method="lbfgs", **options):
     return lambda: dp.minimize(loss, np.array(start), method, **options)
@@ -154,6 +156,76 @@ WRONG = [
         run(method="gauss_newton"),
         DerivativeError,
         "the outputs are one number; return the residuals as an array, do not sum them",
+    ),
+    (
+        run(method="adam", metric=dp.identity(LINE.cells)),
+        TypeError,
+        "adam takes no metric; leave it out, or write method= one of lbfgs, gd, newton_cg",
+    ),
+    (
+        run(metric=dp.identity(LINE.cells) - dp.laplacian(LINE), bounds=(0.0, None)),
+        ValueError,
+        "with bounds the metric must be diagonal, such as dp.diagonal(grid.cells, grid.volumes): the direction of "
+        "another one leads out of them; leave bounds or metric out",
+    ),
+    (run(metric=np.eye(2)), TypeError, "metric takes an Operator, got ndarray; write dp.from_matrix(...) first"),
+    (run(metric=1j * dp.identity(LINE.cells)), TypeError, "metric must hold real numbers, got dtype complex128"),
+    (
+        run(metric=dp.identity(dp.Grid(3).cells)),
+        ShapeError,
+        "metric must map arrays of the shape of start, (2,), to such arrays, got identity from cells(3) to cells(3)",
+    ),
+    (
+        lambda: dp.minimize(lambda p: p["a"] ** 2, {"a": 1.0, "n": 2}, metric=dp.identity(LINE.cells)),
+        ShapeError,
+        "metric is one Operator, and start is a dict of a, n; write an Operator or None for each array of start",
+    ),
+    (
+        lambda: dp.minimize(lambda p: p["a"] ** 2, {"a": 1.0, "n": 2}, metric={"a": None}),
+        ShapeError,
+        "metric: missing key 'n'; expected 'a', 'n'; write an Operator or None for each array of start",
+    ),
+    (
+        run(metric=dp.from_functions(lambda u: np.nan * u, None, LINE.cells, LINE.cells)),
+        NonFiniteError,
+        "the product with metric must be finite, got 6 that are NaN or infinite",
+    ),
+    (
+        run(metric=dp.from_matrix([[2.0, 1.0], [0.0, 2.0]], LINE.cells, LINE.cells)),
+        ValueError,
+        "metric must be symmetric, and matrix is not; on a grid with cells of different volume multiply it by them, as "
+        "in dp.diagonal(grid.cells, grid.volumes) @ op",
+    ),
+    (
+        run(metric=-dp.laplacian(LINE)),
+        ValueError,
+        "metric must not be singular, and -laplacian is; add a multiple of dp.identity",
+    ),
+    (
+        run(metric=dp.inverse(-dp.laplacian(LINE))),
+        ValueError,
+        "metric must not be singular, and inverse(-laplacian) is; add a multiple of dp.identity",
+    ),
+    (
+        run(metric=dp.from_matrix([[1.0, -2.0], [-2.0, 4.0]], LINE.cells, LINE.cells)),
+        ValueError,
+        "metric has no inverse: <matrix: cells(2) -> cells(2), explicit> is singular",
+    ),
+    (
+        run(metric=dp.laplacian(LINE) - dp.identity(LINE.cells)),
+        ValueError,
+        "metric must be positive definite, and laplacian + -identity is not; check its sign: -dp.laplacian(grid) has "
+        "positive eigenvalues",
+    ),
+    (
+        run(metric=dp.diagonal(LINE.cells, [3.0, -1.0])),
+        ValueError,
+        "metric must be positive definite, and has the diagonal entry -1",
+    ),
+    (
+        run(metric=dp.from_matrix([[1.0, 3.0], [3.0, 5.0]], LINE.cells, LINE.cells), start=(0.5, -0.5)),
+        ValueError,
+        "metric must be positive definite, and is negative for a vector of this run; check its eigenvalues",
     ),
     (direction(power=2), ValueError, "power must be from 0 to 1, got 2; 0.75 gives half-inverse gradients"),
     (direction(damping=-1), ValueError, "damping must be >= 0, got -1; the default is 0"),

@@ -121,6 +121,17 @@ REFUSED = [
     ),
     (
         TypeError,
+        "minimize of fields on ranks takes lbfgs, bounds of numbers and a callback, got lbfgs, metric; leave the rest "
+        "out, or start from dp.gather(u)",
+        lambda s: dp.minimize(lambda u: anp.sum(u * u), s.u, metric=dp.identity(s.grid.cells)),
+    ),
+    (
+        TypeError,
+        "metric does not work on ranks yet; give it the grid from before dp.distribute",
+        lambda s: dp.minimize(lambda u: anp.sum(u * u), np.ones((5, 4)), metric=dp.identity(s.grid.cells)),
+    ),
+    (
+        TypeError,
         "implicit(<lambda>) takes, for fields on ranks, residuals in which each number is coupled to a few near ones; "
         "write dp.gather(u) for unknowns that every rank solves for alone",
         lambda s: dp.implicit(lambda x, k: x - k + anp.sum(x) ** 2)(s.u, 1.0),
