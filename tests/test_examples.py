@@ -92,12 +92,17 @@ def test_new_operator():
 @example("poisson_control.py")
 def test_poisson_control():
     """Case B2: the optimum to 1e-8 within 60 iterations, as many on every grid (+-3)."""
-    rows = re.findall(r"^ +(\d+)\^2 +(\S+) +\S+ +\S+ +(\S+) +(\d+) +\d+$", run("poisson_control.py"), re.MULTILINE)
+    printed = run("poisson_control.py")
+    rows = re.findall(r"^ +(\d+)\^2 +(\S+) +\S+ +\S+ +(\S+) +(\d+) +\d+$", printed, re.MULTILINE)
     assert len(rows) == 6
     for alpha in ("1e-02", "1e-04"):
         gaps, counts = zip(*((float(gap), int(count)) for _, a, gap, count in rows if a == alpha))
         assert max(gaps) <= 1e-8 and max(counts) <= 60
         assert max(counts) - min(counts) <= 3
+    rows = re.findall(r"^ +\d+\^2 +(\d+) +(\d+) +(\S+)$", printed, re.MULTILINE)
+    plain, in_metric, gaps = zip(*((int(a), int(b), float(gap)) for a, b, gap in rows))
+    assert len(rows) == 4 and plain[-1] >= 4 * plain[0]
+    assert max(in_metric[1:]) - min(in_metric[1:]) <= 2 and max(gaps) <= 1e-8
 
 
 @example("warm_start.py")
