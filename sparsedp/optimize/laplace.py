@@ -15,6 +15,7 @@ from sparsedp._utils.validation import check_finite, check_function, check_numbe
 from sparsedp.autodiff.backend import backend_of, is_field
 from sparsedp.autodiff.derivative import check_loss, pullback, value_and_grad
 from sparsedp.autodiff.flattening import Packing
+from sparsedp.autodiff.tape import isbox
 from sparsedp.errors import DerivativeError, PosteriorWarning, ShapeError
 from sparsedp.optimize.linearization import Linearization
 from sparsedp.optimize.misfit_eigenpairs import eigenpairs_of_jacobian, eigenpairs_of_products
@@ -143,6 +144,10 @@ def laplace(
     tolerance = check_number("tolerance of laplace", tolerance, "between 0 and 1", "; the default is 0.01")
     seed = check_whole("seed of laplace", seed, 0, "; the default is 0")
     backend_of(leaves(x)).check("laplace")
+    if any(map(isbox, leaves(x))):
+        raise DerivativeError(
+            "laplace cannot be differentiated or recorded; call it with plain arrays, outside of the function that is"
+        )
     packing = Packing(x, "x")
     if packing.complex:
         raise DerivativeError("laplace takes real unknowns, got complex ones; split them into two real arrays")
@@ -216,6 +221,7 @@ class _Hessian(NamedTuple):
 
 def _hessian(misfit, packing, vector, rank):
     value = misfit(packing.unpack(vector))
+    backend_of([value]).check("a misfit of laplace")
     if not is_field(value):
         raise DerivativeError(
             f"the misfit must return an array of residuals or one number, got {type(value).__name__}; join it"

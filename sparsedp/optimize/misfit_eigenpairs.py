@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 __all__ = ["MisfitEigenpairs", "eigenpairs_of_jacobian", "eigenpairs_of_products"]
 
 FIRST_BLOCKS = 2  # convergence is not tested before the space has this number of blocks
+SAFETY = 10.0  # the norm of a matrix is rarely larger than this multiple of its products with random vectors
 SMALLEST = np.finfo(float).tiny
 BLOCK = 10  # random samples, and vectors in a block of the Krylov space
 ROUNDING = 1e3 * EPS  # eigenvalues below this multiple of the largest are lost in rounding
@@ -159,7 +160,7 @@ def eigenpairs_of_products(
         known = space.informative
         outside = space.start(_random_rows(prior, rng, count), prior.has_root)
         if outside <= space.threshold:
-            return space.result(rank, is_complete=True)
+            return space.result(rank, is_complete=True, outside=outside)
         has_converged = space.grow_until_converged(rank, least)
         if not has_converged or space.informative > rank:
             return space.result(rank, is_complete=False)
@@ -267,9 +268,7 @@ class KrylovSpace:
         squares = np.einsum("ij,ij->i", remainder, self._prior.apply(remainder))
         self._next, _ = self._orthonormalized(remainder)
         self._continues = False
-        if not self._next.dimension:
-            return 0.0
-        if not are_samples:
+        if self._next.dimension and not are_samples:
             return np.inf
         return float(np.sqrt(np.max(np.maximum(squares, 0.0))))
 
@@ -372,7 +371,7 @@ class KrylovSpace:
         weights = (vectors / lengths).T
         return Block(weights @ rows, weights @ images), vectors * lengths, resolved > dropped**2 and not np.all(kept)
 
-    def result(self, rank: int, is_complete: bool) -> MisfitEigenpairs:
+    def result(self, rank: int, is_complete: bool, outside: float = np.inf) -> MisfitEigenpairs:
         """Return the eigenpairs that have converged, at most `rank`.
 
         Parameters
@@ -380,6 +379,8 @@ class KrylovSpace:
         rank : int
         is_complete : bool
             Whether all eigenpairs above the threshold are in the space and have converged.
+        outside : float
+            The last result of `start`.
         """
         magnitudes = np.abs(self.values)
         is_whole = self.dimension == self._prior.size
@@ -393,7 +394,7 @@ class KrylovSpace:
         if is_whole:
             neglected = np.max(magnitudes[others], initial=0.0)
         elif is_complete:
-            neglected = self.threshold
+            neglected = max(np.max(magnitudes[others], initial=0.0), min(self.threshold, SAFETY * outside))
         else:
             neglected = max(self.threshold, np.max((magnitudes + self.residuals)[others], initial=0.0))
         vectors = np.zeros((len(kept), self._prior.size))

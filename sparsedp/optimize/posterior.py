@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
@@ -9,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sparsedp._utils.base_classes import Frozen
+from sparsedp._utils.calls import frames_inside
 from sparsedp._utils.html import facts
 from sparsedp._utils.validation import check_finite, check_function, check_whole
 from sparsedp.autodiff.derivative import pullback
-from sparsedp.errors import DerivativeError
+from sparsedp.errors import DerivativeError, PosteriorWarning
 from sparsedp.grid.space import Space
 from sparsedp.operators.given import from_functions
 from sparsedp.operators.operator import Operator
@@ -27,6 +29,10 @@ if TYPE_CHECKING:
 __all__ = ["Posterior"]
 
 SHOWN = 8  # eigenvalues in the table
+SMALLEST = np.finfo(float).tiny
+CORRELATION = 1.5  # factor of the standard error of a mean, because the corrections are not independent
+INACCURATE = 0.1  # root mean square of the relative standard errors of variances above which a warning is issued
+NOT_ACCURATE = "variances have a standard error of {:.0f} % with probes={}; increase probes"
 
 
 class Posterior(Frozen):
@@ -131,7 +137,7 @@ class Posterior(Frozen):
         apply = partial(_covariance_of_field, self._pairs, self._prior)
         return from_functions(apply, apply, space, space, name="posterior covariance")
 
-    def variance(self, probes: int = 64) -> Any:
+    def variance(self, probes: int = 200) -> Any:
         """Return the variance of each entry of x, a tree like x with None in place of constants.
 
         Parameters
@@ -143,26 +149,33 @@ class Posterior(Frozen):
         -----
         Prior variances are exact for numbers, diagonals, sparse matrices, functions of separable operators, and up to
         1024 unknowns. Otherwise the diagonal of C - sum of v v^T is estimated by the XDiag method, with 2 `probes`
-        products with C. See `variance_error`.
+        products with C. See `variance_error`. A PosteriorWarning is issued if the standard error is above 10 % of the
+        variance (root mean square).
 
         References
         ----------
         E. N. Epperly, J. A. Tropp, R. J. Webber, XTrace: making the most of every sample in stochastic trace
         estimation, SIAM J. Matrix Anal. Appl. 45, 2024.
         """
-        probes = check_whole("probes of variance", probes, 2, "; the default is 64")
+        probes = check_whole("probes of variance", probes, 2, "; the default is 200")
         return _tree(self._packing, self._variances(probes)[0])
 
-    def variance_error(self, probes: int = 64) -> Any:
+    def variance_error(self, probes: int = 200) -> Any:
         """Return the standard error of each entry of ``variance(probes)``, a tree like it; 0 for exact entries."""
-        probes = check_whole("probes of variance_error", probes, 2, "; the default is 64")
+        probes = check_whole("probes of variance_error", probes, 2, "; the default is 200")
         return _tree(self._packing, self._variances(probes)[1])
 
     def _variances(self, probes):
         """Return the variances and their standard errors as flat vectors."""
         if probes not in self._known_variances:
             self._known_variances[probes] = self._computed_variances(probes)
-        return self._known_variances[probes]
+        variances, errors = self._known_variances[probes]
+        if np.any(errors):
+            relative = np.sqrt(np.mean((errors / np.maximum(variances, SMALLEST)) ** 2))
+            if relative > INACCURATE:
+                message = NOT_ACCURATE.format(100 * relative, probes)
+                warnings.warn(message, PosteriorWarning, stacklevel=frames_inside() + 1)
+        return variances, errors
 
     @cached_property
     def _known_variances(self):
@@ -177,9 +190,12 @@ class Posterior(Frozen):
         if len(vectors) < self._prior.size:
             for block in self._prior.blocks:
                 part = block.part
-                if block.diagonal is not None:
-                    others[part] = block.diagonal - np.sum(vectors[:, part] ** 2, axis=0)
-                elif block.size:
+                diagonal = block.diagonal
+                if diagonal is None and block.size <= probes:
+                    diagonal = np.diagonal(block.columns())
+                if diagonal is not None:
+                    others[part] = diagonal - np.sum(vectors[:, part] ** 2, axis=0)
+                else:
                     others[part], errors[part] = _estimated_diagonal(block, vectors[:, part], probes)
         return informed + np.maximum(others, 0.0), errors
 
@@ -291,6 +307,9 @@ def _reduction(values):
 
 def _covariance_of_field(pairs, prior, field):
     """Return the posterior covariance times a field."""
+    if np.iscomplexobj(field):
+        real = _covariance_of_field(pairs, prior, np.real(field))
+        return real + 1j * _covariance_of_field(pairs, prior, np.imag(field))
     vector = np.asarray(field, float).reshape(1, -1)
     components = vector @ pairs.vectors.T
     if len(pairs.values) == prior.size:
@@ -329,7 +348,7 @@ def _estimated_diagonal(block, vectors, probes):
 
     Each random vector is tested with a low-rank approximation that was computed from the other vectors.
     """
-    signs = np.random.default_rng(3).choice([-1.0, 1.0], (min(probes, block.size), block.size))
+    signs = np.random.default_rng(3).choice([-1.0, 1.0], (probes, block.size))
 
     def product(rows):
         return block.apply(rows) - (rows @ vectors.T) @ vectors
@@ -341,7 +360,7 @@ def _estimated_diagonal(block, vectors, probes):
     left_out = q @ directions
     corrections = signs.T * left_out * np.sum(directions * r, axis=0) - left_out * (images @ directions)
     diagonal = np.sum(q * images, axis=1) + np.mean(corrections, axis=1)
-    return diagonal, np.std(corrections, axis=1, ddof=1) / np.sqrt(corrections.shape[1])
+    return diagonal, CORRELATION * np.std(corrections, axis=1, ddof=1) / np.sqrt(probes)
 
 
 def _tree(packing, vector):

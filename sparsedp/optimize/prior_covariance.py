@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg
 
 from sparsedp._utils.base_classes import Uncached
-from sparsedp._utils.pytree import keys, paired
+from sparsedp._utils.pytree import keys, norm, paired
 from sparsedp._utils.validation import EPS, check_finite, check_type, is_number
 from sparsedp.errors import ConvergenceError, ShapeError
 from sparsedp.operators.given import check_operator
@@ -89,10 +89,10 @@ class Block(Uncached):
         """C as a dense array, symmetric to the last bit, if it is small; else None."""
         if self.size > MOST_COLUMNS:
             return None
-        matrix = self._columns()
+        matrix = self.columns()
         return 0.5 * (matrix + matrix.T)
 
-    def _columns(self):
+    def columns(self) -> NDArray:
         """Return C as a dense array."""
         batches = [self.apply(unit) for unit in unit_rows(self.size)]
         return np.concatenate(batches)
@@ -191,14 +191,14 @@ class Block(Uncached):
     def _check_symmetry(self, tests, images):
         products = tests @ images.T
         # The typical size of u . C v for independent u and v.
-        scale = np.max(np.linalg.norm(images, axis=1)) or 1.0
+        scale = max(map(norm, images)) or 1.0
         difference = np.max(np.abs(products - products.T)) / scale
         if difference > SYMMETRY:
             raise ValueError(NOT_SYMMETRIC.format(self.name, difference))
 
     def _check_root(self, root, tests, images):
         by_root = _product(root, _product(root.T, tests))
-        difference = np.linalg.norm(by_root - images) / (np.linalg.norm(images) or 1.0)
+        difference = norm(by_root - images) / (norm(images) or 1.0)
         if not difference <= SYMMETRY:
             raise ValueError(OTHER_ROOT.format(self.name, difference))
 
@@ -212,7 +212,7 @@ class Block(Uncached):
         if is_exact and smallest <= rounding * largest:
             raise ValueError(SINGULAR.format(self.name, "its smallest eigenvalue is 0"))
         constant = np.ones((1, self.size))
-        if np.linalg.norm(self.apply(constant)) <= NULL * largest * np.sqrt(self.size):
+        if norm(self.apply(constant)) <= NULL * largest * np.sqrt(self.size):
             raise ValueError(SINGULAR.format(self.name, "it maps a constant to 0"))
 
     def _extreme_eigenvalues(self, start):

@@ -60,6 +60,11 @@ WRONG = [
         "x of laplace must be finite, got 12 that are NaN or infinite, the first at (0, 0)",
     ),
     (
+        lambda: dp.grad(lambda x: anp.sum(run(x=x)().variance()))(np.zeros((4, 3))),
+        DerivativeError,
+        "laplace cannot be differentiated or recorded; call it with plain arrays, outside of the function that is",
+    ),
+    (
         run(misfit=lambda x: (x, x)),
         DerivativeError,
         "the misfit must return an array of residuals or one number, got tuple; join it",
@@ -170,12 +175,12 @@ WRONG = [
     (
         lambda: run()().variance(1),
         ValueError,
-        "probes of variance must be a whole number >= 2, got 1; the default is 64",
+        "probes of variance must be a whole number >= 2, got 1; the default is 200",
     ),
     (
         lambda: run()().variance_error(1),
         ValueError,
-        "probes of variance_error must be a whole number >= 2, got 1; the default is 64",
+        "probes of variance_error must be a whole number >= 2, got 1; the default is 200",
     ),
     (lambda: run()().std_of(3), TypeError, "std_of takes a function, got int; write lambda x: np.mean(x)"),
     (

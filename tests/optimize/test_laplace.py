@@ -1,11 +1,15 @@
 """The posterior of laplace: beside dense linear algebra, for all kinds of priors and unknowns, and its intervals."""
 
+import pickle
+
 import autograd.numpy as anp
 import numpy as np
 import pytest
 import scipy.linalg
+from scipy.stats import binom
 
 import sparsedp as dp
+from sparsedp.optimize import prior_covariance
 
 GRID = dp.Grid((6, 5), size=1.0)
 HEAT = 20.0 * dp.identity(GRID.cells) - dp.laplacian(GRID)
@@ -90,3 +94,232 @@ def test_multiple_eigenvalues():
     posterior = dp.laplace(lambda x: 3.0 * anp.concatenate([x[:35], 0.0 * x]), np.zeros(50), 1.0, rank=49)
     assert posterior.eigenvalues == pytest.approx(np.full(35, 9.0))
     assert posterior.variance() == pytest.approx(np.where(np.arange(50) < 35, 0.1, 1.0))
+
+
+@pytest.mark.filterwarnings("ignore:eigenvalues:sparsedp.errors.PosteriorWarning")
+def test_jacobian_and_products_agree(rng, monkeypatch):
+    """The two ways to the eigenpairs, and a prior whose square root takes an iteration."""
+    _, residuals, mean, covariance = linear_problem(rng, dense(MATERN))
+    direct = dp.laplace(residuals, mean, MATERN)
+    monkeypatch.setattr(prior_covariance, "MOST_COLUMNS", 1)
+    functions = dp.from_functions(MATERN, MATERN, GRID.cells, GRID.cells)
+    posterior = dp.laplace(residuals, mean, functions, rank=19, tolerance=1e-3)
+    assert posterior.eigenvalues == pytest.approx(direct.eigenvalues[:19], rel=1e-6)
+    with pytest.warns(dp.errors.PosteriorWarning, match="^variances have a standard error of .* % with probes=4; inc"):
+        posterior.variance(4)
+    ratio = posterior.variance(30) / np.diag(covariance)  # as many probes as unknowns
+    assert np.all(ratio >= 1 - 1e-4) and np.all(ratio <= 1 + posterior.error)
+    assert np.all(posterior.variance_error(30) == 0)
+    [sample] = posterior.sample(1, seed=3)
+    assert np.all(np.isfinite(sample))
+
+
+def test_stated_error_of_estimated_variances(rng, monkeypatch):
+    """The errors of estimated variances have the stated size."""
+    monkeypatch.setattr(prior_covariance, "MOST_COLUMNS", 1)
+    grid = dp.Grid((16, 16), size=1.0)
+    prior = dp.matrix_power(40.0 * dp.identity(grid.cells) - dp.laplacian(grid), -2)
+    functions = dp.from_functions(prior, prior, grid.cells, grid.cells)
+    residuals = lambda x: anp.reshape(x, -1)[::30] * 30.0
+    exact = dp.laplace(residuals, np.zeros(grid.shape), prior).variance()
+    posterior = dp.laplace(residuals, np.zeros(grid.shape), functions)
+    off = (posterior.variance(60) - exact) / posterior.variance_error(60)
+    assert 0.5 < np.sqrt(np.mean(off**2)) < 1.2
+    assert np.max(np.abs(posterior.variance(60) / exact - 1)) < 0.5
+    assert "estimated" in str(posterior)
+
+
+def test_estimated_variances_of_low_rank(rng, monkeypatch):
+    """The estimate is exact where the rank of the prior, beside a small remainder, is below the number of probes."""
+    monkeypatch.setattr(prior_covariance, "MOST_COLUMNS", 1)
+    columns = rng.standard_normal((60, 5))
+    apply = lambda x: 1e-9 * x + columns @ (columns.T @ x)
+    posterior = dp.laplace(lambda x: x[:0], np.zeros(60), dp.from_functions(apply, apply, 60, 60))
+    assert posterior.variance(20) == pytest.approx(1e-9 + np.sum(columns**2, axis=1), rel=1e-6)
+    assert np.max(posterior.variance_error(20)) < 1e-7
+
+
+def of_root(root):
+    return {"prior": root @ root.T, "prior_root": root}
+
+
+STRETCHED = dp.Grid(12, spacing=np.linspace(1.0, 2.0, 12))
+SOLVE = dp.inverse(dp.identity(STRETCHED.cells) - dp.laplacian(STRETCHED), "direct")
+RING = dp.Grid(12, periodic=True)
+RECTANGULAR = dp.from_matrix(np.random.default_rng(0).standard_normal((12, 20)))
+PRIORS = {
+    "a variance": {"prior": 3.0},
+    "a diagonal": {"prior": dp.diagonal(STRETCHED.cells, np.linspace(1.0, 2.0, 12))},
+    "a sparse matrix": {"prior": dp.from_matrix(np.eye(12) + 0.3 * (np.eye(12, k=1) + np.eye(12, k=-1)))},
+    "a stretched grid": {"prior": SOLVE @ SOLVE @ dp.diagonal(STRETCHED.cells, 1 / STRETCHED.volumes)},
+    "a root": of_root(SOLVE @ dp.diagonal(STRETCHED.cells, STRETCHED.volumes**-0.5)),
+    "a rectangular root": of_root(RECTANGULAR),
+    "a periodic grid": {"prior": dp.matrix_power(dp.identity(RING.cells) - dp.laplacian(RING), -1)},
+    "functions": {"prior": dp.from_functions(lambda x: 2.0 * x, None, 12, 12)},
+}
+
+
+@pytest.mark.parametrize("name", PRIORS)
+def test_priors(name, rng):
+    """Variances, deviations and the covariance of samples, for each kind of prior."""
+    options = PRIORS[name]
+    prior = options["prior"]
+    matrix = prior * np.eye(12) if name == "a variance" else dense(prior)
+    _, residuals, mean, covariance = linear_problem(rng, matrix, count=4)
+    posterior = dp.laplace(residuals, mean, **options)
+    assert posterior.shift < 1e-6
+    check_against(posterior, covariance, rng, 1e-7)
+    samples = np.array(posterior.sample(2000, seed=5)) - mean
+    whitened = np.linalg.solve(scipy.linalg.cholesky(covariance, lower=True), samples.T)
+    assert np.max(np.abs(whitened @ whitened.T / 2000 - np.eye(12))) < 0.15  # standard error 0.022 and 0.032
+    assert np.max(np.abs(np.mean(whitened, axis=1))) < 0.1
+
+
+def test_samples_depend_on_the_seed_only():
+    posterior = dp.laplace(lambda x: x[:2], np.zeros(5), 1.0)
+    first, second = posterior.sample(2, seed=1)
+    assert np.array_equal(first, posterior.sample(1, seed=1)[0]) and not np.array_equal(first, second)
+    assert not np.array_equal(first, posterior.sample(1, seed=2)[0])
+    assert np.array_equal(posterior.sample(1)[0], posterior.sample(1, seed=0)[0])
+    assert posterior.sample(0) == []
+
+
+def test_trees(rng):
+    """A prior for each leaf, or one for all; constants stay, and have no variance."""
+    x = {"u": np.zeros((6, 5)), "rate": 0.0, "n": 3}
+    rows = rng.standard_normal((5, 31))
+    residuals = lambda x: anp.dot(rows, anp.concatenate([anp.reshape(x["u"], -1), anp.reshape(x["rate"], 1)])) * x["n"]
+    prior = scipy.linalg.block_diag(dense(MATERN), 4.0)
+    covariance = np.linalg.inv(np.linalg.inv(prior) + 9.0 * rows.T @ rows)
+    for given in ({"rate": 4.0, "n": None, "u": MATERN}, dp.from_matrix(prior)):
+        posterior = dp.laplace(residuals, x, given)
+        variance = posterior.variance()
+        assert variance["u"].reshape(-1) == pytest.approx(np.diag(covariance)[:30], rel=1e-8)
+        assert variance["rate"] == pytest.approx(covariance[30, 30], rel=1e-8) and variance["n"] is None
+        assert posterior.std_of(lambda x: 2.0 * x["rate"]) == pytest.approx(2 * covariance[30, 30] ** 0.5)
+        [sample] = posterior.sample(1)
+        assert sample["n"] == 3 and sample["u"].shape == (6, 5) and type(sample["rate"]) is float
+        assert dense(posterior.covariance) == pytest.approx(covariance, rel=1e-6, abs=1e-9)
+
+
+@pytest.mark.filterwarnings("ignore:eigenvalues:sparsedp.errors.PosteriorWarning")
+@pytest.mark.parametrize("unit", [1e-150, 1e-9, 1e9])
+def test_units(unit, rng):
+    """The posterior does not depend on the unit of the unknowns."""
+    rows = rng.standard_normal((40, 30))
+    run = lambda unit, **options: dp.laplace(
+        lambda x: anp.dot(rows, anp.reshape(x, -1) / unit), np.zeros((6, 5)), (unit * MATERN) * unit, **options
+    )
+    for options in ({}, {"rank": 29}):
+        posterior = run(unit, **options)
+        expected = run(1.0, **options)
+        assert posterior.eigenvalues == pytest.approx(expected.eigenvalues, rel=1e-8)
+        assert posterior.variance() / unit**2 == pytest.approx(expected.variance(), rel=1e-8)
+
+
+def test_single_precision():
+    x = np.zeros(40, np.float32)
+    posterior = dp.laplace(lambda x: 3.0 * x[:20], x, 1.0)
+    assert posterior.sample(1)[0].dtype == np.float32 and posterior.variance().dtype == float
+    assert posterior.variance() == pytest.approx(np.where(np.arange(40) < 20, 0.1, 1.0), rel=1e-6)
+    posterior = dp.laplace(lambda x: 0.5 * anp.sum(9.0 * x[:20] ** 2), x, 1.0)
+    assert posterior.variance() == pytest.approx(np.where(np.arange(40) < 20, 0.1, 1.0), rel=1e-4)
+
+
+def test_nothing_to_learn():
+    """No unknowns, no data, and data that do not depend on the unknowns: the posterior is the prior."""
+    empty = dp.laplace(lambda x: x, np.zeros(0), 1.0)
+    assert empty.variance().shape == (0,) and empty.sample(1)[0].shape == (0,) and empty.information_gain == 0
+    for misfit in (lambda x: x[:0], lambda x: np.ones(3), lambda x: 0.0 * x, lambda x: 0.0, lambda x: 0.0 * anp.sum(x)):
+        posterior = dp.laplace(misfit, np.zeros(4), 2.0, rank=2)
+        assert posterior.eigenvalues.shape == (0,) and np.all(posterior.variance() == 2.0)
+        assert posterior.information_gain == 0 and posterior.expected_information_gain == 0
+        assert np.std(posterior.sample(2000)) == pytest.approx(2.0**0.5, rel=0.05)
+
+
+def test_exact_data():
+    """Noise of 1e-9: no digits of the small variances are lost, and none of the large ones."""
+    posterior = dp.laplace(lambda x: 1e9 * x[:3], np.zeros(5), 1.0)
+    assert posterior.variance() == pytest.approx([1e-18, 1e-18, 1e-18, 1.0, 1.0], rel=1e-9)
+    assert posterior.std_of(lambda x: x[0]) == pytest.approx(1e-9, rel=1e-9)
+    assert np.std(np.array(posterior.sample(500))[:, 0]) == pytest.approx(1e-9, rel=0.1)
+
+
+def test_wide_prior_is_the_covariance_of_least_squares():
+    """Without prior knowledge, the covariance is that of minimize with absolute_sigma."""
+    times = np.linspace(0.0, 2.0, 30)
+    data = 3.0 * np.exp(-1.5 * times) + 0.05 * np.random.default_rng(2).standard_normal(30)
+    residuals = lambda p: (p["size"] * anp.exp(-p["rate"] * times) - data) / 0.05
+    best = dp.minimize(residuals, {"size": 1.0, "rate": 1.0}, "gauss_newton", absolute_sigma=True)
+    posterior = dp.laplace(residuals, best.x, 1e12)
+    assert dense(posterior.covariance) == pytest.approx(best.covariance, rel=1e-6)
+    assert list(posterior.variance().values()) == pytest.approx(np.diag(best.covariance), rel=1e-6)
+    assert posterior.shift < 1e-4
+
+
+def test_hessian_of_a_loss_may_be_indefinite():
+    """An eigenvalue between -1 and 0 makes the posterior wider than the prior."""
+    posterior = dp.laplace(lambda x: 0.5 * anp.sum(np.array([4.0, -0.5, 0.0]) * x**2), np.zeros(3), 1.0)
+    assert posterior.variance() == pytest.approx([0.2, 2.0, 1.0])
+    assert posterior.eigenvalues == pytest.approx([4.0, -0.5])
+    assert np.var(np.array(posterior.sample(4000)), axis=0) == pytest.approx([0.2, 2.0, 1.0], rel=0.1)
+
+
+def test_covariance_is_a_differentiable_operator(rng):
+    posterior = dp.laplace(lambda x: anp.reshape(x, -1)[:4] * 3.0, np.zeros((6, 5)), MATERN)
+    assert dp.check.operator(posterior.covariance).ok
+    assert posterior.covariance.domain == GRID.cells
+    weights = rng.standard_normal((6, 5))
+    loss = lambda u: anp.sum(weights * posterior.covariance(u) ** 2)
+    assert dp.check.gradient(loss, weights, quick=True).verdict == "agrees"
+
+
+def test_deviation_of_a_nonlinear_quantity(rng):
+    """std_of uses the derivative of the quantity at x."""
+    mean = rng.standard_normal(12)
+    posterior = dp.laplace(lambda x: 2.0 * (x[:5] - mean[:5]), mean, 1e-8, prior_mean=mean)
+    quantity = lambda x: anp.stack([anp.sum(x**3), anp.exp(x[0])])
+    values = np.array([quantity(x) for x in posterior.sample(1000)])
+    assert posterior.std_of(quantity) == pytest.approx(np.std(values, axis=0), rel=0.1)
+    assert posterior.std_of(lambda x: 3.0) == 0.0
+
+
+def test_jitted_misfit_and_pickles():
+    posterior = dp.laplace(dp.jit(lambda x: 2.0 * x[:5]), np.zeros(8), 1.0)
+    again = pickle.loads(pickle.dumps(posterior))
+    assert np.array_equal(again.variance(), posterior.variance())
+    assert posterior.eigenvalues == pytest.approx(np.full(5, 4.0))
+    assert "eigenvalues" in posterior._repr_html_()
+
+
+def coverage(rng, data_sets, prior, samples_of_prior, rows):
+    """Count how often intervals of 90 % and 95 % hold the truth: of a weighted sum and of an entry."""
+    weights = rng.standard_normal(rows.shape[1])
+    held = np.zeros((2, 2), int)
+    for truth in samples_of_prior(data_sets):
+        data = rows @ truth + rng.standard_normal(len(rows))
+        residuals = lambda x, data=data: anp.dot(rows, x) - data
+        posterior = dp.laplace(residuals, np.zeros(truth.size), prior)
+        error = posterior.x + posterior.step - truth
+        off = [
+            abs(weights @ error) / posterior.std_of(lambda x: anp.dot(weights, x)),
+            abs(error[7]) / np.sqrt(posterior.variance()[7]),
+        ]
+        held += np.less.outer(off, [1.6449, 1.9600])
+    return held
+
+
+@pytest.mark.filterwarnings("ignore:x is:sparsedp.errors.PosteriorWarning")
+@pytest.mark.parametrize("data_sets", [40, pytest.param(200, marks=pytest.mark.slow)])
+def test_coverage(rng, data_sets):
+    """Intervals hold the truth as often as they say, for data sets drawn from the prior: binomial bounds."""
+    rows = rng.standard_normal((25, 30)) * 3.0
+    held = coverage(rng, data_sets, MATERN, lambda count: sampled(MATERN, rng, count), rows)
+    for share, counts in zip((0.9, 0.95), held.T):
+        least, most = binom.ppf([1e-4, 1 - 1e-4], data_sets, share)
+        assert np.all(counts >= least) and np.all(counts <= most)
+
+
+def sampled(prior, rng, count):
+    root = scipy.linalg.cholesky(dense(prior), lower=True)
+    return [root @ rng.standard_normal(len(root)) for _ in range(count)]

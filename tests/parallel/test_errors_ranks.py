@@ -68,6 +68,21 @@ REFUSED = [
     ),
     (
         TypeError,
+        "laplace does not work on ranks yet; give it the grid from before dp.distribute",
+        lambda s: dp.laplace(lambda u: u, s.u, 1.0),
+    ),
+    (
+        TypeError,
+        "laplace does not work on ranks yet; give it the grid from before dp.distribute",
+        lambda s: dp.laplace(lambda u: u, np.ones((5, 4)), dp.identity(s.grid.cells)),
+    ),
+    (
+        TypeError,
+        "a misfit of laplace does not work on ranks yet; give it the grid from before dp.distribute",
+        lambda s: dp.laplace(lambda u: u * s.u, 1.0, 1.0),
+    ),
+    (
+        TypeError,
         "transport.operator does not work on ranks yet; give it the grid from before dp.distribute",
         lambda s: dp.transport(s.grid).operator(np.ones(s.grid.faces.size), 0.1),
     ),
