@@ -27,6 +27,32 @@ class Bug(NamedTuple):
 
 
 BUGS = {
+    "the first field beyond a wall in all stages": Bug(
+        "advection/eulerian.py",
+        "                beyond = self._values_beyond_walls(x, inflow)\n                slopes",
+        "                beyond = self._values_beyond_walls(u, inflow)\n                slopes",
+        "tests/advection/test_patches.py",
+        compiled=True,
+    ),
+    "a cotangent of inflow where no inflow is": Bug(
+        "advection/eulerian.py",
+        "                of_inflow[repeated] = 0.0\n",
+        "",
+        "tests/advection/test_patches.py",
+        compiled=True,
+    ),
+    "inflow on the whole of a wall, in the matrices": Bug(
+        "advection/control_volumes.py",
+        "        return sides._replace(wall=np.where(is_repeated, -1, sides.wall))\n",
+        "        return sides\n",
+        "tests/advection/test_patches.py",
+    ),
+    "inflow on the whole of a wall, in ghost cells": Bug(
+        "advection/ghost_cells.py",
+        "where=chosen)",
+        "where=True)",
+        "tests/advection/test_patches.py",
+    ),
     "an opening that is the whole wall": Bug(
         "flow/projection_setup.py",
         "            is_open: Any = wall.faces_with(open_side)\n",

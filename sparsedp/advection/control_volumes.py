@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sparsedp import kernels
-from sparsedp.grid.boundary_conditions import neumann
+from sparsedp.grid.boundary_conditions import MixedWall, neumann
 from sparsedp.kernels.fluxes import (
     COLUMN,
     EXTRA,
@@ -83,6 +83,10 @@ class Component(NamedTuple):
         Number of tiles that the loops run over.
     work : int
         Number of values that the loops process: one pass for each axis. Two threads are faster from 512^2 cells on.
+    repeated : int array, shape (2, m)
+        Indices of inflow values that are not used, because the wall has the value of the point there, and the indices
+        of these points. Empty unless a wall has several conditions. The loops read an inflow value on the whole of such
+        a wall, so that the caller writes the values of the points there.
     """
 
     field: slice
@@ -93,6 +97,7 @@ class Component(NamedTuple):
     axes: NDArray[np.int64]
     tiles: int
     work: int
+    repeated: NDArray[np.int64]
 
     @property
     def points(self) -> int:
@@ -105,7 +110,9 @@ class Component(NamedTuple):
 
     def sides(self, axis: int) -> Sides:
         """Return the sides of all points along an axis."""
-        return _sides(self.axes[axis], np.arange(self.points))
+        sides = _sides(self.axes[axis], np.arange(self.points))
+        is_repeated = (sides.wall >= 0) & np.isin(sides.wall, self.repeated[0])
+        return sides._replace(wall=np.where(is_repeated, -1, sides.wall))
 
 
 def components(settings: TransportSettings, limited: bool) -> list[Component]:
@@ -119,6 +126,8 @@ def components(settings: TransportSettings, limited: bool) -> list[Component]:
         tables: list = []
         speeds = 0
         wall_values = 0
+        repeated = [np.zeros((2, 0), np.int64)]
+        numbers = np.arange(points).reshape(shape)
         for axis, n in enumerate(shape):
             row = axes[axis]
             lines = points // n
@@ -133,6 +142,10 @@ def components(settings: TransportSettings, limited: bool) -> list[Component]:
                         row[WALL + side] = SAME_AS_CELL
                     else:
                         row[WALL + side] = wall_values + side * lines
+                    if isinstance(condition, MixedWall):
+                        places = np.flatnonzero(condition.faces_with(lambda on_face: on_face == neumann))
+                        at_wall = np.take(numbers, -side, axis).reshape(-1)
+                        repeated.append(np.stack([row[WALL + side] + places, at_wall[places]]))
                 wall_values += 2 * lines
                 if row[ON_SIDES]:
                     row[EXTRA] = row[STRIDE]
@@ -157,6 +170,7 @@ def components(settings: TransportSettings, limited: bool) -> list[Component]:
                 axes=axes,
                 tiles=points // shape[-1] * -(-shape[-1] // TILE),
                 work=points * len(axes),
+                repeated=np.concatenate(repeated, axis=1),
             )
         )
         field_start = result[-1].field.stop

@@ -87,8 +87,9 @@ class Eulerian(TransportMethod):
             for keep in self.scheme.stages:
                 x = out
                 out = self._new_field()
-                slopes = self._loops.slopes(x, inflow, partials=False)
-                invalid += self._loops.stage(x, slopes, w, dt, inflow, u, keep, out)
+                beyond = self._values_beyond_walls(x, inflow)
+                slopes = self._loops.slopes(x, beyond, partials=False)
+                invalid += self._loops.stage(x, slopes, w, dt, beyond, u, keep, out)
             must_check = invalid or not isfinite(self._unread_sum(v, inflow))
         else:
             with np.errstate(all="ignore"):
@@ -99,6 +100,26 @@ class Eulerian(TransportMethod):
             check_stability(self.settings, dt, self.reference.rate(v), self.scheme.max_courant)
             check_finite(self.name, out.reshape(self.settings.space.shape), "cannot represent the result")
         return out
+
+    @cached_property
+    def _repeated(self) -> tuple[NDArray, NDArray]:
+        """The inflow values that stand for the value of a point, and these points; see `Component`."""
+        components = self.reference.components
+        values = [component.inflow.start + component.repeated[0] for component in components]
+        points = [component.field.start + component.repeated[1] for component in components]
+        return np.concatenate(values), np.concatenate(points)
+
+    def _values_beyond_walls(self, u: NDArray, inflow: NDArray) -> NDArray:
+        """Return the inflow values, replaced by the values of the points on those faces of mixed walls without inflow.
+
+        They depend on the field, so they differ from stage to stage.
+        """
+        values, points = self._repeated
+        if not values.size:
+            return inflow
+        beyond = inflow.copy()
+        beyond[values] = u[points]
+        return beyond
 
     def _unread_sum(self, v: NDArray, inflow: NDArray) -> float:
         """Return the sum of the values that the loops may not read: inflow at closed walls, velocity in the solid.
@@ -143,7 +164,7 @@ class Eulerian(TransportMethod):
         if of_velocity.size:
             cotangents[VELOCITY] = self.interpolate_velocity_vjp(of_velocity)
         # The count of non-finite values in the loops omits the contributions of interpolation and slopes.
-        counted = self.accumulates and not (self.scheme.limiter and of_field_wanted)
+        counted = self.accumulates and not (self.scheme.limiter and of_field_wanted) and not self._repeated[0].size
         finite = counted and not invalid and (not of_inflow.size or isfinite(of_inflow.sum()))
         return tuple([cotangents[num] for num in nums]), finite
 
@@ -168,13 +189,15 @@ class Eulerian(TransportMethod):
             if stages:
                 last = stages[-1]
                 x = self._new_field()
-                self._loops.stage(last.x, last.slopes, w, dt, inflow, u, last.keep, x)
-            stages.append(_Stage(x, self._loops.slopes(x, inflow, partials=True), keep))
+                self._loops.stage(last.x, last.slopes, w, dt, last.beyond, u, last.keep, x)
+            beyond = self._values_beyond_walls(x, inflow)
+            stages.append(_Stage(x, self._loops.slopes(x, beyond, partials=True), keep, beyond))
         of_inflow = np.zeros(inflow.size)
+        repeated, points = self._repeated
         of_first_field = None  # cotangent of u from its direct use in the means of later stages
         invalid = 0.0
         while stages:
-            x, slopes, keep = stages.pop()
+            x, slopes, keep, beyond = stages.pop()
             if keep:
                 share = keep * g
                 if of_first_field is None:
@@ -186,7 +209,11 @@ class Eulerian(TransportMethod):
                 of_x = self._new_field()
             else:
                 of_x = EMPTY
-            invalid = self._loops.vjp(g, x, slopes, w, dt, inflow, of_x, of_inflow, of_velocity, of_velocity_is_set)
+            invalid = self._loops.vjp(g, x, slopes, w, dt, beyond, of_x, of_inflow, of_velocity, of_velocity_is_set)
+            if repeated.size:
+                if of_x.size:
+                    np.add.at(of_x, points, of_inflow[repeated])  # a point in a corner is at several walls
+                of_inflow[repeated] = 0.0
             g = of_x
             of_velocity_is_set = False
         if of_first_field is not None and of_field_wanted:
@@ -210,6 +237,7 @@ class _Stage(NamedTuple):
     x: NDArray
     slopes: list
     keep: float
+    beyond: NDArray  # the values beyond walls, in the place of the inflow
 
 
 def _has_compiled_loops() -> bool:

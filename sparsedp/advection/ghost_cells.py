@@ -2,19 +2,20 @@
 
 Ghost cells beyond a wall have the value of the nearest point (neumann) or the inflow value (dirichlet); the first of
 them is one spacing beyond the last point. On a periodic axis they have the values of the other end. A ghost cell beyond
-the ends of two axes is set by the condition of the later axis.
+the ends of two axes is set by the condition of the later axis. On a wall with several conditions, the condition of the
+nearest face applies.
 """
 
 from __future__ import annotations
 
 from functools import reduce
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from sparsedp.advection.settings import wall_space
-from sparsedp.grid.boundary_conditions import dirichlet
+from sparsedp.grid.boundary_conditions import MixedWall, dirichlet
 from sparsedp.kernels.interpolation_weights import PAD
 from sparsedp.operators.stencils import adjacent_cell
 
@@ -58,10 +59,15 @@ def ghost_sources(
     wall = number * sum(2 for pair in sides if pair)
     for axis, pair in enumerate(sides):
         for beyond, condition in zip((slice(PAD), slice(-PAD, None)), pair or ()):
-            if condition == dirichlet and not closed:
+            if (condition == dirichlet or isinstance(condition, MixedWall)) and not closed:
                 values = samples.size + np.arange(*walls.offsets[wall : wall + 2]).reshape(walls.parts[wall])
-                along_wall = [*nearest[:axis], [0], *nearest[axis + 1 :]]
-                sources[(slice(None),) * axis + (beyond,)] = values[np.ix_(*along_wall)]
+                along_wall = np.ix_(*nearest[:axis], np.zeros(1, int), *nearest[axis + 1 :])
+                chosen: Any = True
+                if isinstance(condition, MixedWall):
+                    with_inflow = condition.faces_with(lambda on_face: on_face == dirichlet)
+                    chosen = with_inflow.reshape(walls.parts[wall])[along_wall]
+                target = sources[(slice(None),) * axis + (beyond,)]
+                np.copyto(target, values[along_wall], where=chosen)
             wall += 1
     ghosts = np.flatnonzero(sources != samples)
     return ghosts, sources.ravel()[ghosts]

@@ -18,7 +18,16 @@ from sparsedp.advection.semi_lagrangian import SemiLagrangian
 from sparsedp.advection.settings import TransportSettings
 from sparsedp.autodiff.tape import isbox, sample
 from sparsedp.errors import DerivativeError
-from sparsedp.grid.boundary_conditions import dirichlet, neumann, resolve
+from sparsedp.grid.boundary_conditions import (
+    MixedWall,
+    conditions_of,
+    describe_patches,
+    dirichlet,
+    neumann,
+    occurring,
+    resolve,
+    walls_of,
+)
 from sparsedp.grid.grid import check_grid
 from sparsedp.kernels.fluxes import SCHEMES
 from sparsedp.operators.masks_and_lift import check_solid
@@ -87,6 +96,7 @@ def transport(
         Values that enter where the velocity points inwards: for dirichlet `inflow`, for neumann the value of the point
         at the wall. Where the velocity points outwards, both conditions let the field leave. For a closed wall, set
         the velocity to 0. semi_lagrangian and maccormack use these values from one spacing beyond the last point on.
+        An inflow through part of a wall is written with `patch`, for the transport of cells.
     velocity : "faces" or "cells"
         "faces": v is a flat face field. "cells": v has the shape (dim, *grid.shape), in 1-D also grid.shape.
     of : "cells" or "faces"
@@ -133,7 +143,7 @@ def transport(
 
     See Also
     --------
-    upwind, conservation_law, flow_step, convection, dirichlet, neumann
+    upwind, conservation_law, flow_step, convection, dirichlet, neumann, patch
 
     Notes
     -----
@@ -194,7 +204,7 @@ def transport(
     settings = TransportSettings(
         grid=grid,
         scheme=scheme,
-        sides=_sides(grid, boundary),
+        sides=_sides(grid, boundary, of),
         velocity=velocity,
         of=of,
         interpolation=interpolation,
@@ -207,11 +217,11 @@ def transport(
     return Transport(settings)
 
 
-def _sides(grid: Grid, boundary: Any) -> tuple:
+def _sides(grid: Grid, boundary: Any, of: str) -> tuple:
     """Return the conditions of both sides of each axis; raise unless they are dirichlet or neumann."""
-    sides = resolve(grid, boundary, name="transport")
-    for pair in sides:
-        for condition in pair or ():
+    sides = resolve(grid, boundary, patches=of == "cells", name="transport of faces")
+    for _, _, wall in walls_of(sides):
+        for condition in conditions_of(wall):
             if condition not in (dirichlet, neumann):
                 raise ValueError(
                     f"transport takes dirichlet (inflow values) or neumann (outflow), got {condition}; "
@@ -264,7 +274,7 @@ class Transport(Frozen, Reconstructible):
 
     def _check_inflow(self, inflow: Any) -> None:
         """Raise ValueError if no side uses the inflow values. Constant zeros and empty arrays are accepted."""
-        if any(condition == dirichlet for pair in self.settings.sides for condition in pair or ()):
+        if dirichlet in occurring(self.settings.sides):
             return
         values = sample(inflow)
         if np.size(values) and (isbox(inflow) or np.any(values)):
@@ -334,13 +344,16 @@ class Transport(Frozen, Reconstructible):
 
     def __repr__(self) -> str:
         settings = self.settings
-        conditions = {str(condition) for pair in settings.sides for condition in pair or ()}
+        conditions = {str(wall) for _, _, wall in walls_of(settings.sides) if not isinstance(wall, MixedWall)}
         words = [f"velocity on {settings.velocity}"]
         if settings.form:
             words.append(f"{settings.form} form")
         else:
             words += [settings.interpolation, settings.backtrace]
         words += sorted(conditions)
+        patches = describe_patches(settings.sides).strip("[]")
+        if patches:
+            words.append(patches)
         if settings.solid is not None:
             words.append(f"{np.count_nonzero(settings.solid)} solid cells")
         return f"<transport {settings.scheme}: {self.space}, {', '.join(words)}>"

@@ -40,6 +40,7 @@ __all__ = [
     "MixedWall",
     "Patch",
     "check_condition",
+    "conditions_of",
     "describe_patches",
     "dirichlet",
     "free_slip",
@@ -538,7 +539,7 @@ def patch(where: Any, condition: Any, elsewhere: Any = None) -> Patch:
 
     See Also
     --------
-    dirichlet, neumann, robin, no_slip, free_slip, inflow, outflow, lift, gradient, laplacian, projection
+    dirichlet, neumann, robin, no_slip, free_slip, inflow, outflow, lift, gradient, laplacian, transport, projection
 
     Notes
     -----
@@ -552,9 +553,9 @@ def patch(where: Any, condition: Any, elsewhere: Any = None) -> Patch:
     returns an array that is 20 on the faces of the patch `heated`, and 0 on the others.
 
     These functions accept patches: `gradient`, `laplacian`, `lift`, `average` and `upwind`, and with them `inverse` and
-    `elliptic_solver`; for flows `projection`, `flow_step`, `face_laplacian`, `face_lift`, `convection` and `forces`.
-    All others refuse them, and so do distributed grids. Operators with patches are not sums of 1-D operators: `inverse`
-    uses sparse factors or multigrid for them, and method "separable" does not apply.
+    `elliptic_solver`; `transport` of cell fields; for flows `projection`, `flow_step`, `face_laplacian`, `face_lift`,
+    `convection` and `forces`. All others refuse them, and so do distributed grids. Operators with patches are not sums
+    of 1-D operators: `inverse` uses sparse factors or multigrid for them, and method "separable" does not apply.
 
     Examples
     --------

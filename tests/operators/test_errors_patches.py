@@ -147,10 +147,10 @@ TABLE = [
         "the wall, got shape (3,)",
     ),
     (
-        lambda: dp.transport(BOX, boundary={"x": WALL}),
+        lambda: dp.transport(BOX, boundary={"x": WALL}, of="faces"),
         TYPE,
-        "transport takes one condition for each wall, but x-lower has a patch; write one condition, such as "
-        "dp.dirichlet",
+        "transport of faces takes one condition for each wall, but x-lower has a patch; write one condition, "
+        "such as dp.dirichlet",
     ),
 ]
 
