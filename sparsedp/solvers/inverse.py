@@ -114,7 +114,7 @@ def inverse(
 
     See Also
     --------
-    laplacian, Operator, elliptic_solver, matrix_solver, implicit, matrix_power
+    laplacian, Operator, elliptic_solver, matrix_solver, eigenpairs, implicit, matrix_power
 
     Notes
     -----

@@ -59,7 +59,8 @@ SMALLEST_EXPONENT = -1022  # of a float with all its digits
 class ParametricSolver(Reconstructible):
     """A solver of (shift - D diag(k) G) x = b, with a derivative rule in (k, b, shift).
 
-    A subclass has a `name` and defines ``_operator(k, shift)``, which may keep the arrays.
+    A subclass has a `name` and defines ``_operator(k, shift)``, which may keep the arrays, and
+    ``of_coefficients(*given)``, which returns the solver and the checked (k, shift) of the coefficients of a call.
 
     Parameters
     ----------
@@ -75,6 +76,7 @@ class ParametricSolver(Reconstructible):
     name: str
     all_rows = True  # refuse an operator with an equation that no unknown can satisfy: see `build`
     _operator: Any
+    of_coefficients: Any  # for `eigenpairs`
 
     def __init__(self, D: Operator, G: Operator, settings: SolveSettings) -> None:
         self.D = D
@@ -199,7 +201,7 @@ def elliptic_solver(
 
     See Also
     --------
-    harmonic_average, inverse, matrix_solver
+    eigenpairs, harmonic_average, inverse, matrix_solver
 
     Notes
     -----
@@ -315,6 +317,13 @@ class EllipticSolver(ParametricSolver):
         k_copy = np.array(values, np.result_type(values, float))
         shift_copy = np.array(shift, np.result_type(shift, float))
         return solver._operator(k_copy, shift_copy)
+
+    def of_coefficients(self, k: Any, shift: Any = 0.0) -> tuple[ParametricSolver, tuple[Any, Any]]:
+        """Return the solver of these coefficients, and (k, shift) of its operator, checked."""
+        check_plain("elliptic_solver", k, shift)
+        shift = _checked_parameter("shift", shift, self.D.codomain)
+        k, solver = self._coefficient_and_solver(k)
+        return solver, (k, shift)
 
     def _coefficient_and_solver(self, k):
         """Return k for each face and this solver, or a tensor at the corners of cells and its solver."""
@@ -490,7 +499,7 @@ def matrix_solver(
 
     See Also
     --------
-    inverse, elliptic_solver
+    eigenpairs, inverse, elliptic_solver
 
     Notes
     -----
@@ -650,6 +659,18 @@ class MatrixSolver(ParametricSolver):
         array of the shape of b
         """
         check_plain(self.name, data, b)
+        data = self._entries(data)
+        if not isbox(b):
+            b = np.asarray(b)
+        return self._solution(data, b, 0.0)
+
+    def of_coefficients(self, data: Any) -> tuple[ParametricSolver, tuple[Any, Any]]:
+        """Return this solver, and (k, shift) of its operator for the argument `data` of a call."""
+        check_plain(self.name, data)
+        return self, (self._entries(data), 0.0)
+
+    def _entries(self, data):
+        """Return the entries of the matrix for the argument `data` of a call."""
         if self.assembly is not None:
             data = self.assembly(data)
         values = np.asarray(sample(data))
@@ -658,9 +679,7 @@ class MatrixSolver(ParametricSolver):
         if not isbox(data):
             data = values
         check_values(partial(check_finite, "data", where=self._place_of), data)
-        if not isbox(b):
-            b = np.asarray(b)
-        return self._solution(data, b, 0.0)
+        return data
 
     def _place_of(self, entry):
         return f"row {self.rows[entry]}, column {self.columns[entry]}"

@@ -149,7 +149,7 @@ def matrix_function(op: Operator, f: Callable[[NDArray[Any]], ArrayLike]) -> Ope
 
     See Also
     --------
-    matrix_exponential, matrix_power
+    matrix_exponential, matrix_power, eigenpairs
 
     Notes
     -----

@@ -256,7 +256,7 @@ def test_every_builder_is_here():
         "sponge identity divergence curl upwind component prolong harmonic_average from_functions from_linear_operator"
     )
     calls = "matrix_function from_blackbox minimize laplace certify certified explain stress work_precision rollout"
-    calls += " jit grad value_and_grad vjp jvp hvp differentiable set_threads steady distribute gather"
+    calls += " eigenpairs jit grad value_and_grad vjp jvp hvp differentiable set_threads steady distribute gather"
     shown = "animate plot convergence v_curve update_direction save load from_image"
     public = {name for name in dir(dp) if callable(getattr(dp, name)) and name.islower() and name[0] != "_"}
     public -= {"dirichlet", "neumann"}  # a call of them is refused with advice

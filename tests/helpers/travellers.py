@@ -333,6 +333,7 @@ NOTHING_TO_CALL = {
     "stress",
     "work_precision",
     "explain",
+    "eigenpairs",
     "check",
     "errors",
     "report",

@@ -1,0 +1,512 @@
+"""eigenpairs(op, k): eigenvalues and eigenvectors of an operator, differentiable in its coefficients and the mass."""
+
+from __future__ import annotations
+
+from functools import cached_property, partial
+from inspect import signature
+from typing import TYPE_CHECKING, Any
+
+import autograd.numpy as anp
+import numpy as np
+
+from sparsedp._utils.base_classes import Frozen
+from sparsedp._utils.html import table
+from sparsedp._utils.pytree import leaves
+from sparsedp._utils.validation import (
+    check_choice,
+    check_finite,
+    check_kind,
+    check_number,
+    check_on,
+    check_plain,
+    check_type,
+    check_whole,
+    is_number,
+)
+from sparsedp.autodiff.backend import require_arrays
+from sparsedp.autodiff.program_trace import recording_trace
+from sparsedp.autodiff.tape import Rule, isbox, plain
+from sparsedp.errors import DerivativeError, JitError, NonFiniteError, ShapeError
+from sparsedp.grid.space import fits
+from sparsedp.operators.given import check_operator
+from sparsedp.operators.operator import Operator
+from sparsedp.solvers.eigen_rules import (
+    Constant,
+    Multiplication,
+    OfCoefficients,
+    Problem,
+    Unit,
+    member_values,
+    member_vectors,
+)
+from sparsedp.solvers.eigensolver import METHODS, general_values
+from sparsedp.solvers.parametric import ParametricSolver
+
+if TYPE_CHECKING:
+    from sparsedp._utils.html import Markup
+
+__all__ = ["Eigenpairs", "eigenpairs"]
+
+ROUNDING = 1e-12  # eigenvalues that differ by this share of the size of the operator are equal
+
+
+def eigenpairs(
+    op: Any,
+    k: int = 1,
+    which: str | float = "smallest",
+    mass: Any = None,
+    coefficients: Any = (),
+    mass_coefficients: Any = (),
+    symmetric: bool = True,
+    cluster: float = 1e-6,
+    method: str = "auto",
+    rtol: float = 1e-10,
+    maxiter: int | None = None,
+) -> Eigenpairs:
+    """Return k eigenvalues and eigenvectors of a symmetric operator, A v = lambda v or A v = lambda M v.
+
+    Parameters
+    ----------
+    op : Operator, or a solver of `elliptic_solver` or `matrix_solver`
+        A. A solver stands for the operator that it inverts, with the given `coefficients`.
+    k : int
+        Number of pairs, 1 <= k <= n.
+    which : "smallest", "largest" or float
+        The k smallest eigenvalues with their signs, the k largest, or those nearest to a number.
+    mass : None, number, array, Operator or a solver of `matrix_solver`, optional
+        M: None stands for the identity, a number or an array like a field for a multiplication. Positive (definite).
+    coefficients : Any
+        Of a solver `op`: k or (k, shift) of `elliptic_solver`, the entries of `matrix_solver`.
+    mass_coefficients : Any
+        Of a solver `mass`.
+    symmetric : bool
+        If False, the operator may be any one, and the result has values only, which may be complex and have no
+        derivatives. If True, an operator that is not symmetric is refused.
+    cluster : float
+        Neighbouring eigenvalues whose relative difference is smaller form a cluster; see Notes.
+    method : "auto", "dense", "arpack" or "lobpcg"
+        LAPACK for the full matrix; Lanczos iterations of ARPACK with the inverse of A - sigma M; LOBPCG with an
+        approximate solve as preconditioner, for "smallest". "auto": "dense" up to 512 unknowns, else "arpack".
+    rtol : float
+        Largest relative residual |A v - lambda M v| / |lambda M v| of a pair, unless the residual is at the level of
+        rounding errors.
+    maxiter : int, optional
+        Largest number of iterations of "arpack" or "lobpcg".
+
+    Returns
+    -------
+    Eigenpairs
+        `.values`, shape (k,), ascending; `.vectors`, shape (k, *domain.shape): ``vectors[i]`` is a field, in contrast
+        to the columns of SciPy. ``value, vector = pairs[i]``. `.clusters` lists the equal eigenvalues, of which
+        ``.sum(start, stop)`` and ``.project(u, start, stop)`` are differentiable functions. Differentiable in
+        `coefficients`, `mass` and `mass_coefficients`, to every order.
+
+    Raises
+    ------
+    TypeError
+        If `op` or `mass` is of another type or on ranks, or is not symmetric.
+    ShapeError
+        If `op` is not square, or the mass does not fit.
+    ValueError
+        If k is not between 1 and the number of unknowns, the mass is not positive, or an option is out of range.
+    NonFiniteError
+        If the mass or a coefficient holds NaN or infinity.
+    ConvergenceError
+        If iterations end without the pairs, or the residual of a pair is too large.
+    DerivativeError
+        When a derivative is computed that does not exist: of a single member of a cluster.
+    JitError
+        While `dp.jit` records: the computation depends on the values.
+
+    See Also
+    --------
+    inverse, elliptic_solver, matrix_solver, matrix_function
+
+    Notes
+    -----
+    **Normalisation.** The sum of v_i * M v_j over all entries is 1 for i = j and 0 otherwise. The first entry of a
+    vector that is larger than half of its largest entry is positive. Differences on a stretched grid are symmetric with
+    respect to the cell volumes w; then the sum of w * v_i * M v_j is 1 or 0. Solid cells are not unknowns; vectors
+    are 0 there.
+
+    **Derivatives.** d lambda = v . (dA - lambda dM) v needs no solve. A cotangent of a vector takes one solve of the
+    bordered system [[A - lambda M, -M v], [-(M v)^T, 0]], by sparse LU up to 20 000 unknowns and for a shift, else
+    by MINRES with the inverse of A - sigma M as preconditioner. See solvers/eigen_rules.py.
+
+    **Clusters.** At a multiple eigenvalue the single values have kinks, and the single vectors are arbitrary. What has
+    a derivative are functions that treat the members of a cluster alike: ``pairs.sum(start, stop)`` and
+    ``pairs.project(u, start, stop)`` of whole clusters, in forward and reverse mode and to every order, and in reverse
+    mode to first order every symmetric function of `values` and every function of `vectors` that no rotation changes.
+    Other derivatives are refused, also if the cluster continues behind the last of the k pairs: one more eigenvalue is
+    computed to know that. Other pairs are not affected: ``pairs.values[0]`` and ``pairs[0]`` are differentiable if
+    pair 0 is simple.
+
+    **Multiple eigenvalues** are complete: iterations are repeated in the complement of the pairs that are known.
+
+    Examples
+    --------
+    >>> from sparsedp import Grid, dirichlet, divergence, elliptic_solver, from_matrix, gradient, value_and_grad
+    >>> pairs = eigenpairs(from_matrix([[2.0, 1.0], [1.0, 2.0]]), 2)
+    >>> print(np.round(pairs.values, 12))
+    [1. 3.]
+    >>> grid = Grid(2)
+    >>> rod = elliptic_solver(divergence(grid), gradient(grid, dirichlet))
+    >>> value, slope = value_and_grad(lambda k: eigenpairs(rod, coefficients=k).values[0])(np.ones(3))
+    >>> print(np.round(value, 12), np.round(slope, 12))
+    8.0 [4. 0. 4.]
+    """
+    given = leaves((mass, coefficients, mass_coefficients))
+    if recording_trace(given) is not None:
+        raise JitError("dp.jit cannot record eigenpairs, which decides by values; call the function without dp.jit")
+    require_arrays("eigenpairs", map(plain, given))
+    settings = _checked_settings(k, which, symmetric, cluster, method, rtol, maxiter)
+    stiffness = _side("op", op, coefficients, "coefficients")
+    domain, codomain = _spaces(op)
+    if not fits(domain, codomain):
+        raise ShapeError(f"eigenpairs takes a square operator, got one from {domain} to {codomain}; write op.T @ op")
+    masses = _mass_side(mass, mass_coefficients, domain)
+    count, which, symmetric, cluster, method, rtol, maxiter = settings
+    problem = Problem(stiffness, masses, count, which, method, rtol, maxiter)
+    coefficients = [plain(value) for value in problem.coefficients]
+    pencil = problem.pencil(coefficients)
+    _check_count(count, pencil)
+    if not symmetric:
+        return _general(problem, pencil, settings)
+    if pencil.weights is None or not pencil.mass_is_symmetric:
+        name = pencil.given.name if pencil.weights is None else "the mass"
+        raise TypeError(
+            f"eigenpairs takes a symmetric operator, and {name} is not; write symmetric=False for its eigenvalues, or "
+            "0.5 * (A + A.T) for its symmetric part"
+        )
+    if pencil.complex and any(map(isbox, problem.coefficients)):
+        raise DerivativeError(
+            "eigenpairs of complex operators have no derivatives; write the real symmetric operator of real and "
+            "imaginary parts"
+        )
+    return Eigenpairs(problem, domain, cluster)
+
+
+def _checked_settings(k, which, symmetric, cluster, method, rtol, maxiter):
+    """Return the checked options."""
+    k = check_whole("k of eigenpairs", k, 1)
+    check_choice("symmetric", symmetric, (True, False))
+    check_choice("method of eigenpairs", method, METHODS)
+    if isinstance(which, str) or not (is_number(which) or isinstance(which, complex)):
+        check_choice("which", which, ("smallest", "largest"), "; write 'smallest', 'largest' or a number near to them")
+    elif not np.isfinite(which):
+        raise NonFiniteError(f"which must be finite, got {which}")
+    elif isinstance(which, complex) and symmetric:
+        raise TypeError(f"the eigenvalues of a symmetric operator are real, got which={which}; write a real number")
+    cluster = check_number("cluster", cluster, "from 0 to below 1")
+    rtol = check_number("rtol", rtol, "between 0 and 1")
+    if maxiter is not None:
+        maxiter = check_whole("maxiter", maxiter, 1)
+    return k, which, symmetric, cluster, method, rtol, maxiter
+
+
+def _spaces(op):
+    """Return the domain and the codomain of an Operator, or of the operator of a solver."""
+    if isinstance(op, ParametricSolver):
+        return op.G.domain, op.D.codomain
+    return op.domain, op.codomain
+
+
+def _side(name, op, coefficients, of):
+    """Return an operator of the problem with its coefficients."""
+    if isinstance(op, ParametricSolver):
+        op.D.backend.check("eigenpairs")
+        op.D.codomain.backend.check("eigenpairs")
+        given = coefficients if isinstance(coefficients, tuple) else (coefficients,)
+        if not given:
+            raise TypeError(f"eigenpairs needs the coefficients of {op!r}, got none; write {of}=...")
+        most = len(signature(op.of_coefficients).parameters)
+        if len(given) > most:
+            raise TypeError(f"{op!r} has up to {most} coefficients, got {len(given)}; write {of}=...")
+        return OfCoefficients(*op.of_coefficients(*given))
+    if callable(op) and not isinstance(op, Operator):
+        example = "dp.from_functions(f, f, n, n), or the solver of dp.elliptic_solver with coefficients="
+        check_type(f"eigenpairs, as {name},", op, Operator, "an Operator", example)
+    check_operator("eigenpairs", op)
+    if not (isinstance(coefficients, tuple) and not coefficients):
+        raise TypeError(f"{of} belong to a solver, got an Operator {op}; write eigenpairs(solve, {of}=...)")
+    return Constant(op)
+
+
+def _mass_side(mass, coefficients, domain):
+    """Return the mass of the problem."""
+    if mass is None:
+        return Unit()
+    if isinstance(mass, (Operator, ParametricSolver)):
+        side = _side("mass", mass, coefficients, "mass_coefficients")
+        for space in _spaces(mass):
+            if not fits(space, domain):
+                raise ShapeError(f"the mass of eigenpairs acts on {space}, but the operator on {domain}")
+        return side
+    check_plain("eigenpairs", mass)
+    values = np.asarray(plain(mass))
+    check_kind("the mass of eigenpairs", values.dtype, "real numbers")
+    if values.shape not in ((), domain.shape):
+        raise ShapeError(
+            f"the mass of eigenpairs is a number or a field on {domain.described}, got an array of shape {values.shape}"
+        )
+    check_finite("the mass of eigenpairs", values)
+    if np.any(values <= 0):
+        raise ValueError(f"the mass of eigenpairs must be > 0, got {np.min(values):g} at {np.argmin(values)}")
+    return Multiplication(mass if isbox(mass) else values.astype(np.result_type(values, float)))
+
+
+def _check_count(k, pencil):
+    """Raise ValueError if there are fewer than k eigenvalues."""
+    if k > pencil.unknowns:
+        raise ValueError(
+            f"eigenpairs got k={k}, but {pencil.given.name} has {pencil.unknowns} unknowns; write a smaller k"
+        )
+
+
+def _general(problem, pencil, settings):
+    """Return the eigenvalues of an operator that need not be symmetric."""
+    k, which, _, _, method, _, maxiter = settings
+    values = general_values(pencil, k, which, method, maxiter)
+
+    def forward(*coefficients):
+        return values
+
+    def refused(*args):
+        raise DerivativeError(
+            "eigenpairs with symmetric=False has no derivatives; a symmetric operator has them with symmetric=True"
+        )
+
+    return GeneralValues(Rule("eigenpairs", forward, refused, refused)(*problem.coefficients))
+
+
+class GeneralValues(Frozen):
+    """The eigenvalues of an operator that need not be symmetric.
+
+    Attributes
+    ----------
+    values : array, shape (k,)
+        Complex in general, in ascending order of their real parts.
+    """
+
+    values: Any
+    attribute_suggestions = {"vectors": "eigenpairs(op, k) of a symmetric operator: symmetric=False gives values only"}
+
+    def __init__(self, values: Any) -> None:
+        super().__init__(values=values)
+
+    def __repr__(self) -> str:
+        return f"<{len(self.values)} eigenvalues>"
+
+
+class Eigenpairs:
+    """Eigenvalues and eigenvectors, which `eigenpairs` returns.
+
+    Parameters
+    ----------
+    problem : Problem
+    domain : Space
+    cluster : float
+        Relative difference of the eigenvalues of a cluster.
+
+    Attributes
+    ----------
+    clusters : tuple of range
+        The numbers of the pairs of each cluster; a simple eigenvalue is a cluster of one.
+    cut : tuple of bool
+        Whether a cluster has members that are not among the k pairs.
+    """
+
+    def __init__(self, problem: Problem, domain: Any, cluster: float) -> None:
+        self._problem = problem
+        self._domain = domain
+        self._tolerance = cluster
+        spectrum = problem.first.spectrum
+        pencil = problem.first.pencil
+        self._floor = ROUNDING * float(np.ldexp(pencil.scale, pencil.exponent))
+        self.clusters: tuple[range, ...] = _clusters(spectrum.values, self._are_equal)
+        self._beyond = spectrum.beyond
+        self._plain_values = spectrum.values
+        cut = []
+        for members in self.clusters:
+            ends = spectrum.values[[members.start, members.stop - 1]]
+            cut.append(any(self._are_equal(end, value) for end in ends for value in spectrum.beyond))
+        self.cut: tuple[bool, ...] = tuple(cut)
+
+    def _are_equal(self, one, other):
+        """Return whether two eigenvalues belong to one cluster."""
+        return abs(one - other) <= max(self._tolerance * max(abs(one), abs(other)), self._floor)
+
+    # ------------------------------------------------------------ values and vectors
+
+    @cached_property
+    def values(self) -> Any:
+        """The eigenvalues, ascending, shape (k,)."""
+        if not any(map(isbox, self._problem.coefficients)):
+            return self._plain_values.copy()
+        return anp.concatenate([self._values_of(number) for number in range(len(self.clusters))])
+
+    @cached_property
+    def vectors(self) -> Any:
+        """The eigenvectors as fields, shape (k, *domain.shape)."""
+        if not any(map(isbox, self._problem.coefficients)):
+            return self._problem.first.fields(range(len(self))).copy()
+        return anp.concatenate([self._vectors_of(number) for number in range(len(self.clusters))])
+
+    def __getitem__(self, index: int) -> tuple[Any, Any]:
+        """Return the eigenvalue and the eigenvector of one pair; only its own cluster is differentiated."""
+        number, place = self._place(index)
+        return self._values_of(number)[place], self._vectors_of(number)[place]
+
+    def __len__(self) -> int:
+        return len(self._plain_values)
+
+    def sum(self, start: int = 0, stop: int | None = None) -> Any:
+        """Return the sum of the eigenvalues start to stop - 1.
+
+        Parameters
+        ----------
+        start, stop : int
+            Default: all pairs.
+
+        Returns
+        -------
+        float
+            Differentiable in forward and reverse mode, to every order, unless `start` or `stop` cuts a cluster.
+        """
+        chosen = self._chosen(start, stop)
+        total = 0.0
+        for number in self._touched(chosen):
+            if self._is_whole(number, chosen):
+                block = self._problem.block(self.clusters[number])
+                total = total + anp.sum(block * np.eye(len(block)))
+            else:
+                total = total + anp.sum(self._values_of(number)[self._part(number, chosen)])
+        return total
+
+    def project(self, u: Any, start: int = 0, stop: int | None = None) -> Any:
+        """Return the projection of a field on the space of the eigenvectors start to stop - 1.
+
+        Parameters
+        ----------
+        u : array, a field on the domain
+        start, stop : int
+            Default: all pairs.
+
+        Returns
+        -------
+        array like u
+            The sum of v (v . M u) over these vectors. Differentiable in u and in the coefficients, in forward and
+            reverse mode, to every order, unless `start` or `stop` cuts a cluster.
+        """
+        chosen = self._chosen(start, stop)
+        check_plain("project", u)
+        check_on("project", u, self._domain)
+        problem = self._problem
+        _, of_mass = problem.parts(problem.coefficients)
+        image = anp.reshape(problem.first.weights * problem.mass.product(u, of_mass), (-1,))
+        total = np.zeros(self._domain.shape)
+        for number in self._touched(chosen):
+            if self._is_whole(number, chosen):
+                vectors = problem.vectors(self.clusters[number])
+            else:
+                vectors = self._vectors_of(number)[self._part(number, chosen)]
+            shares = anp.dot(anp.conj(anp.reshape(vectors, (len(vectors), -1))), image)
+            total = total + anp.tensordot(shares, vectors, axes=1)
+        return total
+
+    def _chosen(self, start, stop):
+        """Return the range of pairs of two indices, as for a list."""
+        chosen = range(len(self))[start:stop]
+        if not chosen:
+            raise ValueError(f"pairs {start} to {stop} of {len(self)} eigenpairs are none; write start < stop")
+        return chosen
+
+    def _touched(self, chosen):
+        """Return the numbers of the clusters with members in a range of pairs."""
+        return [
+            number
+            for number, members in enumerate(self.clusters)
+            if members.start < chosen.stop and chosen.start < members.stop
+        ]
+
+    def _is_whole(self, number, chosen):
+        members = self.clusters[number]
+        return not self.cut[number] and chosen.start <= members.start and members.stop <= chosen.stop
+
+    def _part(self, number, chosen):
+        """Return the places of the members of a cluster that belong to a range of pairs."""
+        first = self.clusters[number].start
+        return slice(max(chosen.start - first, 0), chosen.stop - first)
+
+    def _place(self, index):
+        """Return the number of the cluster of a pair, and the place of the pair in it."""
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"there is no pair {index} among {len(self)} eigenpairs; write 0 to {len(self) - 1}")
+        index = range(len(self))[index]
+        starts = [members.start for members in self.clusters]
+        number = int(np.searchsorted(starts, index, side="right")) - 1
+        return number, index - starts[number]
+
+    # ------------------------------------------------------------ clusters
+
+    def _values_of(self, number):
+        members = self.clusters[number]
+        if self.cut[number]:
+            return self._problem.cut_values(members, partial(self._refusal, number))
+        block = self._problem.block(members)
+        if len(members) == 1:
+            return anp.reshape(block, (1,))
+        values = self._plain_values[members.start : members.stop]
+        spread = (values[-1] - values[0]) / max(np.max(np.abs(values)), self._floor)
+        return member_values(block, partial(self._refusal, number), float(spread))
+
+    def _vectors_of(self, number):
+        members = self.clusters[number]
+        if self.cut[number]:
+            return self._problem.cut_vectors(members, partial(self._refusal, number))
+        vectors = self._problem.vectors(members)
+        if len(members) == 1:
+            return vectors
+        return member_vectors(vectors, partial(self._refusal, number))
+
+    def _refusal(self, number):
+        """Return the error for a derivative that does not exist."""
+        members = self.clusters[number]
+        values = self._plain_values[members.start : members.stop]
+        if self.cut[number]:
+            nearest = self._beyond[np.argmin(np.abs(self._beyond - values[-1]))]
+            gap = float(np.min(np.abs(values - nearest)))
+            return DerivativeError(
+                f"pair {members.stop - 1} of eigenpairs has no derivative: its eigenvalue {values[-1]:.10g} differs "
+                f"by {gap:.1e} from {nearest:.10g} of the first pair that was not asked for; ask for another k, so "
+                "that no cluster is cut"
+            )
+        gap = float(np.max(np.diff(values)))
+        return DerivativeError(
+            f"pairs {members.start} to {members.stop - 1} of eigenpairs have no derivatives one by one: their "
+            f"eigenvalues {values[0]:.10g} to {values[-1]:.10g} form a cluster with gaps up to {gap:.1e}; write "
+            f"pairs.sum({members.start}, {members.stop}) or pairs.project(u, {members.start}, {members.stop})"
+        )
+
+    # ------------------------------------------------------------ description
+
+    def __repr__(self) -> str:
+        values = self._plain_values
+        return f"<{len(self)} eigenpairs on {self._domain}, from {values[0]:.6g} to {values[-1]:.6g}>"
+
+    def _repr_html_(self) -> Markup:
+        """Return a table for notebooks."""
+        rows = []
+        for members, cut in zip(self.clusters, self.cut, strict=True):
+            more = " or more" if cut else ""
+            rows += [[number, f"{self._plain_values[number]:.10g}", f"{len(members)}{more}"] for number in members]
+        return table(rows, ["pair", "eigenvalue", "multiplicity"], repr(self))
+
+
+def _clusters(values, are_equal):
+    """Return the ranges of neighbouring equal values."""
+    starts = [0]
+    for number in range(1, len(values)):
+        if not are_equal(values[number - 1], values[number]):
+            starts.append(number)
+    return tuple(map(partial(range), starts, [*starts[1:], len(values)]))

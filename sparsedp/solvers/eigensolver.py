@@ -1,0 +1,709 @@
+"""Eigenvalues and eigenvectors of plain operators: the pairs of A v = lambda M v nearest to an end or to a number.
+
+Notes
+-----
+Three methods: LAPACK on the full matrix, ARPACK in shift-invert mode, whose solves are those of `inverse`, and LOBPCG,
+whose preconditioner is an approximate solve. ARPACK and LOBPCG start from a fixed vector, so that results are
+reproducible. Four things happen after each of them:
+
+1. Missing copies: a Krylov space that starts from one vector contains one copy of a multiple eigenvalue; others enter
+   by rounding errors, or never. So the iteration is repeated on the complement of the vectors that are known, until
+   nothing nearer is found.
+2. One step of inverse iteration and a Rayleigh-Ritz projection bring residuals to the level of rounding errors.
+3. The residual of every pair is computed and tested.
+4. The sign of a vector is fixed: its first large entry is positive.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.linalg as la
+import scipy.sparse as sp
+
+from sparsedp._utils.validation import EPS
+from sparsedp.errors import ConvergenceError
+from sparsedp.operators.masks_and_lift import diagonal, identity
+from sparsedp.operators.operator import Operator
+from sparsedp.operators.structure.lazy import Diagonal
+from sparsedp.solvers.choose_method import SolveSettings
+from sparsedp.solvers.inverse import build
+from sparsedp.solvers.records import failure
+from sparsedp.solvers.scaling import exponent_of
+from sparsedp.solvers.system import System
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+__all__ = ["DENSE_UP_TO", "METHODS", "Pencil", "Spectrum", "general_values", "symmetric_pairs"]
+
+METHODS = ("auto", "dense", "arpack", "lobpcg")
+DENSE_UP_TO = 512  # unknowns for which "auto" takes LAPACK: 0.1 s
+GENERAL_DENSE_UP_TO = 1024  # the same for operators that are not symmetric: 1 s
+DENSE_AT_MOST = 20_000  # unknowns for which "dense" is accepted: a matrix of 3 GB
+LARGE_SHARE = 4  # "auto" takes LAPACK too where more than one eigenvalue in 4 is asked for
+SHIFT = 1e-6  # distance of the shift from the lower end of the spectrum, relative to the mean size of the rows
+NUDGE = 1e-8  # the same for a shift of the user, which may be an eigenvalue
+SYMMETRIC = 1e-12  # two products that should be equal may differ by this share of their sizes
+LARGEST_EXPONENT = 200  # an operator or a mass beyond this power of two is scaled
+AT_ROUNDOFF = 128 * EPS  # residuals below this share of the terms are rounding errors
+ZERO = 4 * EPS  # lambda M v below this share of the terms of A v is 0
+MOST_RESTARTS = 64  # for missing copies
+MOST_STEPS = 20  # of inverse iteration after ARPACK or LOBPCG
+INERTIA_UP_TO = 300_000  # unknowns for which a factorisation counts the eigenvalues below a shift
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Pairs of a pencil.
+
+    Attributes
+    ----------
+    values : array, shape (k,)
+        Ascending.
+    vectors : array, shape (k, n)
+        v_i^H M v_j is 1 for i = j and 0 otherwise.
+    beyond : array
+        The nearest eigenvalues that do not belong to the k: one, or none if there are no others.
+    """
+
+    values: NDArray[Any]
+    vectors: NDArray[Any]
+    beyond: NDArray[Any]
+
+
+class Pencil:
+    """The operators A and M of A v = lambda M v as functions of flat arrays, scaled so that squares do not overflow.
+
+    Parameters
+    ----------
+    op : Operator
+    mass : None, number, array of the shape of a field, or Operator
+        M: one for None, and its diagonal for a number or an array.
+    rtol : float
+
+    Attributes
+    ----------
+    exponent : int
+        Eigenvalues are those of the pencil times 2^exponent.
+    mass_exponent : int
+        Eigenvectors are those of the pencil times 2^(-mass_exponent / 2); it is even.
+    """
+
+    def __init__(self, op: Operator, mass: Any, rtol: float) -> None:
+        self.given = op
+        self.system = System(op)
+        self.op = self.system.op
+        self.rtol = rtol
+        self.size = op.domain.size
+        self.complex = op.dtype.kind == "c" or (isinstance(mass, Operator) and mass.dtype.kind == "c")
+        self.mass_exponent = 0
+        if mass is not None and not isinstance(mass, Operator):
+            mass = np.broadcast_to(np.asarray(mass, float), op.domain.shape)
+        self.mass = self._scaled(mass)
+        self.exponent = self.system.exponent - self.mass_exponent
+
+    def _scaled(self, mass):
+        """Return the mass divided by an even power of two."""
+        if mass is None:
+            return None
+        if isinstance(mass, Operator):
+            size = float(np.max(mass.structure.magnitude()(np.ones(self.size)), initial=0.0))
+        else:
+            size = float(np.max(mass, initial=0.0))
+        exponent = exponent_of(size)
+        if abs(exponent) <= LARGEST_EXPONENT:
+            return mass
+        self.mass_exponent = exponent - exponent % 2
+        if isinstance(mass, Operator):
+            return mass * 2.0 ** -(self.mass_exponent // 2) * 2.0 ** -(self.mass_exponent // 2)
+        return np.ldexp(mass, -self.mass_exponent)
+
+    # ------------------------------------------------------------ unknowns and inner product
+
+    @cached_property
+    def active(self) -> NDArray[Any] | None:
+        """The unknowns as a boolean array, None when all are: an operator on a grid does not use solid cells."""
+        if self.op.domain.grid is None or isinstance(self.op.structure, Diagonal):
+            return None
+        return self.system.active
+
+    @cached_property
+    def unknowns(self) -> int:
+        """The number of unknowns."""
+        return self.size if self.active is None else int(np.count_nonzero(self.active))
+
+    @cached_property
+    def weights(self) -> Any:
+        """Positive w such that diag(w) A and diag(w) M are symmetric: 1.0, an array, or None when none is known."""
+        candidates: list[Any] = [1.0]
+        if not self.complex and not self.system.uniform:
+            space = self.op.domain if self.op.domain.grid is not None else self.op.codomain
+            volumes = np.asarray(space.volumes).reshape(-1)
+            candidates += [volumes, 1.0 / volumes]
+        for weights in candidates:
+            if self._is_symmetric(self._stiffness, weights, self.system.magnitude):
+                return weights
+        return None
+
+    @cached_property
+    def mass_is_symmetric(self) -> bool:
+        """Whether diag(w) M is symmetric."""
+        if not isinstance(self.mass, Operator):
+            return True
+        return self._is_symmetric(self._plain_mass, self.weights, self.mass.structure.magnitude())
+
+    def _is_symmetric(self, product, weights, magnitude):
+        x, y = np.random.default_rng(0).standard_normal((2, self.size))
+        x = self._masked(x)
+        y = self._masked(y)
+        one = y @ (weights * product(x))
+        other = np.conj(x @ (weights * product(y)))
+        size = np.abs(y) @ (weights * magnitude(np.abs(x)))
+        return bool(abs(one - other) <= SYMMETRIC * size)
+
+    def _masked(self, x):
+        return x if self.active is None else np.where(self.active, x, 0.0)
+
+    # ------------------------------------------------------------ products
+
+    def _stiffness(self, x):
+        return self._masked(self.op._acting.product(x))
+
+    def _plain_mass(self, x):
+        if self.mass is None:
+            return x
+        if isinstance(self.mass, Operator):
+            return self._masked(self.mass._acting.product(x))
+        return self.mass.reshape(-1) * x
+
+    def apply_stiffness(self, x: NDArray[Any]) -> NDArray[Any]:
+        """Return diag(w) A x."""
+        return self.weights * self._stiffness(np.ascontiguousarray(x))
+
+    def apply_mass(self, x: NDArray[Any]) -> NDArray[Any]:
+        """Return diag(w) M x."""
+        return self.weights * self._plain_mass(np.ascontiguousarray(x))
+
+    @cached_property
+    def scale(self) -> float:
+        """The mean sum of magnitudes in a row of A, divided by the mean of M."""
+        ones = self._masked(np.ones(self.size))
+        sums = np.sum(self.weights * self._masked(self.system.magnitude(ones)))
+        signs = self.start
+        masses = float(np.real(np.vdot(signs, self.apply_mass(signs)))) / float(np.real(np.vdot(signs, signs)))
+        return float(sums) / self.unknowns / masses if masses > 0 else 0.0
+
+    @cached_property
+    def start(self) -> NDArray[Any]:
+        """The vector with which iterations start: random numbers from a fixed seed."""
+        return self._masked(np.random.default_rng(1).standard_normal(self.size)).astype(self.dtype)
+
+    @property
+    def dtype(self) -> Any:
+        """float, or complex for complex operators."""
+        return complex if self.complex else float
+
+    # ------------------------------------------------------------ matrices
+
+    @cached_property
+    def matrices(self) -> tuple[Any, Any]:
+        """diag(w) A and diag(w) M on the unknowns, as sparse matrices."""
+        keep = np.arange(self.size) if self.active is None else np.flatnonzero(self.active)
+        weights = sp.diags_array(np.broadcast_to(self.weights, self.size)[keep])
+        stiffness = weights @ _matrix(self.op)[keep][:, keep]
+        if self.mass is None:
+            mass = weights
+        elif isinstance(self.mass, Operator):
+            mass = weights @ _matrix(self.mass)[keep][:, keep]
+        else:
+            mass = weights @ sp.diags_array(self.mass.reshape(-1)[keep])
+        return sp.csr_array(stiffness), sp.csr_array(mass)
+
+    def embedded(self, vectors: NDArray[Any]) -> NDArray[Any]:
+        """Return vectors of the unknowns, in rows, as vectors of all numbers of a field."""
+        if self.active is None:
+            return vectors
+        full = np.zeros((len(vectors), self.size), vectors.dtype)
+        full[:, self.active] = vectors
+        return full
+
+    # ------------------------------------------------------------ shifted operators
+
+    def shifted(self, sigma: float) -> Operator:
+        """Return the operator A - sigma M."""
+        if self.mass is None:
+            mass = identity(self.op.domain)
+        elif isinstance(self.mass, Operator):
+            mass = self.mass
+        elif np.all(self.mass == self.mass.flat[0]):
+            mass = float(self.mass.flat[0]) * identity(self.op.domain)
+        else:
+            mass = diagonal(self.op.domain, self.mass)
+        shifted = self.op + (-sigma) * mass
+        return Operator(shifted.structure, self.op.domain, self.op.domain, f"shift of {self.given.name}")
+
+    def shifted_inverse(self, sigma: float, rtol: float, definite: bool) -> Callable:
+        """Return the function b -> x with diag(w) (A - sigma M) x = b.
+
+        Parameters
+        ----------
+        sigma : float
+        rtol : float
+            Relative tolerance of a solve.
+        definite : bool
+            Whether the shift is below the spectrum, so that multigrid can be used.
+        """
+        op = self.shifted(sigma)
+        method = "auto"
+        if not definite and op.structure.has_entries and not op.separable:
+            method = "direct"
+        settings = SolveSettings(method, rtol, None, "project", {})
+        name = f"eigenpairs({self.given.name})"
+        solve = build(op, settings, name, all_rows=False).apply
+        shape = self.op.domain.shape
+
+        def solved(b: NDArray[Any]) -> NDArray[Any]:
+            return self._masked(solve((b / self.weights).reshape(shape)).reshape(-1))
+
+        return solved
+
+    def count_below(self, sigma: float) -> int:
+        """Return the number of eigenvalues below a shift: the number of negative pivots of A - sigma M."""
+        from scipy.sparse.linalg import splu
+
+        stiffness, mass = self.matrices
+        options = {"SymmetricMode": True}
+        try:
+            factors = splu(
+                sp.csc_array(stiffness - sigma * mass), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options
+            )
+        except RuntimeError:  # sigma is an eigenvalue
+            return self.count_below(sigma - NUDGE * self.scale)
+        return int(np.count_nonzero(factors.U.diagonal().real < 0))
+
+    @cached_property
+    def is_positive(self) -> bool:
+        """Whether each diagonal entry is at least the sum of the others in its row: no eigenvalue is negative then."""
+        if not self.op.structure.has_entries:
+            return False
+        stiffness, _ = self.matrices
+        diagonal = stiffness.diagonal().real
+        sums = abs(stiffness) @ np.ones(self.unknowns)
+        return bool(np.all(2.0 * diagonal - sums >= -64 * EPS * sums))
+
+    def negative(self) -> Pencil:
+        """Return the pencil of -A and M."""
+        negative = Pencil.__new__(Pencil)
+        negative.__dict__.update(self.__dict__)
+        negative.op = -1.0 * self.op
+        negative.system = System(negative.op)
+        for name in ("is_positive", "matrices"):
+            negative.__dict__.pop(name, None)
+        return negative
+
+    def below_spectrum(self) -> float:
+        """Return a shift below all eigenvalues, near to the least one."""
+        sigma = -SHIFT * self.scale
+        if self.is_positive or not self.op.structure.has_entries:
+            return sigma
+        if self.unknowns > INERTIA_UP_TO:
+            raise ConvergenceError(
+                f"eigenpairs cannot find the end of the spectrum of {self.given.name}, whose rows do not show that it "
+                "has no negative eigenvalue; give the shift: which=-1.0, below or near to the wanted eigenvalues",
+                info=failure("setup_failed"),
+            )
+        upper = None
+        while self.count_below(sigma):
+            upper = sigma
+            sigma *= 30.0
+        if upper is None:
+            return sigma
+        for _ in range(6):  # the least eigenvalue is between sigma and upper
+            middle = -np.sqrt(sigma * upper)
+            if self.count_below(middle):
+                upper = middle
+            else:
+                sigma = middle
+        return sigma
+
+
+def _matrix(op: Operator) -> sp.csr_array:
+    """Return the matrix of an operator; of one without entries, by its products with the unit vectors."""
+    if op.structure.has_entries:
+        return op.matrix
+    columns = [op._acting.product(unit) for unit in np.eye(op.domain.size)]
+    return sp.csr_array(np.array(columns).T)
+
+
+# ---- symmetric pencils -----------------------------------------------------------------------------------------------
+
+
+def symmetric_pairs(pencil: Pencil, k: int, which: Any, method: str, maxiter: int | None) -> Spectrum:
+    """Return k pairs of a symmetric (or Hermitian) pencil.
+
+    Parameters
+    ----------
+    pencil : Pencil
+    k : int
+    which : "smallest", "largest" or float
+    method : one of METHODS
+    maxiter : int or None
+
+    Raises
+    ------
+    ConvergenceError
+        If the iteration does not converge, or the residual of a pair is too large.
+    """
+    scaled_which = which
+    if not isinstance(which, str):
+        scaled_which = float(np.ldexp(which, -pencil.exponent))
+    method = _chosen(pencil, k, which, method)
+    if method == "dense":
+        values, vectors = _dense(pencil)
+    elif method == "lobpcg":
+        values, vectors = _by_lobpcg(pencil, k, maxiter)
+    else:
+        values, vectors = _by_arpack(pencil, k, scaled_which, maxiter)
+    order = _distances(values, scaled_which).argsort(kind="stable")
+    chosen = order[:k][np.argsort(values[order[:k]], kind="stable")]
+    beyond = values[order[k : k + 1]]
+    vectors = np.array([_with_fixed_sign(vector) for vector in vectors[chosen]])
+    chosen_values = _check_residuals(pencil, values[chosen], vectors)
+    return Spectrum(
+        np.ldexp(chosen_values, pencil.exponent),
+        vectors * 2.0 ** -(pencil.mass_exponent // 2),
+        np.ldexp(beyond, pencil.exponent),
+    )
+
+
+def _chosen(pencil, k, which, method):
+    """Return the method in place of "auto"; refuse one that does not fit."""
+    n = pencil.unknowns
+    if method == "dense" and n > DENSE_AT_MOST:
+        raise _too_large(n)
+    if method == "lobpcg":
+        if which != "smallest":
+            raise ValueError(f"method lobpcg takes which='smallest', got {which!r}; write method='arpack'")
+        if 5 * (k + 1) > n:
+            raise ValueError(f"method lobpcg takes k up to a fifth of the {n} unknowns, got {k}; write method='dense'")
+    if method == "arpack" and k + 1 >= n:
+        raise ValueError(f"method arpack takes k below the {n} unknowns - 1, got {k}; write method='dense'")
+    if method != "auto":
+        return method
+    if n <= DENSE_UP_TO or (LARGE_SHARE * (k + 1) > n and n <= DENSE_AT_MOST):
+        return "dense"
+    return "arpack"
+
+
+def _too_large(n):
+    return ValueError(f"method dense takes up to {DENSE_AT_MOST} unknowns, got {n}; write method='arpack'")
+
+
+def _distances(values, which):
+    """Return numbers that are smaller for eigenvalues that are selected first."""
+    if which == "smallest":
+        return values
+    if which == "largest":
+        return -values
+    return np.abs(values - which)
+
+
+def _dense(pencil):
+    """Return all pairs, by LAPACK."""
+    stiffness, mass = (matrix.toarray() for matrix in pencil.matrices)
+    stiffness = (stiffness + stiffness.conj().T) / 2.0
+    mass = (mass + mass.conj().T) / 2.0
+    try:
+        if pencil.mass is None and np.ndim(pencil.weights) == 0:
+            values, vectors = la.eigh(stiffness)
+        else:
+            values, vectors = la.eigh(stiffness, mass)
+    except la.LinAlgError:
+        raise _mass_error() from None
+    return values, pencil.embedded(vectors.T)
+
+
+def _mass_error():
+    return ValueError("mass must be positive definite, and the one given is not; write a mass > 0 in all unknowns")
+
+
+def _by_arpack(pencil, k, which, maxiter):
+    """Return the k pairs nearest to an end or to a number and one more at least, by ARPACK."""
+    sign = 1.0
+    if not pencil.op.structure.has_entries:
+        return _by_products(pencil, k, which, maxiter)
+    if which == "largest":
+        sign = -1.0
+        pencil = pencil.negative()
+    if isinstance(which, str):
+        sigma = pencil.below_spectrum()
+    else:
+        sigma = which - NUDGE * pencil.scale
+    solve = pencil.shifted_inverse(sigma, _INNER, isinstance(which, str))
+    known = np.zeros((0, pencil.size), pencil.dtype)
+    count = k + 1
+    tolerance = 0.0
+    values = np.zeros(0)
+    for _ in range(MOST_RESTARTS):
+        new_values, new_vectors = _shift_invert(pencil, sigma, solve, known, count, tolerance, maxiter)
+        if len(known):
+            farthest = np.sort(np.abs(values - sigma))[k]
+            if not np.min(np.abs(new_values - sigma)) < farthest * (1.0 - 1e-9):
+                break
+            if tolerance:
+                tolerance = 0.0
+                continue
+        known = np.concatenate([known, new_vectors])
+        values = np.concatenate([values, new_values])
+        if len(known) + 2 > pencil.unknowns:
+            break
+        count = 1
+        tolerance = 1e-7
+    values, vectors = _polished(pencil, solve, known, len(known))
+    return sign * values, vectors
+
+
+_INNER = 1e-12  # relative tolerance of the solves inside of ARPACK
+
+
+def _shift_invert(pencil, sigma, solve, known, count, tolerance, maxiter):
+    """Return pairs near a shift, in the complement of the known vectors."""
+    from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
+
+    shape = pencil.size, pencil.size
+    images = np.array([pencil.apply_mass(vector) for vector in known]).reshape(known.shape)
+
+    def complement(x):
+        return x - known.T @ (images.conj() @ x)
+
+    def solved(b):
+        b = np.asarray(b).reshape(-1)
+        return complement(solve(b - images.T @ (known.conj() @ b)))
+
+    dtype = pencil.dtype
+    try:
+        values, vectors = eigsh(
+            LinearOperator(shape, pencil.apply_stiffness, dtype=dtype),
+            count,
+            LinearOperator(shape, pencil.apply_mass, dtype=dtype),
+            sigma,
+            v0=complement(pencil.start),
+            ncv=min(pencil.unknowns, max(2 * count + 1, 20)),
+            maxiter=maxiter,
+            tol=tolerance,
+            OPinv=LinearOperator(shape, solved, dtype=dtype),
+        )
+    except ArpackNoConvergence as error:
+        raise _not_converged(len(error.eigenvalues), count) from None
+    return values, vectors.T
+
+
+def _not_converged(found, wanted):
+    message = f"eigenpairs found {found} of {wanted} pairs; increase maxiter, or give a shift near to them by which"
+    return ConvergenceError(message, info=failure("max_iterations"))
+
+
+def _by_products(pencil, k, which, maxiter):
+    """Return the pairs of an operator without entries at an end of its spectrum, by products only."""
+    from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
+
+    if not isinstance(which, str) or isinstance(pencil.mass, Operator):
+        raise ValueError(
+            f"{pencil.given.name} has no entries, so that eigenpairs takes which='smallest' or 'largest' and a mass "
+            "that is a number or a field; write dp.from_matrix(A) of its matrix for the others"
+        )
+    masses = pencil.apply_mass(np.ones(pencil.size))
+    roots = np.sqrt(masses)
+    known = np.zeros((0, pencil.size), pencil.dtype)
+    values = np.zeros(0)
+    count = k + 1
+    direction = {"smallest": 1.0, "largest": -1.0}[which]
+    far = direction * 4.0 * pencil.scale * max(1.0, float(np.max(masses) / np.min(masses))) * pencil.size
+
+    def product(x):
+        x = np.asarray(x).reshape(-1)
+        y = pencil.apply_stiffness(x / roots) / roots
+        return y + far * (known.T @ (known.conj() @ x))  # moves the known vectors to the other end
+
+    ends = {"smallest": "SA", "largest": "LA"}
+    for _ in range(MOST_RESTARTS):
+        op = LinearOperator((pencil.size, pencil.size), product, dtype=pencil.dtype)
+        ncv = min(pencil.size, max(2 * count + 1, 20))
+        limit = maxiter or 100 * pencil.size
+        try:
+            new_values, new = eigsh(op, count, which=ends[which], v0=pencil.start, ncv=ncv, maxiter=limit)
+        except ArpackNoConvergence as error:
+            raise _not_converged(len(error.eigenvalues), count) from None
+        new_values = new_values.real
+        if len(known) and not direction * new_values[0] < np.sort(direction * values)[k] - 1e-9 * abs(far):
+            break
+        known = np.concatenate([known, new.T])
+        values = np.concatenate([values, new_values])
+        count = 1
+    return values, known / roots
+
+
+def _polished(pencil, solve, vectors, count):
+    """Return the pairs of the pencil near the space of the given vectors, by steps of inverse iteration.
+
+    One step suffices for vectors of ARPACK. Further steps are for the first `count` pairs.
+    """
+    for _ in range(MOST_STEPS):
+        vectors = np.array([solve(pencil.apply_mass(vector)) for vector in vectors])
+        values, vectors = _rayleigh_ritz(pencil, vectors)
+        tested = zip(values[:count], vectors[:count], strict=True)
+        if all(_residual(pencil, value, vector)[1] for value, vector in tested):
+            break
+    return values, vectors
+
+
+def _rayleigh_ritz(pencil, vectors):
+    """Return the pairs of the pencil on the space of some vectors."""
+    norms = [np.sqrt(np.real(np.vdot(vector, pencil.apply_mass(vector)))) for vector in vectors]
+    vectors = vectors / np.array(norms)[:, None]
+    images = np.array([pencil.apply_stiffness(vector) for vector in vectors])
+    masses = np.array([pencil.apply_mass(vector) for vector in vectors])
+    stiffness = vectors.conj() @ images.T
+    mass = vectors.conj() @ masses.T
+    try:
+        values, combinations = la.eigh((stiffness + stiffness.conj().T) / 2, (mass + mass.conj().T) / 2)
+    except la.LinAlgError:
+        raise _mass_error() from None
+    return values, combinations.T @ vectors
+
+
+def _by_lobpcg(pencil, k, maxiter):
+    """Return the k smallest pairs and one more, by LOBPCG with an approximate solve as preconditioner."""
+    from warnings import catch_warnings, simplefilter
+
+    from scipy.sparse.linalg import LinearOperator, lobpcg
+
+    sigma = pencil.below_spectrum()
+    precondition = pencil.shifted_inverse(sigma, 1e-2, True)
+    count = k + 1 + max(2, (k + 1) // 4)  # the last vectors converge slowly
+    shape = pencil.size, pencil.size
+
+    def of_columns(product):
+        def act(block):
+            return np.array([product(np.ascontiguousarray(column)) for column in block.T]).T
+
+        return LinearOperator(shape, matvec=lambda x: product(x.reshape(-1)), matmat=act, dtype=pencil.dtype)
+
+    block = np.random.default_rng(1).standard_normal((count, pencil.size))
+    block = np.array([pencil._masked(line) for line in block]).T.astype(pencil.dtype)
+    mass = None if pencil.mass is None and np.ndim(pencil.weights) == 0 else of_columns(pencil.apply_mass)
+    with catch_warnings():
+        simplefilter("ignore")  # the residuals are tested below
+        _, vectors = lobpcg(
+            of_columns(pencil.apply_stiffness),
+            block,
+            mass,
+            of_columns(precondition),
+            tol=1e-12 * pencil.scale,
+            maxiter=maxiter or 200,
+            largest=False,
+        )[:2]
+    solve = pencil.shifted_inverse(sigma, _INNER, True)
+    return _polished(pencil, solve, vectors.T, k + 1)
+
+
+def _residual(pencil, value, vector):
+    """Return the relative residual of a pair, whether it is small, and whether the eigenvalue is 0 up to rounding."""
+    image = pencil.apply_stiffness(vector)
+    mass = value * pencil.apply_mass(vector)
+    residual = np.linalg.norm(image - mass)
+    size = np.linalg.norm(mass)
+    terms = np.linalg.norm(pencil.weights * pencil.system.magnitude(np.abs(vector)))
+    is_small = residual <= max(pencil.rtol * size, AT_ROUNDOFF * (terms + size))
+    return residual / (size or 1.0), is_small, size <= ZERO * terms
+
+
+def _check_residuals(pencil, values, vectors):
+    """Raise ConvergenceError if a pair does not satisfy A v = lambda M v; return the values, 0 for rounding errors."""
+    checked = values.copy()
+    for number, (value, vector) in enumerate(zip(values, vectors, strict=True)):
+        residual, is_small, is_zero = _residual(pencil, value, vector)
+        if is_zero:
+            checked[number] = 0.0
+        if not is_small:
+            raise ConvergenceError(
+                f"pair {number} of eigenpairs has a relative residual of {residual:.1e}, more than {pencil.rtol:g}; "
+                "give a shift near to it by which, or increase maxiter",
+                info=failure("stagnated"),
+            )
+    return checked
+
+
+def _with_fixed_sign(vector):
+    """Return a vector times a number of magnitude 1, such that its first large entry is positive."""
+    sizes = np.abs(vector)
+    first = vector[np.argmax(sizes > 0.5 * np.max(sizes, initial=0.0))] if vector.size else 1.0
+    if first == 0:
+        return vector
+    return vector * (np.conj(first) / np.abs(first))
+
+
+# ---- operators that are not symmetric --------------------------------------------------------------------------------
+
+
+def general_values(pencil: Pencil, k: int, which: Any, method: str, maxiter: int | None) -> NDArray[Any]:
+    """Return k eigenvalues of any pencil, complex in general, in ascending order of their real parts."""
+    from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs
+
+    pencil.__dict__["weights"] = 1.0
+    scaled_which = which
+    if not isinstance(which, str):
+        scaled_which = complex(which) * 2.0**-pencil.exponent
+    if method == "lobpcg":
+        raise ValueError("method lobpcg takes symmetric operators; write method='arpack'")
+    n = pencil.unknowns
+    if method == "dense" or (method == "auto" and (n <= GENERAL_DENSE_UP_TO or LARGE_SHARE * (k + 2) > n)):
+        if n > DENSE_AT_MOST:
+            raise _too_large(n)
+        stiffness, mass = (matrix.toarray() for matrix in pencil.matrices)
+        if pencil.mass is None:
+            values = la.eigvals(stiffness)
+        else:
+            values = la.eigvals(stiffness, mass)
+    else:
+        shape = pencil.size, pencil.size
+        options: dict[str, Any] = {"which": {"smallest": "SR", "largest": "LR"}.get(str(which), "LM")}
+        if not isinstance(which, str):
+            sigma = scaled_which.real if scaled_which.imag == 0 else scaled_which
+            sigma = sigma - NUDGE * pencil.scale
+            solve = pencil.shifted_inverse(sigma, _INNER, False)
+            if isinstance(sigma, complex):
+                pencil.complex = True
+            options.update(sigma=sigma, OPinv=LinearOperator(shape, solve, dtype=pencil.dtype))
+        elif pencil.mass is not None:
+            raise ValueError(
+                "eigenpairs of a large operator that is not symmetric and a mass takes a shift, got "
+                f"which={which!r}; write a number"
+            )
+        mass_op = None if pencil.mass is None else LinearOperator(shape, pencil.apply_mass, dtype=pencil.dtype)
+        try:
+            values = eigs(
+                LinearOperator(shape, pencil.apply_stiffness, dtype=pencil.dtype),
+                k,
+                mass_op,
+                v0=pencil.start,
+                maxiter=maxiter,
+                return_eigenvectors=False,
+                **options,
+            )
+        except ArpackNoConvergence as error:
+            raise _not_converged(len(error.eigenvalues), k) from None
+    if which == "smallest":
+        distances = values.real
+    elif which == "largest":
+        distances = -values.real
+    else:
+        distances = np.abs(values - scaled_which)
+    values = np.sort_complex(values[distances.argsort(kind="stable")[:k]])
+    return values * 2.0**pencil.exponent

@@ -1,0 +1,231 @@
+"""Every message of eigenpairs, printed once."""
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+
+import sparsedp as dp
+from sparsedp.autodiff.derivative import grad
+from sparsedp.solvers import eigen_rules, eigensolver
+
+SHAPE = dp.errors.ShapeError
+TYPE = TypeError
+VALUE = ValueError
+FINITE = dp.errors.NonFiniteError
+DERIVATIVE = dp.errors.DerivativeError
+FAILED = dp.errors.ConvergenceError
+GRID = dp.Grid((5, 5), size=1.0)
+SOLVE = dp.elliptic_solver(dp.divergence(GRID), dp.gradient(GRID, dp.dirichlet))
+L = -dp.laplacian(GRID, dp.dirichlet)
+TWO = dp.from_matrix(np.eye(2), name="one")
+WIND = dp.from_matrix([[1.0, 2.0], [0.0, 1.0]], name="wind")
+HERMITIAN = dp.from_matrix([[2.0, 1j], [-1j, 2.0]], name="hermitian")
+LINE = dp.from_functions(lambda u: 2 * u, lambda u: 2 * u, 600, 600, name="line")
+LONG = dp.upwind(dp.Grid(40, periodic=True), 0, 1)
+FACES = np.ones(GRID.faces.shape)
+
+
+def pairs(*args, **options):
+    return lambda: dp.eigenpairs(*args, **options)
+
+
+def slope(of_pairs, count, **options):
+    return lambda: grad(lambda k: of_pairs(dp.eigenpairs(SOLVE, count, coefficients=k, **options)))(FACES)
+
+
+TABLE = [
+    (pairs(np.eye(2)), TYPE, "eigenpairs takes an Operator, got ndarray; write dp.from_matrix(...) first"),
+    (
+        pairs(len),
+        TYPE,
+        "eigenpairs, as op, takes an Operator, got builtin_function_or_method; write dp.from_functions(f, f, n, n), or "
+        "the solver of dp.elliptic_solver with coefficients=",
+    ),
+    (
+        pairs(dp.from_matrix(np.ones((2, 3)))),
+        SHAPE,
+        "eigenpairs takes a square operator, got one from space(3) to space(2); write op.T @ op",
+    ),
+    (
+        pairs(WIND),
+        TYPE,
+        "eigenpairs takes a symmetric operator, and wind is not; write symmetric=False for its eigenvalues, or "
+        "0.5 * (A + A.T) for its symmetric part",
+    ),
+    (
+        pairs(TWO, mass=WIND),
+        TYPE,
+        "eigenpairs takes a symmetric operator, and the mass is not; write symmetric=False for its eigenvalues, or "
+        "0.5 * (A + A.T) for its symmetric part",
+    ),
+    (pairs(TWO, 3), VALUE, "eigenpairs got k=3, but one has 2 unknowns; write a smaller k"),
+    (pairs(TWO, 0), VALUE, "k of eigenpairs must be a whole number >= 1, got 0"),
+    (
+        pairs(TWO, 1, "SM"),
+        VALUE,
+        "which must be one of smallest, largest, got 'SM'; write 'smallest', 'largest' or a number near to them",
+    ),
+    (pairs(TWO, 1, np.inf), FINITE, "which must be finite, got inf"),
+    (
+        pairs(TWO, 1, 1j),
+        TYPE,
+        "the eigenvalues of a symmetric operator are real, got which=1j; write a real number",
+    ),
+    (
+        pairs(SOLVE),
+        TYPE,
+        "eigenpairs needs the coefficients of <elliptic_solver: shift - divergence @ diag(k) @ gradient on "
+        "cells(5, 5)>, got none; write coefficients=...",
+    ),
+    (
+        pairs(SOLVE, coefficients=(1.0, 2.0, 3.0)),
+        TYPE,
+        "<elliptic_solver: shift - divergence @ diag(k) @ gradient on cells(5, 5)> has up to 2 coefficients, got 3; "
+        "write coefficients=...",
+    ),
+    (
+        pairs(TWO, coefficients=1.0),
+        TYPE,
+        "coefficients belong to a solver, got an Operator <one: space(2) -> space(2), explicit>; write "
+        "eigenpairs(solve, coefficients=...)",
+    ),
+    (pairs(TWO, mass=L), SHAPE, "the mass of eigenpairs acts on cells(5, 5), but the operator on space(2)"),
+    (
+        pairs(TWO, mass=np.ones(3)),
+        SHAPE,
+        "the mass of eigenpairs is a number or a field on space(2), got an array of shape (3,)",
+    ),
+    (pairs(TWO, mass=1j), TYPE, "the mass of eigenpairs must hold real numbers, got dtype complex128"),
+    (pairs(TWO, mass=np.nan), FINITE, "the mass of eigenpairs must be finite, got nan; write a finite number"),
+    (pairs(TWO, mass=np.array([1.0, -1.0])), VALUE, "the mass of eigenpairs must be > 0, got -1 at 1"),
+    (
+        pairs(TWO, mass=dp.from_matrix([[1.0, 2.0], [2.0, 1.0]])),
+        VALUE,
+        "mass must be positive definite, and the one given is not; write a mass > 0 in all unknowns",
+    ),
+    (pairs(TWO, method="qr"), VALUE, "method of eigenpairs must be one of auto, dense, arpack, lobpcg, got 'qr'"),
+    (
+        pairs(dp.identity(dp.Space(20_001)), method="dense"),
+        VALUE,
+        "method dense takes up to 20000 unknowns, got 20001; write method='arpack'",
+    ),
+    (
+        pairs(L, 1, "largest", method="lobpcg"),
+        VALUE,
+        "method lobpcg takes which='smallest', got 'largest'; write method='arpack'",
+    ),
+    (
+        pairs(L, 5, method="lobpcg"),
+        VALUE,
+        "method lobpcg takes k up to a fifth of the 25 unknowns, got 5; write method='dense'",
+    ),
+    (
+        pairs(TWO, 2, method="arpack"),
+        VALUE,
+        "method arpack takes k below the 2 unknowns - 1, got 2; write method='dense'",
+    ),
+    (
+        pairs(LINE, 1, 1.0),
+        VALUE,
+        "line has no entries, so that eigenpairs takes which='smallest' or 'largest' and a mass that is a number or a "
+        "field; write dp.from_matrix(A) of its matrix for the others",
+    ),
+    (
+        pairs(WIND, method="lobpcg", symmetric=False),
+        VALUE,
+        "method lobpcg takes symmetric operators; write method='arpack'",
+    ),
+    (
+        pairs(LONG, mass=2.0, method="arpack", symmetric=False),
+        VALUE,
+        "eigenpairs of a large operator that is not symmetric and a mass takes a shift, got which='smallest'; write a "
+        "number",
+    ),
+    (
+        pairs(LONG, 3, method="arpack", symmetric=False, maxiter=1),
+        FAILED,
+        "eigenpairs found 0 of 3 pairs; increase maxiter, or give a shift near to them by which",
+    ),
+    (
+        lambda: dp.eigenpairs(WIND, symmetric=False).vectors,
+        AttributeError,
+        "GeneralValues has no attribute 'vectors'; write eigenpairs(op, k) of a symmetric operator: symmetric=False "
+        "gives values only",
+    ),
+    (
+        lambda: grad(lambda m: anp.real(dp.eigenpairs(WIND, mass=m, symmetric=False).values[0]))(1.0),
+        DERIVATIVE,
+        "eigenpairs with symmetric=False has no derivatives; a symmetric operator has them with symmetric=True",
+    ),
+    (
+        lambda: grad(lambda m: dp.eigenpairs(HERMITIAN, mass=m).values[0])(1.0),
+        DERIVATIVE,
+        "eigenpairs of complex operators have no derivatives; write the real symmetric operator of real and imaginary "
+        "parts",
+    ),
+    (
+        lambda: dp.jit(lambda m: dp.eigenpairs(TWO, mass=m).values[0])(1.0),
+        dp.errors.JitError,
+        "dp.jit cannot record eigenpairs, which decides by values; call the function without dp.jit",
+    ),
+    (lambda: dp.eigenpairs(TWO, 2)[2], IndexError, "there is no pair 2 among 2 eigenpairs; write 0 to 1"),
+    (
+        lambda: dp.eigenpairs(TWO, 2).sum(1, 1),
+        VALUE,
+        "pairs 1 to 1 of 2 eigenpairs are none; write start < stop",
+    ),
+    (
+        lambda: dp.eigenpairs(TWO, 2).project(np.ones(3)),
+        SHAPE,
+        "project takes a field on space(2), got an array of shape (3,)",
+    ),
+]
+
+
+@pytest.mark.parametrize(("call", "error", "message"), TABLE, ids=[row[2][:50] for row in TABLE])
+def test_message(call, error, message):
+    with pytest.raises(error) as caught:
+        call()
+    assert str(caught.value) == message
+
+
+def test_messages_of_clusters():
+    message = (
+        "pairs 1 to 2 of eigenpairs have no derivatives one by one: their eigenvalues .* to .* form a cluster with "
+        r"gaps up to .*; write pairs.sum\(.*, .*\) or pairs.project\(u, .*, .*\)"
+    )
+    with pytest.raises(DERIVATIVE, match=message):
+        slope(lambda pairs: pairs.values[1], 3)()
+    message = (
+        "pair 1 of eigenpairs has no derivative: its eigenvalue .* differs by .* from .* of the first pair that was "
+        "not asked for; ask for another k, so that no cluster is cut"
+    )
+    with pytest.raises(DERIVATIVE, match=message):
+        slope(lambda pairs: pairs.values[1], 2)()
+
+
+def test_messages_of_failures(monkeypatch):
+    biharmonic = L @ L
+    monkeypatch.setattr(eigensolver, "INERTIA_UP_TO", 10)
+    message = (
+        "eigenpairs cannot find the end of the spectrum of .*, whose rows do not show that it has no negative "
+        "eigenvalue; give the shift: which=-1.0, below or near to the wanted eigenvalues"
+    )
+    with pytest.raises(FAILED, match=message):
+        dp.eigenpairs(biharmonic, method="arpack")
+    monkeypatch.setattr(eigensolver, "AT_ROUNDOFF", 0.0)
+    message = (
+        "pair 0 of eigenpairs has a relative residual of .*, more than .*; give a shift near to it by which, or "
+        "increase maxiter"
+    )
+    with pytest.raises(FAILED, match=message):
+        dp.eigenpairs(L, rtol=1e-20)
+    monkeypatch.undo()
+    monkeypatch.setattr(eigen_rules, "BORDERED_LU_UP_TO", 0)
+    monkeypatch.setattr(eigen_rules, "MOST_ITERATIONS", 1)
+    message = (
+        "the adjoint solve of eigenpairs ended with a relative residual of .*; ask for more pairs, so that the gap "
+        "behind the last one is larger"
+    )
+    with pytest.raises(FAILED, match=message):
+        slope(lambda pairs: anp.sum(pairs.vectors[0] ** 3), 1)()
