@@ -378,7 +378,7 @@ class RolloutRule(Rule):
             runner = StepRunner(specification, args)
         kept: KeptStates = []
         if self.disk is not None:
-            kept = self._new_store(args)
+            kept = self._new_store(args)  # may contain states of an interrupted run
         with runner.errors_named():
             try:
                 last = run_forward(runner, self.plan, self.outputs, self.stored, self.progress, kept)
@@ -408,7 +408,7 @@ class RolloutRule(Rule):
 
     def _new_store(self, args: Sequence) -> KeptStates:
         """Return an empty store for the states of a run, with files if states do not fit into the memory."""
-        if not self.plan.disk_slots or not self.specification.differentiated:
+        if self.disk is None or not self.plan.disk_slots or not self.specification.differentiated:
             return []
         if any(map(isbox, args)):
             raise DerivativeError(
