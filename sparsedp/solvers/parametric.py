@@ -16,18 +16,19 @@ from __future__ import annotations
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
+import autograd.numpy as anp
 import numpy as np
 import scipy.sparse as sp
 
 from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.calls import public
-from sparsedp._utils.validation import check_finite, check_kind, check_plain, check_shape, check_type
+from sparsedp._utils.validation import check_finite, check_kind, check_plain, check_shape, check_type, place
 from sparsedp.autodiff.backend import as_field, gathered
 from sparsedp.autodiff.derivative import of_argument
 from sparsedp.autodiff.fast_derivatives import in_dtype
 from sparsedp.autodiff.program_trace import check_values
 from sparsedp.autodiff.tape import cast, dtype_of, isbox, sample
-from sparsedp.errors import DerivativeError, ShapeError
+from sparsedp.errors import ConvergenceError, DerivativeError, ShapeError
 from sparsedp.grid.space import Space, fits
 from sparsedp.operators.given import from_matrix
 from sparsedp.operators.masks_and_lift import identity
@@ -84,6 +85,7 @@ class ParametricSolver(Reconstructible):
         self.info = SolveLog()
         self._settings = settings
         self._cache = Cache()
+        self._batch_cache = Cache()  # of lists of inverses
 
     def _solution(self, k, b, shift):
         rule = solve_rule(self.name, self._solve, self._negative_gradient, self._product, checked=True)
@@ -100,12 +102,12 @@ class ParametricSolver(Reconstructible):
     def _negative_gradient(self, params, places, y, x):
         """Return -grad <y, A x> in k (place 0) and shift (place 1)."""
         gradients = []
-        for place in places:
-            if place == 0:
+        for position in places:
+            if position == 0:
                 gradient = self.D.T(y) * self.G(x)
             else:
                 gradient = -y * x
-            gradients.append(of_argument(gradient, params[place]))
+            gradients.append(of_argument(gradient, params[position]))
         return gradients
 
     def _product(self, transposed, x, k, shift):
@@ -121,13 +123,17 @@ class ParametricSolver(Reconstructible):
         inverse = self._cache.find((k, shift))
         if inverse is not None:
             return inverse
+        return self._cache.put((k, shift), self._new_inverse(k, shift))
+
+    def _new_inverse(self, k, shift) -> Inverse:
+        """Return a new inverse for floating values of k and shift."""
         exponent = _exponent_out_of_range(k, shift)
         scaled_k = shifted(k, -exponent) if exponent else k.copy()
         scaled_shift = shifted(np.atleast_1d(shift), -exponent).reshape(np.shape(shift))
         op = self._operator(scaled_k, scaled_shift)
         inverse = build(op, self._settings, self.name, self.info, solves="few", all_rows=self.all_rows)
         inverse.solver.system.exponent += exponent  # solutions are scaled back by it
-        return self._cache.put((k, shift), inverse)
+        return inverse
 
     def __str__(self) -> str:
         if not len(self._cache):
@@ -185,6 +191,9 @@ def elliptic_solver(
         positive definite. b is a field on the cells. shift is a number or one for each cell, real or complex.
         Differentiable in all three, to every order. A set-up is built for each new content of (k, shift); the last
         two are cached.
+        A leading axis of k, shift or b is a batch of independent systems, such as an ensemble of coefficients; an
+        argument without that axis is the same for all of them. A batch of numbers has the shape (batch, 1) as k, and
+        (batch, 1, ..., 1) as shift. The set-ups of the last two batches are cached.
 
     Raises
     ------
@@ -258,20 +267,25 @@ class EllipticSolver(ParametricSolver):
         Parameters
         ----------
         k : number, or array of the shape of a field on the faces, or of shape (dim, dim, *grid.shape)
-            A tensor need not be symmetric; where it is, so is the operator.
+            A tensor need not be symmetric; where it is, so is the operator. A leading axis is a batch.
         b : array, a field on the cells; leading axes are a batch
-        shift : number, or array of the shape of a field on the cells
+        shift : number, or array of the shape of a field on the cells; a leading axis is a batch
 
         Returns
         -------
         array of the shape and dtype of b; complex where k or shift is
+            With a leading axis if k, b or shift has one. With a batch of k or shift, b has at most one such axis.
         """
         check_plain("elliptic_solver", k, b, shift)
         if not isbox(b):
             b = as_field(b)
-        shift = _checked_parameter("shift", shift, self.D.codomain)
-        k, solver = self._coefficient_and_solver(k)
-        return solver._solution(k, b, shift)
+        shift, n_shift = _checked_batch("shift", shift, self.D.codomain)
+        k, solver, n_k = self._coefficient_and_solver(k)
+        if n_k is None and n_shift is None:
+            return solver._solution(k, b, shift)
+        self.D.backend.check("a batch of coefficients")
+        sizes = {"k": n_k, "shift": n_shift, "b": _batch_of_right_hand_sides(b, self.D.codomain)}
+        return BatchSolver(solver, _common_size(sizes), n_k, n_shift)._solution(k, b, shift)
 
     def flux(self, k: Any, slopes: Any) -> Any:
         """Return the flux k g, or K g of a tensor, from slopes g on the faces, as the solve discretises it.
@@ -289,7 +303,7 @@ class EllipticSolver(ParametricSolver):
             ``D(solve.flux(k, lift(values)))`` belongs to b. Differentiable in both arguments.
         """
         check_plain("elliptic_solver.flux", k, slopes)
-        k, solver = self._coefficient_and_solver(k)
+        k, solver, _ = self._coefficient_and_solver(k)
         if solver is self:
             return k * slopes
         return solver.fluxes(k * solver.slopes(slopes))
@@ -312,7 +326,12 @@ class EllipticSolver(ParametricSolver):
                 "elliptic_solver.operator takes plain k and shift, got a traced one; write solve.flux"
             )
         check_plain("elliptic_solver.operator", k, shift)
-        values, solver = self._coefficient_and_solver(k)
+        values, solver, n_k = self._coefficient_and_solver(k)
+        if n_k is not None:
+            raise ShapeError(
+                f"elliptic_solver.operator takes one k, got a batch of {n_k}; call it for each entry along the "
+                "first axis"
+            )
         shift = _checked_parameter("shift", shift, self.D.codomain)
         k_copy = np.array(values, np.result_type(values, float))
         shift_copy = np.array(shift, np.result_type(shift, float))
@@ -326,26 +345,39 @@ class EllipticSolver(ParametricSolver):
         return solver, (k, shift)
 
     def _coefficient_and_solver(self, k):
-        """Return k for each face and this solver, or a tensor at the corners of cells and its solver."""
+        """Return k for each face and this solver, or a tensor at the corners of cells and its solver.
+
+        The third value is the size of the batch of coefficients along the first axis, or None if k has no such axis.
+        """
         if not isbox(k):
             k = as_field(k)
         if np.ndim(k) <= 2:
-            return self._face_coefficient(k), self
+            k, batch = self._face_coefficient(k)
+            return k, self, batch
         self.D.backend.check("a tensor")
         solver = self._tensor_solver
-        check_values(partial(check_tensor, "k", grid=self.D.codomain.grid), k)
-        return solver.at_corners(cast(k, np.result_type(dtype_of(k), float))), solver
+        grid = self.D.codomain.grid
+        k = cast(k, np.result_type(dtype_of(k), float))
+        if np.ndim(k) < 3 + grid.dim:
+            check_values(partial(check_tensor, "k", grid=grid), k)
+            return solver.at_corners(k), solver, None
+        batch = np.shape(k)[0]
+        check_values(partial(_check_tensors, grid=grid), k)
+        # The tensors at the corners, for all entries of the batch at once: an axis behind the axes of the tensor.
+        at_corners = solver.at_corners(anp.moveaxis(k, 0, 2))
+        return anp.moveaxis(at_corners, 3, 0), solver, batch
 
     @cached_property
     def _tensor_solver(self):
         return TensorSolver(self)
 
     def _face_coefficient(self, k):
-        k = _checked_parameter("k", k, self.D.domain, "harmonic_average(grid)(k)", self.D.codomain)
+        """Return k for each face, and the size of its batch, or None."""
+        k, batch = _checked_batch("k", k, self.D.domain, "harmonic_average(grid)(k)", self.D.codomain)
         check_values(_check_not_negative, k)
         if np.ndim(sample(k)) == 0:
-            return k * np.ones(self.D.domain.shape)
-        return k
+            return k * np.ones(self.D.domain.shape), None
+        return k, batch
 
     def _operator(self, k, shift):
         shift_name = "shift" if shift.ndim else f"{shift:g}"
@@ -368,6 +400,71 @@ class EllipticSolver(ParametricSolver):
 
     def __repr__(self) -> str:
         return f"<elliptic_solver: shift - {self.D.name} @ diag(k) @ {self.G.name} on {self.G.domain}>"
+
+
+class BatchSolver:
+    """The solves of a batch of independent systems with coefficients of their own, as one rule.
+
+    Parameters
+    ----------
+    solver : EllipticSolver or TensorSolver
+    batch : int
+        Number of systems.
+    n_k, n_shift : int or None
+        None if k, or shift, is the same for all systems.
+    """
+
+    def __init__(self, solver: ParametricSolver, batch: int, n_k: int | None, n_shift: int | None) -> None:
+        self._solver = solver
+        self._batch = batch
+        self._has_k = n_k is not None
+        self._has_shift = n_shift is not None
+
+    def _solution(self, k, b, shift):
+        solver = self._solver
+        rule = solve_rule(solver.name, self._solve, solver._negative_gradient, solver._product, checked=True)
+        return rule(b, k, shift)
+
+    def _solve(self, transposed, checked, b, k, shift):
+        space = self._solver.D.codomain
+        inverses = self._inverses(k, shift)
+        solutions = []
+        has_b = np.ndim(b) > len(space.shape)
+        for i, inverse in enumerate(inverses):
+            solve: Operator = inverse
+            if transposed:
+                solve = inverse.T
+            elif not checked:
+                solve = inverse.tangent
+            try:
+                solutions.append(solve.apply(b[i] if has_b else b))
+            except ConvergenceError as error:
+                error.args = (f"entry {i} of the batch: {error}", *error.args[1:])
+                raise
+        if not solutions:
+            return np.empty((0, *space.shape), np.result_type(b, np.float32))
+        return np.array(solutions)
+
+    def _inverses(self, k, shift) -> list[Inverse]:
+        """Return the inverses of all systems, from the cache or new."""
+        k = _in_floating_dtype(k)
+        shift = _in_floating_dtype(shift)
+        cache = self._solver._batch_cache
+        inverses = cache.find((k, shift))
+        if inverses is not None:
+            return inverses
+        inverses = []
+        for i in range(self._batch):
+            k_of_entry = k
+            shift_of_entry = shift
+            if self._has_k:
+                k_of_entry = k[i]
+            if self._has_shift:
+                shift_of_entry = shift[i]
+                if shift_of_entry.size and np.all(shift_of_entry == shift_of_entry.flat[0]):
+                    shift_of_entry = np.asarray(shift_of_entry.flat[0])  # a number: the operator may be separable
+            inverses.append(self._solver._new_inverse(k_of_entry, shift_of_entry))
+        return cache.put((k, shift), inverses)
 
 
 class TensorSolver(ParametricSolver):
@@ -394,6 +491,7 @@ class TensorSolver(ParametricSolver):
         super().__init__(D @ self.fluxes, self.slopes @ G, solver._settings)
         self.info = solver.info
         self._cache = solver._cache
+        self._batch_cache = solver._batch_cache
 
     def _operator(self, k, shift):
         structure = Matrix(Elliptic(-self.D, self.G, k, shift).explicit())
@@ -418,10 +516,58 @@ def _checked_parameter(name, parameter, space, advice="", other_space=None):
     return parameter if isbox(parameter) else values
 
 
+def _checked_batch(name, parameter, space, advice="", other_space=None):
+    """Return a parameter, and the size of its batch: as `_checked_parameter`, but there may be a leading axis.
+
+    A batch of numbers, with axes of length 1 behind the leading one, is broadcast to fields.
+    """
+    shape = np.shape(as_field(sample(parameter)))
+    of_numbers = shape[1:] == (1,) * len(space.shape)
+    is_other_field = other_space is not None and shape == other_space.shape
+    if len(shape) != 1 + len(space.shape) or not (of_numbers or shape[1:] == space.shape) or is_other_field:
+        return _checked_parameter(name, parameter, space, advice, other_space), None
+    values = as_field(sample(parameter))
+    check_kind(name, values.dtype, "numbers", f"; write np.asarray({name}, float)")
+    if not isbox(parameter):
+        parameter = values
+    check_values(partial(check_finite, name), parameter)
+    if of_numbers:
+        parameter = parameter * np.ones((1, *space.shape))
+    return parameter, shape[0]
+
+
+def _batch_of_right_hand_sides(b, space):
+    """Return the size of the batch of right-hand sides that are solved with a batch of coefficients, or None."""
+    shape = np.shape(b)
+    if shape == space.shape:
+        return None
+    if shape[1:] == space.shape:
+        return shape[0]
+    raise ShapeError(
+        f"b takes a field on {space.described}, or one for each entry of the batch of coefficients, got an array of "
+        f"shape {shape}"
+    )
+
+
+def _common_size(sizes):
+    """Return the size of a batch, given that of each argument or None; raise ShapeError if the sizes differ."""
+    sizes = {name: size for name, size in sizes.items() if size is not None}
+    if len({*sizes.values()}) > 1:
+        given = ", ".join(f"{size} of {name}" for name, size in sizes.items())
+        raise ShapeError(f"elliptic_solver needs one batch size, got {given}; give each the same leading axis, or none")
+    return next(iter(sizes.values()))
+
+
+def _check_tensors(tensors, grid):
+    """Check each tensor of a batch along the first axis."""
+    for i, tensor in enumerate(np.asarray(tensors)):
+        check_tensor(f"k[{i}]", tensor, grid=grid)
+
+
 def _check_not_negative(k):
     k = as_field(k)
     if k.dtype.kind != "c" and np.any(k < 0):
-        raise ValueError(f"k must be >= 0, got {np.min(k):g} at {np.argmin(k)}")
+        raise ValueError(f"k must be >= 0, got {np.min(k):g} at {place(int(np.argmin(k)), np.shape(k) or (1,))}")
 
 
 class Elliptic(Sum):
