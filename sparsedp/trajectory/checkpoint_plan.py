@@ -23,7 +23,7 @@ from __future__ import annotations
 import re
 from bisect import bisect_left
 from dataclasses import dataclass, replace
-from math import comb
+from math import ceil, comb
 from typing import TYPE_CHECKING
 
 from sparsedp._utils.validation import is_number
@@ -63,7 +63,7 @@ class CheckpointPlan:
     is_reversing : bool
         Whether only the last state is kept, and the backward pass computes the others by reversed steps.
     disk_slots : int
-        The number of the `slots` whose states are kept in files.
+        Number of states that are kept in files beside the `slots` in memory.
     """
 
     n: int
@@ -72,34 +72,34 @@ class CheckpointPlan:
     is_reversing: bool = False
     disk_slots: int = 0
 
-    @property
-    def memory_slots(self) -> int:
-        """Return the largest number of states that may be kept in memory, if `slots` is a number."""
-        assert self.slots is not None
-        return self.slots - self.disk_slots
-
-    def disk_indices(self) -> set[int]:
-        """Return the indices of the states that the forward pass keeps in files.
-
-        The backward pass begins with the last of the kept states and then uses their places again. It finds these in
-        memory. The first state is an argument of the rollout and in memory anyway.
-        """
-        kept = sorted(self.stored_indices())
-        return set(kept[1 : 1 + self.disk_slots])
-
     def with_files(self, most: int) -> CheckpointPlan:
         """Return a plan that keeps states in files if they do not fit into the memory; `most` states fit there."""
         assert self.slots is not None
-        disk_slots = min(most, self.n - self.slots)
-        if disk_slots < 1:
-            return self
-        return replace(self, slots=self.slots + disk_slots, disk_slots=disk_slots)
+        return replace(self, disk_slots=max(min(most, self.n - self.slots), 0))
+
+    def disk_indices(self) -> range:
+        """Return the indices of the states in files: at equal distances, up to the last steps.
+
+        The memory is used for the last steps in the forward pass, and for the steps between two files in the backward
+        pass, so that each file is written and read once.
+        """
+        if not self.disk_slots:
+            return range(0)
+        assert self.slots is not None
+        steps = self.n - self.slots
+        distance = ceil(steps / self.disk_slots)
+        return range(distance, steps + distance, distance)
 
     def stored_indices(self) -> set[int]:
         """Return the indices of the states that the forward pass keeps, the last one included."""
         if self.is_reversing:
             return {self.n}
-        return {*checkpoints(self.n, self.slots), self.n}
+        in_files = self.disk_indices()
+        if not in_files:
+            return {*checkpoints(self.n, self.slots), self.n}
+        first = in_files[-1]
+        in_memory = {first + i for i in checkpoints(self.n - first, self.slots)}
+        return {0, *in_files, *in_memory, self.n}
 
     def next_index(self, start: int, stop: int, kept: int) -> int:
         """Return the index of the next state to keep while states from `start` to `stop` are computed again.
@@ -109,7 +109,7 @@ class CheckpointPlan:
         start, stop : int
             Index of the current state, and of the state that the backward pass needs.
         kept : int
-            Number of states that are kept at present.
+            Number of states that are kept in memory at present.
         """
         if self.slots is None:
             free = 1

@@ -371,25 +371,19 @@ class DiskStates:
     def __getitem__(self, position: int) -> State | FileState:
         return self._entries[position]
 
-    def occupied(self) -> int:
-        """Return the number of places for states that are in use, or that cannot be used because the disk is full."""
-        assert self._plan.slots is not None
-        if self._is_full:
-            return self._plan.slots - max(self._plan.memory_slots - self._in_memory, 0)
-        return len(self._entries)
+    @property
+    def in_memory(self) -> int:
+        """Return the number of states in memory."""
+        return self._in_memory
 
     def append(self, state: State) -> None:
-        """Add a state to the stack. If it should be in a file and the disk is full, it is not kept."""
+        """Add a state to the stack. If it belongs into a file and the disk is full, it is not kept."""
         if self._popped is not None and self._popped.i == state.i:
             self._entries.append(self._popped)
             self._popped = None
             return
         self._remove_popped()
-        if self._is_forward:
-            in_memory = state.i not in self._disk_indices
-        else:
-            in_memory = self._in_memory < self._plan.memory_slots
-        if in_memory:
+        if not self._is_forward or state.i not in self._disk_indices:
             self._entries.append(state)
             self._in_memory += 1
         elif not self._is_full:

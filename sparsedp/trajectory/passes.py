@@ -268,10 +268,10 @@ def _state_at(i: int, runner: StepRunner, plan: CheckpointPlan, kept: KeptStates
     while state.i < i:
         kept.append(state)
         if isinstance(kept, DiskStates):
-            occupied = kept.occupied()
+            in_memory = kept.in_memory
         else:
-            occupied = len(kept)
-        stop = plan.next_index(state.i, i, occupied)
+            in_memory = len(kept)
+        stop = plan.next_index(state.i, i, in_memory)
         repeated += stop - state.i
         while state.i < stop:
             state = runner.step(state, False)
