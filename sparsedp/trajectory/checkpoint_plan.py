@@ -94,9 +94,9 @@ class CheckpointPlan:
         """Return the indices of the states that the forward pass keeps, the last one included."""
         if self.is_reversing:
             return {self.n}
-        in_files = self.disk_indices()
-        if not in_files:
+        if not self.disk_slots:
             return {*checkpoints(self.n, self.slots), self.n}
+        in_files = self.disk_indices()
         first = in_files[-1]
         in_memory = {first + i for i in checkpoints(self.n - first, self.slots)}
         return {0, *in_files, *in_memory, self.n}
