@@ -33,6 +33,8 @@ from sparsedp.kernels.fluxes import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from sparsedp.advection.settings import TransportSettings
@@ -107,6 +109,10 @@ class Component(NamedTuple):
     def run(self, loop: Any, *args: Any) -> None:
         """Run a compiled loop, a `Kernel`, over all tiles."""
         loop.run_all(self.tiles, self.work, kernels.threads, args)
+
+    def bound(self, loop: Any) -> Callable[..., bool]:
+        """Return a function that does what `run` does for a loop, with less overhead."""
+        return loop.over(self.tiles, self.work, kernels.threads)
 
     def sides(self, axis: int) -> Sides:
         """Return the sides of all points along an axis."""

@@ -27,7 +27,7 @@ S. Gottlieb, C.-W. Shu, Math. Comp. 67 (1998) 73-85 (stages).
 from __future__ import annotations
 
 from functools import cached_property
-from math import isfinite
+from math import isfinite, prod
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -45,7 +45,7 @@ from sparsedp.kernels import fluxes
 from sparsedp.kernels.fluxes import SCHEMES
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -55,6 +55,7 @@ if TYPE_CHECKING:
 __all__ = ["Eulerian"]
 
 EMPTY = np.zeros(0)  # stands for a result that is not requested
+EULER = (0.0,)  # the stages of a scheme whose step is one Euler step
 
 
 class Eulerian(TransportMethod):
@@ -68,6 +69,11 @@ class Eulerian(TransportMethod):
         self.any_order = first_order
         self.accumulates = self.interpolation is None and _has_compiled_loops()
         self._new_field = buffers.allocator((settings.space.size,))
+        if self.interpolation is None:
+            velocities = prod(self.velocity_shapes[0])
+        else:
+            velocities = self.interpolation.codomain.size
+        self._new_velocity = buffers.allocator((velocities,))
 
     @cached_property
     def reference(self) -> SparseReference:
@@ -154,7 +160,7 @@ class Eulerian(TransportMethod):
         of_velocity = EMPTY
         if VELOCITY in nums:
             if velocity_sum is None:
-                of_velocity = buffers.empty(w.shape, float)
+                of_velocity = self._new_velocity()
             else:
                 of_velocity = velocity_sum
         of_field, of_inflow, invalid = self._vjp_of_stages(
@@ -183,6 +189,13 @@ class Eulerian(TransportMethod):
 
         `of_velocity` is set to the cotangent of w if `of_velocity_is_set`; otherwise the cotangent is added to it.
         """
+        of_inflow = np.zeros(inflow.size)
+        repeated, points = self._repeated
+        if self.scheme.stages == EULER and not repeated.size:
+            of_u = self._new_field() if of_field_wanted else EMPTY
+            slopes = self._loops.slopes(u, inflow, partials=True)
+            invalid = self._loops.vjp(g, u, slopes, w, dt, inflow, of_u, of_inflow, of_velocity, of_velocity_is_set)
+            return of_u, of_inflow, invalid
         stages: list[_Stage] = []
         for keep in self.scheme.stages:
             x = u
@@ -192,8 +205,6 @@ class Eulerian(TransportMethod):
                 self._loops.stage(last.x, last.slopes, w, dt, last.beyond, u, last.keep, x)
             beyond = self._values_beyond_walls(x, inflow)
             stages.append(_Stage(x, self._loops.slopes(x, beyond, partials=True), keep, beyond))
-        of_inflow = np.zeros(inflow.size)
-        repeated, points = self._repeated
         of_first_field = None  # cotangent of u from its direct use in the means of later stages
         invalid = 0.0
         while stages:
@@ -265,6 +276,55 @@ class CompiledLoops:
             self.slopes_per_axis = 2
         self.least_weight = 1.0 - self.scheme.max_courant - ROUNDING
         self._no_slopes = [self._empty_slopes(component, 0, 0) for component in self.components]
+        self._stages = [self._bound_stage(component) for component in self.components]
+        self._vjps = [self._bound_vjp(component) for component in self.components]
+
+    def _bound_stage(self, part: Component) -> Callable[..., float]:
+        """Return a function that runs the loop `stage` for a component of given fields."""
+        run = part.bound(fluxes.stage)
+        flux_form = self.flux_form
+        least_weight = self.least_weight
+        free, table, axes, tiles = part.free, part.table, part.axes, part.tiles
+
+        def stage_of_component(u, slopes, w, dt, inflow, first_field, keep, out):
+            invalid = np.empty(tiles)
+            run(u, inflow, w, free, slopes, dt, table, axes, flux_form, least_weight, first_field, keep, out, invalid)
+            return _sum_of_tiles(invalid)
+
+        if len(self.components) == 1:
+            return stage_of_component
+
+        def stage(u, slopes, w, dt, inflow, first_field, keep, out):
+            field = part.field
+            fields = first_field[field], keep, out[field]
+            return stage_of_component(u[field], slopes, w[part.speed], dt, inflow[part.inflow], *fields)
+
+        return stage
+
+    def _bound_vjp(self, part: Component) -> Callable[..., float]:
+        """Return a function that runs the loops `vjp` and `slope_vjp` for a component of given fields."""
+        run = part.bound(fluxes.vjp)
+        run_slope_vjp = part.bound(fluxes.slope_vjp)
+        flux_form = self.flux_form
+        free, table, axes, tiles = part.free, part.table, part.axes, part.tiles
+
+        def vjp_of_component(g, u, slopes, partials, w, dt, inflow, of_u, of_inflow, of_w, of_w_is_set):
+            invalid = np.empty(tiles)
+            inputs = u, inflow, w, free, slopes, dt, table, axes, flux_form
+            run(g, *inputs, of_u, of_inflow, of_w, of_w_is_set, partials, invalid)
+            if partials.size and of_u.size:
+                run_slope_vjp(partials, free, axes, of_u, of_inflow)
+            return _sum_of_tiles(invalid)
+
+        if len(self.components) == 1:
+            return vjp_of_component
+
+        def vjp(g, u, slopes, partials, w, dt, inflow, of_u, of_inflow, of_w, of_w_is_set):
+            field, walls, speed = part.field, part.inflow, part.speed
+            inputs = g[field], u[field], slopes, partials, w[speed], dt, inflow[walls]
+            return vjp_of_component(*inputs, of_u[field], of_inflow[walls], of_w[speed], of_w_is_set)
+
+        return vjp
 
     def slopes(self, u: NDArray, inflow: NDArray, partials: bool) -> list:
         """Return, for each component, its limited slopes and their derivatives in a and b.
@@ -276,16 +336,8 @@ class CompiledLoops:
         result = []
         for part in self.components:
             slopes, derivatives = self._empty_slopes(part, part.points, part.points if partials else 0)
-            part.run(
-                self.slope_loop,
-                u[part.field],
-                inflow[part.inflow],
-                part.free,
-                part.table,
-                part.axes,
-                slopes,
-                derivatives,
-            )
+            field, values = u[part.field], inflow[part.inflow]
+            part.run(self.slope_loop, field, values, part.free, part.table, part.axes, slopes, derivatives)
             result.append((slopes, derivatives))
         return result
 
@@ -293,20 +345,6 @@ class CompiledLoops:
         shape = (len(part.axes), self.slopes_per_axis)
         slopes = buffers.empty((*shape, points), float)
         return slopes, buffers.empty((*shape, 2, points_of_derivatives), float)
-
-    def _inputs(self, part: Component, u: NDArray, inflow: NDArray, w: NDArray, slopes: NDArray, dt: float) -> tuple:
-        """Return the arguments that the loops `stage` and `vjp` share."""
-        return (
-            u[part.field],
-            inflow[part.inflow],
-            w[part.speed],
-            part.free,
-            slopes,
-            dt,
-            part.table,
-            part.axes,
-            self.flux_form,
-        )
 
     def stage(
         self,
@@ -327,11 +365,8 @@ class CompiledLoops:
             Number of weights below the stability limit plus the number of results that are not finite.
         """
         total = 0.0
-        for part, (values, _) in zip(self.components, slopes, strict=True):
-            invalid = np.empty(part.tiles)
-            inputs = self._inputs(part, u, inflow, w, values, dt)
-            part.run(fluxes.stage, *inputs, self.least_weight, first_field[part.field], keep, out[part.field], invalid)
-            total += invalid.sum() if part.tiles > 1 else invalid[0]
+        for act, (values, _) in zip(self._stages, slopes):
+            total += act(u, values, w, dt, inflow, first_field, keep, out)
         return total
 
     def vjp(
@@ -359,23 +394,12 @@ class CompiledLoops:
             Number of values of `of_u` (before the contribution of the slopes) and `of_w` that are not finite.
         """
         total = 0.0
-        for part, (values, partials) in zip(self.components, slopes, strict=True):
-            inputs = self._inputs(part, u, inflow, w, values, dt)
-            part_of_u = of_u[part.field]
-            part_of_inflow = of_inflow[part.inflow]
-            invalid = np.empty(part.tiles)
-            part.run(
-                fluxes.vjp,
-                g[part.field],
-                *inputs,
-                part_of_u,
-                part_of_inflow,
-                of_w[part.speed],
-                of_w_is_set,
-                partials,
-                invalid,
-            )
-            total += invalid.sum() if part.tiles > 1 else invalid[0]
-            if partials.size and of_u.size:
-                part.run(fluxes.slope_vjp, partials, part.free, part.axes, part_of_u, part_of_inflow)
+        for act, (values, partials) in zip(self._vjps, slopes):
+            total += act(g, u, values, partials, w, dt, inflow, of_u, of_inflow, of_w, of_w_is_set)
         return total
+
+
+def _sum_of_tiles(counts: NDArray) -> float:
+    if counts.size == 1:
+        return counts[0]
+    return counts.sum()

@@ -12,7 +12,7 @@ from sparsedp._utils.validation import check_finite, surely_finite
 from sparsedp.advection.arguments import FLOAT, check_step, flatten_array
 from sparsedp.advection.settings import FIELD, INFLOW, STEP, VELOCITY
 from sparsedp.autodiff.program_trace import check_values, open_traces, recording_trace
-from sparsedp.autodiff.tape import MOST_BOUND, Rule, cast, dtype_of, form_of, isbox, linear, plain
+from sparsedp.autodiff.tape import Rule, cast, dtype_of, isbox, linear, plain
 from sparsedp.errors import DerivativeError
 
 if TYPE_CHECKING:
@@ -45,20 +45,19 @@ def rule_of(method: TransportMethod) -> Rule:
 
         return bound_forward
 
-    flatteners: dict[tuple, Callable] = {}  # form of the arguments -> function that flattens such arguments
+    def bind_vjp(nums, *values):
+        flatten = _bound_flatten(method, *values)
+        if flatten is None:
+            return None
+        return _bound_pull(method, nums, values, flatten)
 
     def vjp(nums, ans, *args):
-        form = form_of(args)
-        flatten = flatteners.get(form)
-        if flatten is None:
-            flatten = _bound_flatten(method, *args) or partial(_flatten, method)
-            if len(flatteners) >= MOST_BOUND:
-                flatteners.clear()
-            flatteners[form] = flatten
-        args_are_plain = type(flatten) is not partial  # `_bound_flatten` accepts plain arguments only
+        bound_pull = rule.bound_vjp(nums, *args)
 
         def pull(g, *sums):
-            return _pull(method, nums, args, g, sums, flatten, args_are_plain)
+            if bound_pull is None:
+                return _pull(method, nums, args, g, sums, partial(_flatten, method), args_are_plain=False)
+            return bound_pull(g, *args, sums=sums)
 
         return pull
 
@@ -80,8 +79,31 @@ def rule_of(method: TransportMethod) -> Rule:
 
     rule = Rule(method.name, forward, vjp, jvp)
     rule.bind = bind
+    rule.bind_vjp = bind_vjp
     rule.adds = method.accumulates
     return rule
+
+
+def _bound_pull(method: TransportMethod, nums: Sequence[int], values: Sequence, flatten: Callable) -> Callable:
+    """Return a pullback ``pull(g, *args, sums=())`` for arguments of the form of `values`.
+
+    `flatten` is that of `_bound_flatten`. See `Rule` for `sums`.
+    """
+    shapes = [np.shape(values[num]) for num in nums]
+    is_direct = not {STEP, INFLOW} & set(nums)
+    velocity_place = None
+    if VELOCITY in nums:
+        velocity_place = nums.index(VELOCITY)
+
+    def pull(g, u, v, dt, inflow, sums=()):
+        adds = sums and velocity_place is not None and sums[velocity_place] is not None
+        if is_direct and not adds and type(g) is np.ndarray and g.dtype == FLOAT:
+            cotangents, finite = method.vjp(nums, g.reshape(-1), *flatten(u, v, dt, inflow))
+            if finite or all(map(surely_finite, cotangents)):
+                return [cotangent.reshape(shape) for cotangent, shape in zip(cotangents, shapes)]
+        return _pull(method, nums, (u, v, dt, inflow), g, sums, flatten, args_are_plain=True)
+
+    return pull
 
 
 def _pull(

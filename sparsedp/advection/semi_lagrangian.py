@@ -36,7 +36,7 @@ from sparsedp.advection.method import TransportMethod
 from sparsedp.advection.settings import FIELD, INFLOW, VELOCITY
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -114,15 +114,19 @@ class SemiLagrangian(TransportMethod):
             return [w.reshape(self._velocity_parts[0][1])]
         return [w[span].reshape(shape) for span, shape in self._velocity_parts]
 
-    def _steps(self, u: NDArray, v: NDArray, dt: float, inflow: NDArray) -> Iterator[tuple[slice, Any]]:
-        """Yield, for each component, the range of its entries in the field and its step.
+    def _steps(self, u: NDArray, v: NDArray, dt: float, inflow: NDArray) -> Iterable[tuple[slice, Any]]:
+        """Return, for each component, the range of its entries in the field and its step."""
+        w = self.interpolate_velocity(v)
+        if len(self.components) == 1:
+            (component,) = self.components
+            return ((component.span, self.component_step(component, *self._split_velocity(w), dt, u, inflow)),)
+        return self._steps_of_components(u, w, dt, inflow)
 
-        A generator, so that the memory of a step is free before the next one is computed.
-        """
-        velocities = self._split_velocity(self.interpolate_velocity(v))
-        for component, w in zip(self.components, velocities):
+    def _steps_of_components(self, u: NDArray, w: NDArray, dt: float, inflow: NDArray) -> Iterator[tuple[slice, Any]]:
+        """Yield what `_steps` returns, so that the memory of a step is free before the next one is computed."""
+        for component, part_of_w in zip(self.components, self._split_velocity(w)):
             span = component.span
-            yield span, self.component_step(component, w, dt, u[span], inflow)
+            yield span, self.component_step(component, part_of_w, dt, u[span], inflow)
 
     def _keep_solid(self, result: NDArray, u: NDArray) -> NDArray:
         """Set the points of `result` inside the solid to the values of u, and return `result`."""

@@ -964,12 +964,17 @@ class Rule(Reconstructible):
     bind : callable or None
         ``bind(*values)`` returns the function for `bound`, which returns what `forward` returns, bit for bit. None
         stands for `forward` itself.
+    bind_vjp : callable or None
+        ``bind_vjp(nums, *values)`` returns the pullback for arguments of the form of `values`, a function
+        ``pull(g, *values)`` that returns what ``vjp(nums, ans, *values)(g)`` returns, bit for bit. It returns None
+        for arguments of another form than the rule is fast for.
     accepts_traced : bool
         Whether the functions of the rule accept traced values of outer traces, see `through`.
     """
 
     adds = False
     bind: Callable | None = None
+    bind_vjp: Callable | None = None
     accepts_traced = False
 
     def __init__(
@@ -988,6 +993,7 @@ class Rule(Reconstructible):
         self.keywords = keywords
         self.constructor_call = made or (Rule, (name, forward, vjp, jvp, keywords))
         self._bound: dict[tuple, Callable] = {}
+        self._bound_vjps: dict[tuple, Callable | None] = {}
 
     def __call__(self, *args: Any, **options: Any) -> Any:
         """Evaluate the rule, and record the call if an argument is traced."""
@@ -1011,6 +1017,19 @@ class Rule(Reconstructible):
                 self._bound.clear()
             self._bound[form] = function
         return function
+
+    def bound_vjp(self, nums: tuple[int, ...], *values: Any) -> Callable | None:
+        """Return the pullback in the arguments `nums` for arguments of the form of these, or None; see `bind_vjp`."""
+        if self.bind_vjp is None:
+            return None
+        key = nums, form_of(values)
+        pull = self._bound_vjps.get(key, self)
+        if pull is self:
+            pull = self.bind_vjp(nums, *values)
+            if len(self._bound_vjps) >= MOST_BOUND:
+                self._bound_vjps.clear()
+            self._bound_vjps[key] = pull
+        return pull
 
     def _positional(self, args, options):
         """Return all arguments by position."""
@@ -1126,12 +1145,18 @@ def _is_program_level(values):
 def _recorded_pullback(rule, nums, ans, values):
     """Return the pullback of a call of a rule while `dp.jit` records: a call of the program."""
     trace = recording_trace((ans, *values))
-    pull = trace.call(partial(rule.vjp, nums), *map(trace.unboxed, (ans, *values)))
+    slots = list(map(trace.unboxed, values))
+    bound_pull = rule.bound_vjp(nums, *map(trace.sample, slots))
+    if bound_pull is None:
+        pull = trace.call(partial(rule.vjp, nums), trace.unboxed(ans), *slots)
 
     def recorded_pull(g, *sums):
         if isbox(g) and not is_recorded(g):  # a derivative of the derivative
             return rule.vjp(nums, ans, *values)(g, *sums)
-        cotangents = trace.call(_pulled, pull, trace.unboxed(g), *[None] * len(sums))
+        if bound_pull is None:
+            cotangents = trace.call(_pulled, pull, trace.unboxed(g), *[None] * len(sums))
+        else:
+            cotangents = trace.call(bound_pull, trace.unboxed(g), *slots)
         returned = trace.sample(cotangents)
         if not isinstance(returned, (tuple, list)):
             return returned

@@ -150,14 +150,15 @@ def bound(module: str, name: str, rows: int, work: int, most_threads: int | None
     callable
         It returns whether the loop is available. numba is imported at its first call.
     """
-    loops: list = []
+    loop: Any = None  # the loop as a function of its arguments
 
     def act(*args):
+        nonlocal loop
         if not compiled():
             return False
-        if not loops:
-            loops.append(getattr(_import_module(f"{__name__}.{module}"), name))
-        return loops[0].run_all(rows, work, most_threads or threads, args)
+        if loop is None:
+            loop = getattr(_import_module(f"{__name__}.{module}"), name).over(rows, work, most_threads or threads)
+        return loop(*args)
 
     return act
 

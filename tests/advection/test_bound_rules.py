@@ -50,6 +50,48 @@ def test_cotangents_do_not_depend_on_the_layout_of_arguments(scheme, rng):
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.parametrize("of", ["cells", "faces"])
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_bound_pullback_has_the_same_bits(scheme, of, rng):
+    """A strided cotangent is not taken by the direct form of the bound pullback."""
+    for grid in GRIDS:
+        move = dp.transport(grid, scheme, dp.dirichlet, velocity="cells", of=of)
+        rule = move._rule
+        args = arguments(move, rng)
+        walls = rng.standard_normal(move.walls.shape)
+        strided = np.asfortranarray(args[1])
+        g = rng.standard_normal(args[0].shape)
+        for nums in ((0,), (1,), (0, 1), (1, 2), (0, 3)):
+            found = rule.bound_vjp(nums, *args)(g, *args)
+            wanted = rule.vjp(nums, None, args[0], strided, *args[2:3], np.full(walls.shape, args[3]))(g)
+            for num, one, other in zip(nums, found, wanted, strict=True):
+                assert np.shape(one) == np.shape(args[num])
+                assert np.asarray(one).tobytes() == np.asarray(np.sum(other) if num == 3 else other).tobytes()
+        assert rule.bound_vjp((0,), *args[:3], walls) is None
+        assert rule.bound_vjp((0,), *args) is rule.bound_vjp((0,), *args)
+
+
+def test_bound_pullback_adds_to_a_sum(rng):
+    """The cotangent of a velocity that many steps share is added in place."""
+    move = dp.transport(GRIDS[0], "upwind", velocity="cells")
+    args = arguments(move, rng)
+    g = rng.standard_normal(args[0].shape)
+    pull = move._rule.vjp((0, 1), None, *args)
+    total = np.ones(args[1].shape)
+    wanted = total + pull(g)[1]
+    result = pull(g, None, total)[1]
+    assert result is total
+    np.testing.assert_allclose(total, wanted, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("scheme", ["upwind", "semi_lagrangian"])
+def test_bound_pullback_checks_its_result(scheme, rng):
+    move = dp.transport(GRIDS[0], scheme, velocity="cells")
+    args = arguments(move, rng)
+    with pytest.raises(dp.errors.NonFiniteError, match="cannot represent the gradient in v"):
+        move._rule.vjp((0, 1), None, 1e200 * args[0], *args[1:])(1e200 * np.cos(args[0]))
+
+
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_other_forms_after_the_bound_one(scheme, rng):
     """Other shapes are refused, other layouts and dtypes converted."""
