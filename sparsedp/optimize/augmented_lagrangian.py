@@ -14,10 +14,13 @@ from sparsedp.optimize.lbfgs import LBFGS, LBFGSState
 from sparsedp.optimize.result import Evaluation, Failure, NoStepFound
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from sparsedp.optimize.box import Box
-    from sparsedp.optimize.constrained_run import ConstrainedProblem, ConstrainedRun, Point
+    from sparsedp.optimize.constrained_problem import ConstrainedProblem, Point
+    from sparsedp.optimize.constrained_run import ConstrainedRun
 
 __all__ = ["AugmentedLagrangian", "AugmentedState"]
 
@@ -149,14 +152,14 @@ class AugmentedLagrangian(ConstrainedMethod):
     """
 
     name: ClassVar[str] = "augmented_lagrangian"
-    penalty: float = 10.0
+    penalty: float = 1.0
     growth: float = 10.0
     inner: int = 50
     memory: int = 10
     line_search: int = 20
 
     def __post_init__(self) -> None:
-        check_number("penalty of augmented_lagrangian", self.penalty, "> 0", "; the default is 10")
+        check_number("penalty of augmented_lagrangian", self.penalty, "> 0", "; the default is 1")
         check_number("growth of augmented_lagrangian", self.growth, "> 1", "; the default is 10")
         self.inner = check_whole("inner of augmented_lagrangian", self.inner, 1, "; the default is 50")
         self.memory = check_whole("memory of augmented_lagrangian", self.memory, 1, "; the default is 10")
@@ -164,21 +167,28 @@ class AugmentedLagrangian(ConstrainedMethod):
         self.line_search = line_search
         self._lbfgs = LBFGS(self.memory, line_search)
 
-    def run(self, problem: ConstrainedProblem, run: ConstrainedRun) -> str:
+    @property
+    def resumable(self) -> bool:
+        """True: the state is a named tuple of arrays and numbers."""
+        return True
+
+    def run(
+        self, problem: ConstrainedProblem, run: ConstrainedRun, state: AugmentedState, save: Callable[[Any], None]
+    ) -> str:
         """Iterate until no step is found; see `ConstrainedMethod`."""
-        state = self.begin(problem)
         while True:
             try:
                 state = self.advance(state, problem)
             except NoStepFound as error:
                 return str(error)
-            point = problem.at(state.inner.current.point)
-            run.record(point, self.function(state, problem).estimates(point))
+            try:
+                run.record(problem.at(state.inner.current.point), self.multipliers(state, problem))
+            finally:
+                save(state)
 
-    def first_multipliers(self, problem: ConstrainedProblem) -> NDArray[np.float64]:
-        """Return the estimates of the multipliers at the start, so that no Jacobian is formed."""
-        state = self.begin(problem)
-        return self.function(state, problem).estimates(problem.start)
+    def multipliers(self, state: AugmentedState, problem: ConstrainedProblem) -> NDArray[np.float64]:
+        """Return the estimates of the multipliers at the current point, for which no Jacobian is formed."""
+        return self.function(state, problem).estimates(problem.at(state.inner.current.point))
 
     def function(self, state: AugmentedState, problem: ConstrainedProblem) -> AugmentedFunction:
         """Return the current augmented Lagrangian."""

@@ -13,7 +13,8 @@ from sparsedp.optimize.constrained_run import ConstrainedMethod
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from sparsedp.optimize.constrained_run import ConstrainedProblem, ConstrainedRun
+    from sparsedp.optimize.constrained_problem import ConstrainedProblem
+    from sparsedp.optimize.constrained_run import ConstrainedRun
 
 __all__ = ["Ipopt"]
 
@@ -119,7 +120,7 @@ class Ipopt(ConstrainedMethod):
         """Raise ImportError if cyipopt is not installed."""
         _cyipopt()
 
-    def run(self, problem: ConstrainedProblem, run: ConstrainedRun) -> str:
+    def run(self, problem: ConstrainedProblem, run: ConstrainedRun, state: Any, save: Any) -> str:
         """Iterate until Ipopt ends; see `ConstrainedMethod`."""
         cyipopt = _cyipopt()
         callbacks = IpoptCallbacks(problem, run)

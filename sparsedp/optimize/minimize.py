@@ -135,7 +135,8 @@ def minimize(
     checkpoint : path, optional
         Folder in which the last two states of the run are stored. If the run was killed, interrupted, or stopped by
         its callback or by maxiter, the same call continues from the last stored state and gives bitwise the same
-        result as a run without interruption. A new problem needs a new folder.
+        result as a run without interruption. A new problem needs a new folder. Not available for mma, slsqp,
+        trust_constr and ipopt.
     constraints : callable, or a list, tuple or dict of callables, optional
         Each function ``g(x)`` returns a number or an array that is <= 0 at a feasible point; `equal` of a function
         stands for g(x) == 0. A NonlinearConstraint or LinearConstraint of SciPy is used with its limits lb and ub; its
@@ -200,7 +201,7 @@ def minimize(
         ====================  ===================  =======  ==========================================================
         method                option               default  meaning
         ====================  ===================  =======  ==========================================================
-        augmented_lagrangian  penalty              10.0     initial penalty parameter, in units of loss / constraint^2
+        augmented_lagrangian  penalty              1.0      initial penalty parameter, in units of loss / constraint^2
         augmented_lagrangian  growth               10.0     its factor if the violation has not fallen enough
         augmented_lagrangian  inner                50       maximum number of steps between updates of the multipliers
         augmented_lagrangian  memory, line_search  same     as for lbfgs

@@ -11,11 +11,14 @@ from sparsedp._utils.validation import check_choice
 from sparsedp.optimize.constrained_run import ConstrainedMethod
 
 if TYPE_CHECKING:
-    from sparsedp.optimize.constrained_run import ConstrainedProblem, ConstrainedRun
+    from sparsedp.optimize.constrained_problem import ConstrainedProblem
+    from sparsedp.optimize.constrained_run import ConstrainedRun
 
 __all__ = ["MMA"]
 
 LEAST_STEP = 1e-15  # NLopt stops when a step changes no unknown by more than this fraction
+DUAL_EVALUATIONS = 200  # largest number of evaluations of the dual problem, which has no maximum if x is infeasible
+RESTART = 0.5  # NLopt is started again if the residual has fallen to this fraction
 
 
 @dataclass
@@ -54,8 +57,20 @@ class MMA(ConstrainedMethod):
         """Raise ImportError if NLopt is not installed."""
         _nlopt()
 
-    def run(self, problem: ConstrainedProblem, run: ConstrainedRun) -> str:
-        """Iterate until NLopt ends; see `ConstrainedMethod`."""
+    def run(self, problem: ConstrainedProblem, run: ConstrainedRun, state: Any, save: Any) -> str:
+        """Iterate until NLopt ends; see `ConstrainedMethod`.
+
+        Rounding errors of the loss make the models of NLopt too conservative in the course of a run. Therefore it is
+        started again from the best point as long as this improves the feasibility and the optimality.
+        """
+        while True:
+            before = run.best.residual
+            reason = self._run_nlopt(problem, run)
+            if not run.best.residual < RESTART * before:
+                return reason
+
+    def _run_nlopt(self, problem, run):
+        """Run NLopt from the best point, and return why it has ended by itself."""
         nlopt = _nlopt()
         algorithm = nlopt.LD_MMA if self.model == "mma" else nlopt.LD_CCSAQ
         size = problem.start.z.size
@@ -63,6 +78,8 @@ class MMA(ConstrainedMethod):
         optimizer.set_lower_bounds(np.broadcast_to(problem.box.lower, (size,)))
         optimizer.set_upper_bounds(np.broadcast_to(problem.box.upper, (size,)))
         optimizer.set_xtol_rel(LEAST_STEP)
+        optimizer.set_param("dual_algorithm", nlopt.LD_LBFGS)  # needs a quarter of the time of NLopt's default
+        optimizer.set_param("dual_maxeval", DUAL_EVALUATIONS)
         errors: list[BaseException] = []
 
         def stopping(function: Any) -> Any:
@@ -94,15 +111,14 @@ class MMA(ConstrainedMethod):
         optimizer.set_min_objective(stopping(loss))
         if problem.start.rows.size:
             optimizer.add_inequality_mconstraint(stopping(rows), np.zeros(problem.start.rows.size))
+        reason = "NLopt found no step that changes x"
         try:
-            optimizer.optimize(problem.start.z)
+            optimizer.optimize(run.best.point.z)
         except Exception as error:
-            if errors:
-                raise errors[0] from None
-            return f"NLopt stopped ({error})"
+            reason = f"NLopt stopped ({type(error).__name__})"
         if errors:
             raise errors[0]
-        return "NLopt found no step that changes x"
+        return reason
 
 
 def _nlopt():

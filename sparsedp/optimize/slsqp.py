@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from sparsedp.optimize.constrained_run import ConstrainedMethod
 
 if TYPE_CHECKING:
-    from sparsedp.optimize.constrained_run import ConstrainedProblem, ConstrainedRun
+    from sparsedp.optimize.constrained_problem import ConstrainedProblem
+    from sparsedp.optimize.constrained_run import ConstrainedRun
 
 __all__ = ["SLSQP"]
 
@@ -35,7 +36,7 @@ class SLSQP(ConstrainedMethod):
 
     name: ClassVar[str] = "slsqp"
 
-    def run(self, problem: ConstrainedProblem, run: ConstrainedRun) -> str:
+    def run(self, problem: ConstrainedProblem, run: ConstrainedRun, state: Any, save: Any) -> str:
         """Iterate until SciPy ends; see `ConstrainedMethod`."""
         from scipy.optimize import Bounds, minimize
 

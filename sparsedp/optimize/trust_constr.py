@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -12,7 +12,8 @@ from sparsedp._utils.validation import check_number
 from sparsedp.optimize.constrained_run import ConstrainedMethod
 
 if TYPE_CHECKING:
-    from sparsedp.optimize.constrained_run import ConstrainedProblem, ConstrainedRun
+    from sparsedp.optimize.constrained_problem import ConstrainedProblem
+    from sparsedp.optimize.constrained_run import ConstrainedRun
 
 __all__ = ["TrustConstr"]
 
@@ -56,7 +57,7 @@ class TrustConstr(ConstrainedMethod):
         check_number("radius of trust_constr", self.radius, "> 0", "; the default is 1")
         check_number("barrier of trust_constr", self.barrier, "> 0", "; the default is 0.1")
 
-    def run(self, problem: ConstrainedProblem, run: ConstrainedRun) -> str:
+    def run(self, problem: ConstrainedProblem, run: ConstrainedRun, state: Any, save: Any) -> str:
         """Iterate until SciPy ends; see `ConstrainedMethod`."""
         from scipy.optimize import BFGS, Bounds, NonlinearConstraint, minimize
 

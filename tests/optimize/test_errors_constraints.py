@@ -114,6 +114,12 @@ WRONG = [
         ShapeError,
         "the jac of constraints must have shape (2, 2), got (3, 2)",
     ),
+    (
+        run(above, "slsqp", checkpoint="folder"),
+        TypeError,
+        "slsqp cannot store its state, which is inside of a library; leave checkpoint out, or write "
+        "method='augmented_lagrangian'",
+    ),
     (run(above, batches=[1]), TypeError, "augmented_lagrangian does not use batches; leave it out"),
     (
         run(above, "slsqp", tolerance=dp.certified(0.1)),
@@ -128,7 +134,7 @@ WRONG = [
     (
         run(above, penalty=0.0),
         ValueError,
-        "penalty of augmented_lagrangian must be > 0, got 0; the default is 10",
+        "penalty of augmented_lagrangian must be > 0, got 0; the default is 1",
     ),
     (
         run(above, growth=1.0),

@@ -1,12 +1,14 @@
 """Constraints of minimize: published optima, multipliers, and what wrong constraints get."""
 
 import importlib.util
+import sys
+from types import ModuleType
 from typing import Any
 
 import autograd.numpy as anp
 import numpy as np
 import pytest
-from scipy.optimize import LinearConstraint, NonlinearConstraint
+from scipy.optimize import Bounds, LinearConstraint, NonlinearConstraint, minimize
 
 import sparsedp as dp
 
@@ -116,7 +118,7 @@ def test_published_optima(method, number):
     )
     assert best.converged and best.message.startswith("converged")
     assert max(best.feasibility, best.optimality) <= tolerance
-    assert abs(best.value - value) <= 3 * tolerance * max(1.0, abs(value))
+    assert abs(best.value - value) <= 10 * tolerance * max(1.0, abs(value))
     assert np.allclose(best.multipliers, multipliers, atol=30 * tolerance)
 
 
@@ -175,3 +177,215 @@ def test_contradictory_constraints_are_infeasible(method):
     constraints = [lambda x: anp.sum(x) + 1.0, lambda x: 1.0 - anp.sum(x)]
     best = dp.minimize(lambda x: anp.sum((x - 0.1) ** 2), np.full(2, 0.3), method, constraints=constraints, maxiter=60)
     assert not best.converged and best.message.startswith("infeasible: ") and best.feasibility > 0.1
+
+
+class StandIn:
+    """The class Problem of cyipopt, with its callbacks; it solves the problem by SciPy's SLSQP."""
+
+    def __init__(self, n, m, problem_obj, lb, ub, cl, cu):
+        self.callbacks = problem_obj
+        self.bounds = Bounds(lb, ub)
+        self.limits = cl, cu
+        self.shape = m, n
+        self.options = {}
+
+    def add_option(self, name, value):
+        self.options[name] = value
+
+    def solve(self, start):
+        lower, upper = self.limits
+        equality = lower == upper
+        constraints = [
+            {
+                "type": kind,
+                "fun": lambda z, rows=rows, sign=sign: sign * self.callbacks.constraints(z)[rows],
+                "jac": lambda z, rows=rows, sign=sign: sign * self.callbacks.jacobian(z).reshape(self.shape)[rows],
+            }
+            for kind, rows, sign in (("eq", equality, 1.0), ("ineq", ~equality & (upper == 0), -1.0))
+        ]
+
+        class Stop(Exception):
+            pass
+
+        iterations = []
+
+        def callback(z):
+            iterations.append(z)
+            self.callbacks.gradient(z)
+            figures = [0.0] * 9
+            if not self.callbacks.intermediate(0, len(iterations), *figures):
+                raise Stop
+
+        message = b"Solved_To_Acceptable_Level"
+        try:
+            minimize(
+                self.callbacks.objective,
+                start,
+                jac=self.callbacks.gradient,
+                bounds=self.bounds,
+                constraints=constraints,
+                callback=callback,
+                method="SLSQP",
+                options={"ftol": 1e-30},
+            )
+        except Stop:
+            message = b"User_Requested_Stop"
+        return start, {"status_msg": message}
+
+
+def test_callbacks_of_ipopt(monkeypatch):
+    """Objective, gradient, constraints, Jacobian, bounds and intermediate, without Ipopt."""
+    module = ModuleType("cyipopt")
+    module.Problem = StandIn
+    monkeypatch.setitem(sys.modules, "cyipopt", module)
+    loss, start, bounds, constraints, value, multipliers = HOCK[71]
+    settings = {"linear_solver": "mumps"}
+    best = dp.minimize(loss, np.array(start), "ipopt", constraints=constraints, bounds=bounds, settings=settings)
+    assert best.converged and np.isclose(best.value, value, rtol=1e-8)
+    assert np.allclose(best.multipliers, multipliers, atol=1e-7) and len(best.history) > 3
+    with pytest.raises(ZeroDivisionError):
+        dp.minimize(loss, np.array(start), "ipopt", constraints=constraints, callback=lambda record, x: 1 / 0)
+
+
+# ---- scales and precision --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("x_size, loss_size, constraint_size", [(1e-9, 1e9, 1e9), (1e9, 1e-9, 1e-9)])
+@pytest.mark.parametrize("method", ["augmented_lagrangian", "mma", "slsqp"])
+def test_units_do_not_matter(method, x_size, loss_size, constraint_size):
+    """The unknowns, the loss and the constraints are divided by their sizes."""
+    if method not in METHODS:
+        pytest.skip("NLopt is not installed")
+    loss, start, bounds, constraints, value, multipliers = HOCK[24]
+    best = dp.minimize(
+        lambda x: loss_size * loss(x / x_size),
+        x_size * np.array(start),
+        method,
+        constraints=[lambda x, one=one: constraint_size * one(x / x_size) for one in constraints],
+        bounds=bounds,
+        tolerance=1e-6,
+    )
+    assert best.converged
+    assert np.isclose(best.value, value * loss_size, rtol=1e-5)
+    assert np.allclose(np.array(best.multipliers) * constraint_size / loss_size, multipliers, atol=1e-5)
+
+
+@pytest.mark.parametrize("method", METHODS[:2])
+def test_single_precision_and_constant_leaves(method):
+    def loss(x):
+        return anp.sum((x["u"] - x["target"]) ** 2)
+
+    start = {"u": np.zeros(3, np.float32), "target": 2, "name": "a"}
+    best = dp.minimize(loss, start, method, constraints={"sum": lambda x: anp.sum(x["u"]) - 3.0}, bounds=(0.0, None))
+    assert best.converged and best.x["u"].dtype == np.float32 and best.x["name"] == "a"
+    assert np.allclose(best.x["u"], 1.0, atol=1e-4) and np.isclose(best.multipliers["sum"], 2.0, rtol=1e-3)
+
+
+def test_complex_unknowns():
+    """The nearest point to 3 + 4i in the unit disk."""
+    best = dp.minimize(
+        lambda z: anp.abs(z - (3 + 4j)) ** 2,
+        0.5 + 0.1j,
+        "augmented_lagrangian",
+        constraints=lambda z: anp.abs(z) ** 2 - 1.0,
+    )
+    assert best.converged and np.isclose(best.x, 0.6 + 0.8j, atol=1e-7) and np.isclose(best.multipliers, 4.0, atol=1e-6)
+
+
+# ---- the course of a run ---------------------------------------------------------------------------------------------
+
+
+def without_seconds(best):
+    return [record._replace(seconds=0.0) for record in best.history]
+
+
+@pytest.mark.parametrize("stop", [1, 8, 30])
+def test_a_resumed_run_has_the_same_bits(tmp_path, stop):
+    loss, start, bounds, constraints, _, _ = HOCK[71]
+
+    def run(stop=None, **options):
+        return dp.minimize(
+            loss,
+            np.array(start),
+            "augmented_lagrangian",
+            constraints=constraints,
+            bounds=bounds,
+            callback=lambda record, x: record.iteration == stop,
+            **options,
+        )
+
+    whole = run()
+    stopped = run(stop, checkpoint=tmp_path)
+    assert stopped.message.startswith("stopped by the callback") and stopped.history[-1].iteration == stop
+    resumed = run(checkpoint=tmp_path)
+    assert resumed.resumed.startswith(f"resumed from iteration {stop}")
+    assert resumed.message == whole.message and resumed.evaluations == whole.evaluations
+    assert without_seconds(resumed) == without_seconds(whole)
+    assert np.array_equal(resumed.x, whole.x) and np.array_equal(resumed.multipliers, whole.multipliers)
+    again = run(checkpoint=tmp_path)
+    assert again.converged and np.array_equal(again.x, whole.x)
+    constraints = [lambda x: 1.01 * (25 - x[0] * x[1] * x[2] * x[3]), constraints[1]]
+    with pytest.raises(ValueError, match="holds a run with another"):
+        run(checkpoint=tmp_path)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("where", ["loss", "constraint", "callback"])
+def test_exceptions_and_interrupts_come_through(method, where):
+    """A library must neither swallow an exception nor lose the best point after Ctrl-C."""
+    calls = dict.fromkeys(["loss", "constraint", "callback"], 0)
+
+    def failing(name, error):
+        calls[name] += 1
+        if name == where and calls[name] == 4:
+            raise error
+
+    def run(error):
+        calls.update(dict.fromkeys(calls, 0))
+
+        def loss(x):
+            failing("loss", error)
+            return anp.sum((x - np.array([2.0, 1.0, 0.3])) ** 4)
+
+        def constraint(x):
+            failing("constraint", error)
+            return anp.sum(x**2) - 1.0
+
+        def callback(record, x):
+            failing("callback", error)
+
+        return dp.minimize(loss, np.full(3, 0.1), method, constraints=constraint, callback=callback, bounds=(0.0, 5.0))
+
+    with pytest.raises(ZeroDivisionError, match="by the user"):
+        run(ZeroDivisionError("by the user"))
+    best = run(KeyboardInterrupt())
+    assert best.message == "interrupted" and not best.converged and len(best.history) >= 2
+    assert best.value <= best.history[0].value and best.feasibility <= 1e-6
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("error", [dp.errors.ConvergenceError, dp.errors.UnstableStepError, None])
+def test_points_that_cannot_be_evaluated_are_avoided(method, error):
+    """Beyond x[0] == 1.5 the loss or the constraint raises, or is NaN; the optimum is at (1, 1)."""
+
+    def loss(x):
+        return anp.sum((x - 2.0) ** 2)
+
+    def constraint(x):
+        if anp.max(x) > 1.5:
+            if error is None:
+                return anp.log(anp.sum(x) - 100.0)
+            raise error("no solution")
+        return anp.sum(x) - 2.0
+
+    with np.errstate(invalid="ignore"):
+        best = dp.minimize(loss, np.full(2, 0.2), method, constraints=constraint, maxiter=100, tolerance=1e-5)
+    assert best.converged and np.allclose(best.x, 1.0, atol=1e-4)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_no_iterations_and_infeasible_starts(method):
+    best = dp.minimize(lambda x: anp.sum(x**2), np.full(2, 0.5), method, constraints=lambda x: 3.0 - x, maxiter=0)
+    assert len(best.history) == 1 and not best.converged and np.array_equal(best.x, [0.5, 0.5])
+    assert best.feasibility > 0.3 and np.array_equal(best.constraint_values, [2.5, 2.5])
+    assert "the constraints are violated by up to" in best.message
