@@ -322,9 +322,13 @@ class CheckpointFunctions:
         """Return the number; see `Objective.in_units_of_loss`."""
         return number
 
-    def projected_gradient(self, evaluation: Evaluation) -> Any:
+    def projected_gradient(self, evaluation: Evaluation) -> NDArray[np.float64]:
         """Return the projected gradient of the Lagrangian at the start."""
         return self._problem.gradient_in_x(self._problem.start, self._first_multipliers)
+
+    def gradient_norm(self, evaluation: Evaluation) -> float:
+        """Return the norm of this gradient."""
+        return norm(self.projected_gradient(evaluation))
 
 
 class ConstrainedMethod(ABC):
