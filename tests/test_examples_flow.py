@@ -91,6 +91,20 @@ def test_steady_states():
     assert len(heat) == 2
 
 
+@example("room.py")
+def test_room():
+    """Air that enters leaves, walls are closed, the gradient is right and lowers the loss."""
+    printed = run("room.py")
+    entering, leaving, leak = (
+        float(n) for n in re.search(r"in (\S+), out (\S+), through closed walls (\S+)", printed).groups()
+    )
+    assert entering == leaving == 0.05 and leak == 0
+    slope, difference = (float(n) for n in re.search(r"direction (\S+), by a difference (\S+)", printed).groups())
+    assert slope == pytest.approx(difference, rel=1e-4)
+    ((before, after),) = rows(printed, r"^loss (\S+) -> (\S+)$")
+    assert after < 0.8 * before
+
+
 @example("obstacle.py")
 def test_obstacle():
     printed = run("obstacle.py")

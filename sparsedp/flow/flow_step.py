@@ -125,9 +125,9 @@ def flow_step(
         "values": values, "source": lambda s, params: ...}}``. All four entries are optional. "diffusivity": a number
         >= 0 [length^2 / time]. "boundary": a condition or a dict (default neumann). "values": wall values as `lift`
         takes them, here for x-lower, x-upper, y-lower and y-upper
-        ``dp.lift(grid, {"x": dp.dirichlet}).domain.join(1.0, 0.0, 0.0, 0.0)``. "source": a function that returns the
-        rate [scalar / time] from the dict of all scalars. With scalars, the force is called as
-        ``force(v, s, params)``.
+        ``dp.lift(grid, {"x": dp.dirichlet}).domain.join(1.0, 0.0, 0.0, 0.0)``, or a function ``values(params)`` that
+        returns those at the end of a step; differentiable. "source": a function that returns the rate [scalar / time]
+        from the dict of all scalars. With scalars, the force is called as ``force(v, s, params)``.
     unstable : "raise" or "allow"
         Whether to raise UnstableStepError if dt is too large for stability.
     friction : array or callable, optional
@@ -147,7 +147,8 @@ def flow_step(
         [velocity^2] and the previous acceleration "a". ``step(state, params)`` returns the next state, for `rollout`.
         The params are passed to force, friction, viscosity, walls and inflow. With scalars,
         ``step.start(v, params, s)`` takes a dict of cell fields. The state then also holds these as "s" and their
-        previous rates as "r". If `walls` is a function, the state also holds the wall velocities as "walls".
+        previous rates as "r". If `walls` is a function, the state also holds the wall velocities as "walls"; if wall
+        values of scalars are functions, it holds these as "values".
 
     Raises
     ------
@@ -261,6 +262,8 @@ def _check(settings: FlowSettings) -> None:
         _check_constant(f"diffusivity of {name!r}", entries.get("diffusivity", 0.0), ">= 0")
         if entries.get("source") is not None:
             check_function("flow_step", entries["source"], "source=lambda s, params: ...", 2)
+        if callable(entries.get("values")):
+            check_function("flow_step, as values,", entries["values"], "values=lambda params: ...", 1)
 
 
 def _check_constant(name: str, number: Any, range_: str) -> None:
@@ -381,7 +384,10 @@ class FlowStep(Reconstructible):
             state["walls"] = walls
         if s:
             state["s"] = s
-            state["r"] = self._rates(v, s, params)
+            values = self._wall_values(s, params)
+            state["r"] = self._rates(v, s, params, values)
+            if values:
+                state["values"] = values
         return state
 
     @public("dp.flow_step(grid, dt)")
@@ -422,11 +428,16 @@ class FlowStep(Reconstructible):
         if self.walls.changes:
             new["walls"] = walls_after
         if s:
-            rates = self._rates(v, s, params)
+            before = state.get("values", {})
+            after = self._wall_values(s, params)
+            rates = self._rates(v, s, params, before)
             new["r"] = rates
             new["s"] = {
-                name: scalar.step(s[name], rates[name], state["r"][name]) for name, scalar in self.scalars.items()
+                name: scalar.step(s[name], rates[name], state["r"][name], before.get(name), after.get(name))
+                for name, scalar in self.scalars.items()
             }
+            if after:
+                new["values"] = after
         return new
 
     def _check_state(self, state: Any) -> None:
@@ -435,6 +446,8 @@ class FlowStep(Reconstructible):
             names += ["s", "r"]
         if self.walls.changes:
             names += ["walls"]
+        if any(scalar.changes for scalar in self.scalars.values()):
+            names += ["values"]
         if not isinstance(state, dict) or state.keys() != set(names):
             raise ShapeError(
                 f"flow_step takes a dict of {', '.join(names[:-1])} and {names[-1]} as its state; "
@@ -485,8 +498,13 @@ class FlowStep(Reconstructible):
         check_on("flow_step, as inflow,", inflow, self.grid.faces, "; join its components with grid.join")
         return v + self._inflow_faces(cast(inflow, dtype_of(v)) - v)
 
-    def _rates(self, v: Any, s: dict[str, Any], params: Any) -> dict[str, Any]:
-        return {name: scalar.rate(v, s, params) for name, scalar in self.scalars.items()}
+    def _wall_values(self, s: dict[str, Any], params: Any) -> dict[str, Any]:
+        """Return the wall values of the scalars for which they are functions of params."""
+        scalars = self.scalars.items()
+        return {name: scalar.wall_values(params, dtype_of(s[name])) for name, scalar in scalars if scalar.changes}
+
+    def _rates(self, v: Any, s: dict[str, Any], params: Any, values: dict[str, Any]) -> dict[str, Any]:
+        return {name: scalar.rate(v, s, params, values.get(name)) for name, scalar in self.scalars.items()}
 
     def _check_convection(self, v: Any) -> None:
         """Raise UnstableStepError if convection would amplify a wave by more than MAX_GROWTH."""

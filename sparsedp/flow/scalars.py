@@ -4,20 +4,22 @@
 
 for implicit diffusion. If diffusion is explicit, r also contains k (L s + D B), and the third term is omitted. D is the
 divergence, A the average from cells to faces, and k the diffusivity. B and W are the contributions of the wall values
-to the slopes and to the values on faces.
+to the slopes and to the values on faces. If the wall values are a function of params, r contains those at the beginning
+of the step, and B is the mean of those at its beginning and at its end.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sparsedp._utils.pytree import mapped
-from sparsedp._utils.validation import check_finite
+from sparsedp._utils.validation import check_finite, check_on
 from sparsedp.autodiff.program_trace import check_values, sample
+from sparsedp.autodiff.tape import cast
 from sparsedp.autodiff.tape_constants import frozen
 from sparsedp.errors import ShapeError
 from sparsedp.flow.diffusion import Diffusion
@@ -34,6 +36,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Scalar"]
 
+ADVICE = "; write dp.lift(grid, boundary).domain.join(...)"
+
 
 class Scalar:
     """A cell field that the flow carries.
@@ -45,6 +49,11 @@ class Scalar:
     divergence : Operator
     diffusivity, boundary, values, source
         As `flow_step` takes them in `scalars`.
+
+    Attributes
+    ----------
+    changes : bool
+        Whether the wall values are a function of params. If they are, the state of a flow step contains them.
     """
 
     def __init__(
@@ -54,7 +63,7 @@ class Scalar:
         divergence: Operator,
         diffusivity: float = 0.0,
         boundary: Any = neumann,
-        values: NDArray | None = None,
+        values: NDArray | Callable | None = None,
         source: Callable | None = None,
     ) -> None:
         grid = settings.grid
@@ -64,22 +73,54 @@ class Scalar:
         self.source = source
         self._divergence = divergence
         self._average = average(grid, boundary)
-        self._wall_values: Any = 0.0  # on faces
-        self._wall_part: Any = None  # contribution of wall values to the Laplacian
-        if values is not None:
-            slopes = lift(grid, boundary)(values)
-            self._wall_part = divergence(slopes)
-            if solid is not None:
-                self._wall_part = mask(grid.cells, ~check_solid(grid, solid))(self._wall_part)
-            normal = divergence.T(np.ones(grid.shape))
-            self._wall_values = slopes / np.where(slopes != 0, 2 * normal, 1.0)
+        self._lift = lift(grid, boundary)
+        self._fluid: Any = None
+        if solid is not None:
+            self._fluid = mask(grid.cells, ~check_solid(grid, solid))
+        self._values: Any = values
+        self.changes = callable(values)
+        self._constant_part: Any = None
+        self._constant_on_faces: Any = 0.0
+        if values is not None and not self.changes:
+            self._constant_part, self._constant_on_faces = self._contributions(values)
         build_laplacian = partial(laplacian, grid, boundary, solid)
         self.diffusion = Diffusion(f"diffusivity of {name!r}", float(diffusivity), build_laplacian, settings)
 
-    def rate(self, v: Any, scalars: dict[str, Any], params: Any) -> Any:
-        """Return the explicit part r of the rate of change; see the module docstring."""
+    def wall_values(self, params: Any, dtype: np.dtype) -> Any:
+        """Return the wall values for params, in the dtype of the field, if they are a function of params."""
+        values = self._values(params)
+        check_on(f"flow_step, as values of {self.name!r},", values, self._lift.domain, ADVICE)
+        return cast(values, dtype)
+
+    def _contributions(self, values: Any) -> tuple[Any, Any]:
+        """Return the contributions of wall values to the Laplacian, and to the values on faces."""
+        slopes = self._lift(values)
+        part = self._divergence(slopes)
+        if self._fluid is not None:
+            part = self._fluid(part)
+        return part, slopes / self._twice_normal
+
+    @cached_property
+    def _twice_normal(self) -> Any:
+        """2 / h on walls, with the sign of the outward normal, and 1 on all other faces."""
+        at_wall = self._lift(np.ones(self._lift.domain.shape)) != 0
+        normal = self._divergence.T(np.ones(self._divergence.codomain.shape))
+        return np.where(at_wall, 2 * normal, 1.0)
+
+    def _parts(self, values: Any) -> tuple[Any, Any]:
+        """Return `_contributions` of the given values, or of the constant ones if values is None."""
+        if values is None:
+            return self._constant_part, self._constant_on_faces
+        return self._contributions(values)
+
+    def rate(self, v: Any, scalars: dict[str, Any], params: Any, values: Any = None) -> Any:
+        """Return the explicit part r of the rate of change; see the module docstring.
+
+        `values` are the wall values at the beginning of the step; None if they are constant.
+        """
         u = scalars[self.name]
-        rate = -self._divergence(v * (self._average(u) + self._wall_values))
+        wall_part, on_faces = self._parts(values)
+        rate = -self._divergence(v * (self._average(u) + on_faces))
         if self.source is not None:
             source = self.source(mapped(frozen, scalars), params)
             if np.shape(sample(source)) not in ((), u.shape):
@@ -88,17 +129,19 @@ class Scalar:
                     f"{np.shape(sample(source))}; write one number for each cell"
                 )
             rate = rate + source
-        rate = self.diffusion.add_explicit(rate, u, params, lambda: self._wall_part)
+        rate = self.diffusion.add_explicit(rate, u, params, lambda: wall_part)
         check_values(partial(check_finite, f"the rate of {self.name!r}"), rate)
         return rate
 
-    def step(self, u: Any, rate: Any, previous_rate: Any) -> Any:
-        """Return the field after a step."""
+    def step(self, u: Any, rate: Any, previous_rate: Any, before: Any = None, after: Any = None) -> Any:
+        """Return the field after a step, given the wall values at its beginning and end; None if they are constant."""
         explicit = u + self.dt * (1.5 * rate - 0.5 * previous_rate)
         if self.diffusion.solve is None:
             return explicit
-        if self._wall_part is None:
+        if before is not None:
+            wall_part, _ = self._contributions(before + after)
+        elif self._constant_part is None:
             wall_part = None
         else:
-            wall_part = 2.0 * self._wall_part
+            wall_part = 2.0 * self._constant_part
         return self.diffusion.step_implicit(explicit, u, wall_part)
