@@ -750,6 +750,60 @@ BUGS = {
         "tests/trajectory/test_rollout.py tests/trajectory/test_rollout_kinds.py",
     ),
     # ---- optimize, blackbox, network
+    "multipliers with the wrong sign": Bug(
+        "optimize/constraints.py",
+        "function.in_shape(function.cotangent(part)) for",
+        "function.in_shape(-function.cotangent(part)) for",
+        "tests/optimize/test_minimize_constraints.py",
+    ),
+    "a row of the Jacobian of the constraints is missing": Bug(
+        "optimize/constraints.py",
+        "        return np.concatenate(blocks)\n",
+        "        return np.concatenate(blocks) * (np.arange(self.rows.size) > 0)[:, None]\n",
+        "tests/optimize/test_minimize_constraints.py",
+    ),
+    "converged without being feasible": Bug(
+        "optimize/constrained_run.py",
+        "return max(record.feasibility, record.optimality) <= self._tolerance",
+        "return record.optimality <= self._tolerance",
+        "tests/optimize/test_minimize_constraints.py",
+    ),
+    "a lower limit with the sign of an upper one": Bug(
+        "optimize/constraints.py",
+        "-np.ones(below.size)",
+        "np.ones(below.size)",
+        "tests/optimize/test_minimize_constraints.py",
+    ),
+    "a gradient lost in the rounding of x counts as 0": Bug(
+        "optimize/constrained_problem.py",
+        "return np.clip(gradient, point.z - self.box.upper, point.z - self.box.lower)",
+        "return point.z - self.box.nearest(point.z - gradient)",
+        "tests/optimize/test_minimize_constraints.py",
+    ),
+    "an exception of a function that NLopt swallows": Bug(
+        "optimize/mma.py",
+        "        if errors:\n            raise errors[0]\n",
+        "",
+        "tests/optimize/test_minimize_constraints.py",
+    ),
+    "constraints that are not divided by their units": Bug(
+        "optimize/constraints.py",
+        "            units.append(np.full(rows.size, power_of_two(size)))",
+        "            units.append(np.ones(rows.size))",
+        "tests/optimize/test_minimize_constraints.py",
+    ),
+    "a negative multiplier of an inequality": Bug(
+        "optimize/augmented_lagrangian.py",
+        "np.where(self._problem.equality, shifted, np.maximum(shifted, 0.0))",
+        "shifted",
+        "tests/optimize/test_minimize_constraints.py",
+    ),
+    "a resumed run that forgets the multipliers": Bug(
+        "optimize/constrained_run.py",
+        "            state = resumed.state\n",
+        "            state = resumed.state._replace(multipliers=0 * resumed.state.multipliers)\n",
+        "tests/optimize/test_minimize_constraints.py",
+    ),
     "a running mean without the correction of its start": Bug(
         "optimize",
         "np.sqrt(mean_square / (1 - b2**count))",

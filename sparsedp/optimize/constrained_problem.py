@@ -202,7 +202,7 @@ class ConstrainedProblem:
 
     def projected_step(self, point: Point, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return z minus the projection of z - gradient onto the bounds: the gradient where no bound is near."""
-        return point.z - self.box.nearest(point.z - gradient)
+        return np.clip(gradient, point.z - self.box.upper, point.z - self.box.lower)  # without cancellation for large z
 
     def optimality(self, point: Point, multipliers: NDArray[np.float64]) -> float:
         """Return the norm of the residuals of the optimality conditions, relative to the gradient of the loss.

@@ -210,7 +210,7 @@ class ConstrainedRun:
     def library_ended(self, reason: str) -> None:
         """Set the message after a method has ended by itself, without meeting the tolerance."""
         best = self.closest
-        self.message = f"stopped: {reason}"
+        self.message = f"stopped: {reason}; dp.check.gradient(loss, x) tells whether the gradient is right"
         stationary = max(NEARLY, np.sqrt(self.problem.packing.eps))  # rounding of the loss hides smaller gradients
         if best.point.violation <= self._nearly and best.optimality <= stationary:
             self.best = best
@@ -240,7 +240,7 @@ class ConstrainedRun:
                 break
             point = problem.at(state.current.point)
             if point.violation <= self.feasible:
-                return best, f"{message}; there are feasible points: write a larger maxiter or another start"
+                return best, f"{message}; there are feasible points: try another start, method or maxiter"
         if not problem.violation_is_stationary(point):
             return best, message
         message = (

@@ -155,7 +155,9 @@ class ConstraintFunction:
 
     def in_shape(self, flat: NDArray[np.float64]) -> Any:
         """Return flat entries in the shape of y; a number if y is a number."""
-        return np.reshape(flat, self.shape)[()]
+        if self.shape == ():
+            return float(flat[0])
+        return np.reshape(flat, self.shape)
 
     def _set_rows(self, shape):
         """Determine the rows from the limits, given the shape of y."""

@@ -188,7 +188,10 @@ class Minimum(Frozen):
     def __str__(self):
         last = self.history[-1]
         head = f"{self.method}: loss {self.value:.6g} after {last.iteration} iterations, {self.evaluations} evaluations"
-        lines = [f"{'n':>6}  {'loss':>13}  {'gradient':>9}  {'seconds':>8}  evaluations  solves"]
+        measures = f"{'gradient':>9}"
+        if self.optimality is not None:
+            measures = "feasibility  optimality"
+        lines = [f"{'n':>6}  {'loss':>13}  {measures}  {'seconds':>8}  evaluations  solves"]
         lines += [_history_line(record) for record in self.history]
         if len(self.history) > 2 * SHOWN + 1:
             lines[SHOWN + 1 : -SHOWN] = [f"{'...':>6}"]
@@ -206,6 +209,8 @@ class Minimum(Frozen):
             "why it stopped": self.message,
             "iterations": self.history[-1].iteration,
             "evaluations": self.evaluations,
+            "feasibility": None if self.optimality is None else f"{self.feasibility:.2e}",
+            "optimality": None if self.optimality is None else f"{self.optimality:.2e}",
             "resumed": self.resumed or None,
             "convergence": curves({"loss": losses}, "iteration", "loss") or None,
         }
@@ -214,8 +219,11 @@ class Minimum(Frozen):
 
 def _history_line(record):
     """Return the line of a record in the table of a result."""
+    measures = f"{record.gradient_norm:9.2e}"
+    if record.optimality is not None:
+        measures = f"{record.feasibility:11.2e}  {record.optimality:10.2e}"
     line = (
-        f"{record.iteration:6d}  {record.value:13.6e}  {record.gradient_norm:9.2e}  {record.seconds:8.2f}  "
+        f"{record.iteration:6d}  {record.value:13.6e}  {measures}  {record.seconds:8.2f}  "
         f"{record.evaluations:11d}  {record.solves:6d}"
     )
     if record.failed:

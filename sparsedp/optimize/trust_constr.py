@@ -61,17 +61,29 @@ class TrustConstr(ConstrainedMethod):
         """Iterate until SciPy ends; see `ConstrainedMethod`."""
         from scipy.optimize import BFGS, Bounds, NonlinearConstraint, minimize
 
-        start = problem.start.z
-        lower = np.broadcast_to(problem.box.lower, start.shape)
-        upper = np.broadcast_to(problem.box.upper, start.shape)
+        whole_start = problem.start.z
+        lower = np.broadcast_to(problem.box.lower, whole_start.shape)
+        upper = np.broadcast_to(problem.box.upper, whole_start.shape)
+        moving = lower < upper  # a barrier needs an interior
+        if not moving.any():
+            return "the bounds allow one point only"
+        start = whole_start[moving]
+        lower = lower[moving]
+        upper = upper[moving]
+
+        def functions(z):
+            whole = whole_start.copy()
+            whole[moving] = z
+            return problem.functions(whole)
+
         constraints = []
         if problem.start.rows.size:
             constraints.append(
                 NonlinearConstraint(
-                    lambda z: problem.functions(z).rows,
+                    lambda z: functions(z).rows,
                     np.where(problem.equality, 0.0, -np.inf),
                     np.zeros(problem.equality.size),
-                    jac=lambda z: problem.functions(z).jacobian,
+                    jac=lambda z: functions(z).jacobian[:, moving],
                     hess=BFGS(),
                 )
             )
@@ -82,15 +94,15 @@ class TrustConstr(ConstrainedMethod):
 
         def callback(z, state):
             if state.nit > 0:
-                run.record(problem.functions(z).usable)
+                run.record(functions(z).usable)
 
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=EXPECTED_WARNINGS)
             result = minimize(
-                lambda z: problem.functions(z).value,
+                lambda z: functions(z).value,
                 start,
                 method="trust-constr",
-                jac=lambda z: problem.functions(z).gradient,
+                jac=lambda z: functions(z).gradient[moving],
                 hess=BFGS(),
                 bounds=bounds,
                 constraints=constraints,

@@ -148,6 +148,32 @@ def test_multipliers_are_the_derivative_of_the_optimal_value():
 
 
 @pytest.mark.parametrize("method", ["augmented_lagrangian", "slsqp"])
+def test_a_source_with_given_temperatures_against_the_kkt_system(method, rng):
+    """The smallest heat source with given readings: one equality for each of three sensors."""
+    grid = dp.Grid((6, 5), size=1.0)
+    minus_laplacian = -dp.laplacian(grid, dp.dirichlet)
+    temperature_of = dp.inverse(minus_laplacian)
+    sensors = dp.sample(grid, rng.uniform(0.2, 0.8, (3, 2)))
+    readings = np.array([0.1, 0.2, 0.15])
+
+    def loss(source):
+        return 0.5 * anp.sum(source**2)
+
+    def misfit(source):
+        return sensors(temperature_of(source)) - readings
+
+    best = dp.minimize(loss, np.ones(grid.shape), method, constraints=dp.equal(misfit), tolerance=1e-9, maxiter=300)
+    matrix = sensors.matrix.toarray() @ np.linalg.inv(minus_laplacian.matrix.toarray())
+    system = np.block([[np.eye(30), matrix.T], [matrix, np.zeros((3, 3))]])
+    solution = np.linalg.solve(system, np.concatenate([np.zeros(30), readings]))
+    assert best.converged and np.allclose(best.x.ravel(), solution[:30], atol=1e-6 * np.max(np.abs(solution[:30])))
+    assert np.allclose(best.multipliers, solution[30:], rtol=1e-6)
+    lagrangian = lambda source: loss(source) + anp.sum(best.multipliers * misfit(source))
+    assert np.linalg.norm(dp.grad(lagrangian)(best.x)) <= 1e-7 * np.linalg.norm(best.x)
+    assert dp.check.gradient(lagrangian, np.ones(grid.shape), quick=True).verdict == "agrees"
+
+
+@pytest.mark.parametrize("method", ["augmented_lagrangian", "slsqp"])
 def test_constraints_of_scipy(method):
     """Two-sided limits, an equality, a limit that is infinite, and a jac of the user."""
     matrix = np.array([[1.0, 1.0, 0.0], [0.0, 1.0, -1.0], [1.0, 0.0, 1.0]])
@@ -389,3 +415,38 @@ def test_no_iterations_and_infeasible_starts(method):
     assert len(best.history) == 1 and not best.converged and np.array_equal(best.x, [0.5, 0.5])
     assert best.feasibility > 0.3 and np.array_equal(best.constraint_values, [2.5, 2.5])
     assert "the constraints are violated by up to" in best.message
+
+
+@pytest.mark.parametrize("method", ["augmented_lagrangian", "mma", "slsqp"])
+def test_a_loss_without_a_minimum_is_not_converged(method):
+    """At x = -1e20 the step of a gradient of 1 is lost in rounding; that must not count as a bound."""
+    if method not in METHODS:
+        pytest.skip("NLopt is not installed")
+    constraint = lambda x: anp.sum(x) - 1.0
+    best = dp.minimize(lambda x: anp.sum(x), np.zeros(2), method, constraints=constraint, maxiter=40)
+    assert not best.converged and best.optimality > 0.5
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_unknowns_that_bounds_hold_fixed(method):
+    lower = np.array([0.5, 0.0, 0.0])
+    upper = np.array([0.5, 1.0, 1.0])
+    start = np.array([0.5, 0.1, 0.1])
+    constraint = lambda x: anp.sum(x) - 1.0
+    best = dp.minimize(lambda x: anp.sum((x - 2.0) ** 2), start, method, constraints=constraint, bounds=(lower, upper))
+    assert best.converged and np.allclose(best.x, [0.5, 0.25, 0.25], atol=1e-6)
+    assert np.isclose(best.multipliers, 3.5, atol=1e-6)
+
+
+def test_dependent_constraints_have_multipliers_too():
+    """The constraints are the same up to a factor; the sum of their multipliers is determined."""
+    constraints = [lambda x: anp.sum(x) - 1.0, lambda x: 2 * anp.sum(x) - 2.0]
+    best = dp.minimize(lambda x: anp.sum((x - 2.0) ** 2), np.zeros(2), "slsqp", constraints=constraints)
+    first, second = best.multipliers
+    assert best.converged and min(first, second) >= 0 and np.isclose(first + 2 * second, 3.0)
+
+
+def test_a_table_and_a_page_show_the_violation():
+    best = dp.minimize(lambda x: anp.sum(x**2), np.ones(2), "slsqp", constraints=lambda x: 1.0 - x[0], maxiter=1)
+    assert "feasibility  optimality" in str(best) and "optimality" in best._repr_html_()
+    assert best.history[-1].summary().startswith("loss 1, feasibility ")
