@@ -27,6 +27,60 @@ class Bug(NamedTuple):
 
 
 BUGS = {
+    "eigenpairs: missing copies of a multiple eigenvalue": Bug(
+        "solvers/eigensolver.py",
+        "    for _ in range(MOST_RESTARTS):\n        new_values, new_vectors",
+        "    for _ in range(1):\n        new_values, new_vectors",
+        "tests/solvers/test_eigenpairs.py",
+    ),
+    "eigenpairs: the largest in the order of their distances": Bug(
+        "solvers/eigensolver.py",
+        '    chosen = order[:k][np.argsort(values[order[:k]], kind="stable")]\n',
+        "    chosen = np.sort(order[:k])\n",
+        "tests/solvers/test_eigenpairs.py",
+    ),
+    "eigenpairs: vectors of any sign": Bug(
+        "solvers/eigensolver.py",
+        "return vector * (np.conj(first) / np.abs(first))",
+        "return vector",
+        "tests/solvers/test_eigenpairs.py",
+    ),
+    "eigenpairs: the normalisation is not differentiated": Bug(
+        "solvers/eigen_rules.py",
+        "_combined(block, y) + 0.5 * _combined(c.T, ans), ans)",
+        "_combined(block, y), ans)",
+        "tests/solvers/test_eigenpairs.py",
+    ),
+    "eigenpairs: the mass in the derivative of a value": Bug(
+        "solvers/eigen_rules.py",
+        "                weights = -0.5 * (anp.dot(g, ans) + anp.dot(ans, g))\n",
+        "                weights = -0.5 * anp.dot(g, ans)\n",
+        "tests/solvers/test_eigenpairs.py",
+    ),
+    "eigenpairs: vectors are constant in the second derivative": Bug(
+        "solvers/eigen_rules.py",
+        "                gradients[1] = weights * self.mass.product(crossed, of_mass)\n",
+        "                gradients[1] = 0.0 * self.mass.product(crossed, of_mass)\n",
+        "tests/solvers/test_eigenpairs.py",
+    ),
+    "eigenpairs: a member of a cluster has a derivative": Bug(
+        "solvers/eigen_rules.py",
+        "            if np.max(g) - np.min(g) > tolerance * np.max(np.abs(g)):\n                raise refusal()\n",
+        "",
+        "tests/solvers/test_eigenpairs.py",
+    ),
+    "eigenpairs: a cut cluster is not seen": Bug(
+        "solvers/eigenpairs.py",
+        "            cut.append(any(self._are_equal(end, value) for end in ends for value in spectrum.beyond))\n",
+        "            cut.append(False)\n",
+        "tests/solvers/test_eigenpairs.py",
+    ),
+    "eigenpairs: coefficients are not copied": Bug(
+        "solvers/eigen_rules.py",
+        "    copy = np.array(value, np.result_type(value, float))\n    copy.flags.writeable = False\n    return copy\n",
+        "    return value\n",
+        "tests/solvers/test_eigenpairs.py",
+    ),
     "the first field beyond a wall in all stages": Bug(
         "advection/eulerian.py",
         "                beyond = self._values_beyond_walls(x, inflow)\n                slopes",

@@ -53,6 +53,9 @@ SYMMETRIC = 1e-12  # two products that should be equal may differ by this share 
 LARGEST_EXPONENT = 200  # an operator or a mass beyond this power of two is scaled
 AT_ROUNDOFF = 128 * EPS  # residuals below this share of the terms are rounding errors
 ZERO = 4 * EPS  # lambda M v below this share of the terms of A v is 0
+INNER = 1e-11  # relative tolerance of the solves inside of ARPACK
+TIGHT = 1e-11  # tolerance of ARPACK; a step of inverse iteration follows
+LOOSE = 1e-6  # tolerance of the search for missing copies
 MOST_RESTARTS = 64  # for missing copies
 MOST_STEPS = 20  # of inverse iteration after ARPACK or LOBPCG
 INERTIA_UP_TO = 300_000  # unknowns for which a factorisation counts the eigenvalues below a shift
@@ -445,34 +448,26 @@ def _by_arpack(pencil, k, which, maxiter):
         sigma = pencil.below_spectrum()
     else:
         sigma = which - NUDGE * pencil.scale
-    solve = pencil.shifted_inverse(sigma, _INNER, isinstance(which, str))
+    solve = pencil.shifted_inverse(sigma, INNER, isinstance(which, str))
     known = np.zeros((0, pencil.size), pencil.dtype)
     count = k + 1
-    tolerance = 0.0
     values = np.zeros(0)
     for _ in range(MOST_RESTARTS):
-        new_values, new_vectors = _shift_invert(pencil, sigma, solve, known, count, tolerance, maxiter)
+        new_values, new_vectors = _shift_invert(pencil, sigma, solve, known, count, maxiter)
         if len(known):
             farthest = np.sort(np.abs(values - sigma))[k]
             if not np.min(np.abs(new_values - sigma)) < farthest * (1.0 - 1e-9):
                 break
-            if tolerance:
-                tolerance = 0.0
-                continue
         known = np.concatenate([known, new_vectors])
         values = np.concatenate([values, new_values])
         if len(known) + 2 > pencil.unknowns:
             break
         count = 1
-        tolerance = 1e-7
-    values, vectors = _polished(pencil, solve, known, len(known))
+    values, vectors = _polished(pencil, solve, known, k)
     return sign * values, vectors
 
 
-_INNER = 1e-12  # relative tolerance of the solves inside of ARPACK
-
-
-def _shift_invert(pencil, sigma, solve, known, count, tolerance, maxiter):
+def _shift_invert(pencil, sigma, solve, known, count, maxiter):
     """Return pairs near a shift, in the complement of the known vectors."""
     from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
 
@@ -496,7 +491,7 @@ def _shift_invert(pencil, sigma, solve, known, count, tolerance, maxiter):
             v0=complement(pencil.start),
             ncv=min(pencil.unknowns, max(2 * count + 1, 20)),
             maxiter=maxiter,
-            tol=tolerance,
+            tol=LOOSE if len(known) else TIGHT,
             OPinv=LinearOperator(shape, solved, dtype=dtype),
         )
     except ArpackNoConvergence as error:
@@ -609,8 +604,8 @@ def _by_lobpcg(pencil, k, maxiter):
             maxiter=maxiter or 200,
             largest=False,
         )[:2]
-    solve = pencil.shifted_inverse(sigma, _INNER, True)
-    return _polished(pencil, solve, vectors.T, k + 1)
+    solve = pencil.shifted_inverse(sigma, INNER, True)
+    return _polished(pencil, solve, vectors.T, k)
 
 
 def _residual(pencil, value, vector):
@@ -677,7 +672,7 @@ def general_values(pencil: Pencil, k: int, which: Any, method: str, maxiter: int
         if not isinstance(which, str):
             sigma = scaled_which.real if scaled_which.imag == 0 else scaled_which
             sigma = sigma - NUDGE * pencil.scale
-            solve = pencil.shifted_inverse(sigma, _INNER, False)
+            solve = pencil.shifted_inverse(sigma, INNER, False)
             if isinstance(sigma, complex):
                 pencil.complex = True
             options.update(sigma=sigma, OPinv=LinearOperator(shape, solve, dtype=pencil.dtype))

@@ -68,6 +68,21 @@ REFUSED = [
     ),
     (
         TypeError,
+        "eigenpairs does not work on ranks yet; give it the grid from before dp.distribute",
+        lambda s: dp.eigenpairs(-dp.laplacian(s.grid, dp.dirichlet), mass=np.ones((5, 4))),
+    ),
+    (
+        TypeError,
+        "eigenpairs does not work on ranks yet; give it the grid from before dp.distribute",
+        lambda s: dp.eigenpairs(dp.elliptic_solver(dp.divergence(s.grid), s.G), coefficients=1.0),
+    ),
+    (
+        TypeError,
+        "eigenpairs does not work on ranks yet; give it the grid from before dp.distribute",
+        lambda s: dp.eigenpairs(dp.identity(dp.Grid((5, 4)).cells), mass=s.u),
+    ),
+    (
+        TypeError,
         "laplace does not work on ranks yet; give it the grid from before dp.distribute",
         lambda s: dp.laplace(lambda u: u, s.u, 1.0),
     ),
