@@ -341,7 +341,11 @@ class EllipticSolver(ParametricSolver):
         """Return the solver of these coefficients, and (k, shift) of its operator, checked."""
         check_plain("elliptic_solver", k, shift)
         shift = _checked_parameter("shift", shift, self.D.codomain)
-        k, solver = self._coefficient_and_solver(k)
+        k, solver, n_k = self._coefficient_and_solver(k)
+        if n_k is not None:
+            raise ShapeError(
+                f"eigenpairs takes one k, got a batch of {n_k}; call it for each entry along the first axis"
+            )
         return solver, (k, shift)
 
     def _coefficient_and_solver(self, k):

@@ -84,6 +84,11 @@ TABLE = [
         "write coefficients=...",
     ),
     (
+        pairs(SOLVE, coefficients=np.array([FACES, FACES])),
+        SHAPE,
+        "eigenpairs takes one k, got a batch of 2; call it for each entry along the first axis",
+    ),
+    (
         pairs(TWO, coefficients=1.0),
         TYPE,
         "coefficients belong to a solver, got an Operator <one: space(2) -> space(2), explicit>; write "
