@@ -169,8 +169,8 @@ BUGS = {
     ),
     "the condition of a patch on the rest of its wall": Bug(
         "operators/stencils.py",
-        "                terms += on_faces(axis, at_wall, faces)\n",
-        "                terms += on_faces(axis, at_wall, ~faces)\n",
+        "*entries), faces)\n",
+        "*entries), ~faces)\n",
         "tests/operators/test_patches.py",
     ),
     "one condition for the values of all faces of a wall": Bug(

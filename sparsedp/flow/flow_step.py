@@ -109,7 +109,7 @@ def flow_step(
     force : callable, optional
         ``force(v, params)`` returns an array on faces [velocity / time], or a number.
     boundary, solid, solid_boundary
-        As in `projection` and `face_laplacian`.
+        As in `projection` and `face_laplacian`. Openings in a wall are written with `patch`.
     implicit : bool
         Whether viscosity and the diffusion of scalars are implicit. They are then stable for every dt, at the cost of
         one additional solve each per step.

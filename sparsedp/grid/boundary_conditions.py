@@ -845,6 +845,8 @@ def _checked_where(where):
     parts = where if isinstance(where, (tuple, list)) else (where,)
     if isbox(where) or any(map(isbox, parts)):
         raise DerivativeError("where of patch must be constant, not traced; the values of lift on it have derivatives")
+    if isinstance(where, np.ndarray) and where.dtype != bool:
+        where = where.tolist()
     if isinstance(where, (tuple, list)) and not _are_flags(where):
         if len(where) == 2 and all(map(_is_coordinate, where)):
             where = (where,)

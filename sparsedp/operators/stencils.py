@@ -139,9 +139,9 @@ def _terms(grid, axis, sides, factor, entry):
             continue
         for condition, faces in wall.regions:
             pair = (condition, None) if side == 0 else (None, condition)
-            at_wall = Factor.from_diagonals(_cells_to_faces(grid, axis), *_walls(grid, axis, pair, entry))
-            if at_wall.matrix.nnz:
-                terms += on_faces(axis, at_wall, faces)
+            entries = _walls(grid, axis, pair, entry)
+            if entries:  # none on an axis without cells
+                terms += on_faces(axis, Factor.from_diagonals(_cells_to_faces(grid, axis), *entries), faces)
     return tuple(terms)
 
 

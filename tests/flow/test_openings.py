@@ -157,7 +157,7 @@ def dense_projection():
     return keep, G
 
 
-@pytest.mark.parametrize("method", ["auto", "multigrid"])
+@pytest.mark.parametrize("method", ["auto", pytest.param("multigrid", marks=pytest.mark.whole)])
 def test_projection_is_the_dense_one(method, rng):
     P = dp.projection(BOX, boundary=SIDES, method=method)
     keep, G = dense_projection()

@@ -45,7 +45,7 @@ TABLE = [
     (
         lambda: patch(np.arange(4), dirichlet),
         TYPE,
-        "where of patch needs (start, stop) or a bool array, got array([0, 1, 2, 3]); write (0.2, 0.4)",
+        "an interval of patch needs (start, stop), got 0; write for example (0.2, 0.4)",
     ),
     (
         lambda: patch((0, "1"), dirichlet),

@@ -124,6 +124,7 @@ def upper_y_faces(grid):
     return part.take(range(1, grid.shape[1] + 1), axis=1).ravel()
 
 
+@pytest.mark.whole
 def test_adjoint_identities_hold_in_every_dtype(scene):
     grid, boundary, _ = scene
     for op in (dp.gradient(grid, boundary), dp.lift(grid, boundary)):
@@ -148,6 +149,21 @@ def test_which_faces_belong_to_an_interval():
     for start, stop, faces in ((0.06, 0.34, [1, 2]), (0.15, 0.35, [1, 2]), (0.05, 0.15, [0]), (0.0, 0.051, [0])):
         ((wall, _), _) = resolve(grid, {"x": (patch((start, stop), dirichlet), neumann)}, patches=True)
         assert np.flatnonzero(wall.faces_with(lambda condition: condition == dirichlet)).tolist() == faces
+
+
+def test_ways_to_write_the_same_part_of_a_wall():
+    pair = patch((0.0, 0.3), dirichlet)
+    assert pair == patch([0.0, 0.3], dirichlet) == patch(np.array([0.0, 0.3]), dirichlet)
+    flags = [False, False, True, False]
+    walls = [resolve(BOX, {"x": (patch(m, dirichlet), neumann)}, patches=True) for m in (flags, np.array([flags]))]
+    assert walls[0] == walls[1] == resolve(BOX, {"x": (pair, neumann)}, patches=True)
+
+
+def test_grids_without_cells_have_patches():
+    grid = dp.Grid((0, 4))
+    one_face = {"x": (patch([True, False, False, False], dirichlet), neumann)}
+    assert dp.laplacian(grid, one_face).matrix.shape == (0, 0)
+    assert not np.any(dp.lift(grid, one_face)(np.ones(8)))
 
 
 def test_null_space_is_seen_through_patches():
@@ -211,8 +227,8 @@ def test_mixed_conditions_along_one_wall_have_order_two():
     assert 1.9 <= np.log2(errors[0] / errors[1]) <= 2.2 and 1.9 <= np.log2(errors[1] / errors[2]) <= 2.2
 
 
-def test_gradients_in_the_data_of_patches_to_second_order(rng):
-    """The values on a patch, a conductivity, and a heat transfer coefficient that varies along a patch."""
+def loss_of_data(rng):
+    """Return a loss of values on a patch, a conductivity and a heat transfer coefficient along a patch; and a point."""
     grid = dp.Grid((4, 4), size=1.0)
     sides = {"x": (patch((0.25, 0.75), dirichlet), patch((0.0, 0.5), dirichlet))}
     div, B = dp.divergence(grid), dp.lift(grid, sides)
@@ -226,7 +242,23 @@ def test_gradients_in_the_data_of_patches_to_second_order(rng):
         return anp.sum(weights * solve(k, 1.0 + div(k * B(walls))) ** 2)
 
     p = {"transfer": 1 + rng.random(4), "k": np.array(0.7), "inlet": rng.standard_normal(4)}
-    audit = dp.check.gradient(loss, p)
+    return loss, p
+
+
+def test_gradients_in_the_data_of_patches(rng):
+    loss, p = loss_of_data(rng)
+    gradient = dp.grad(loss)(p)
+    assert np.array_equal(gradient["inlet"] != 0, [False, True, True, False])
+    assert np.array_equal(gradient["transfer"] != 0, [True, True, False, False])
+    change = {name: rng.standard_normal(np.shape(value)) for name, value in p.items()}
+    values = [loss({name: p[name] + t * change[name] for name in p}) for t in (1e-5, -1e-5)]
+    slope = sum(np.sum(gradient[name] * change[name]) for name in p)
+    assert abs((values[0] - values[1]) / 2e-5 - slope) <= 1e-7 * abs(slope)
+
+
+@pytest.mark.whole
+def test_gradients_in_the_data_of_patches_to_second_order(rng):
+    audit = dp.check.gradient(*loss_of_data(rng))
     assert audit.verdict == audit.hessian == "agrees"
 
 

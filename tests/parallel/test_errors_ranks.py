@@ -135,6 +135,21 @@ REFUSED = [
     ),
     (
         TypeError,
+        "a patch of a wall does not work on ranks yet; give it the grid from before dp.distribute",
+        lambda s: dp.laplacian(s.grid, {"x": dp.patch((0.0, 2.0), dp.dirichlet)}),
+    ),
+    (
+        TypeError,
+        "a patch of a wall does not work on ranks yet; give it the grid from before dp.distribute",
+        lambda s: dp.transport(s.grid, boundary={"x": dp.patch((0.0, 2.0), dp.dirichlet)}),
+    ),
+    (
+        TypeError,
+        "a patch of a wall does not work on ranks yet; give it the grid from before dp.distribute",
+        lambda s: dp.projection(s.grid, boundary={"x": dp.patch((0.0, 2.0), dp.outflow)}),
+    ),
+    (
+        TypeError,
         "a tensor does not work on ranks yet; give it the grid from before dp.distribute",
         lambda s: dp.elliptic_solver(dp.divergence(s.grid), s.G)(np.ones((2, 2, 5, 4)), np.ones((5, 4))),
     ),
