@@ -55,6 +55,19 @@ def test_patterns():
     assert float(re.search(r"25 steps: (\S+)", printed)[1]) == pytest.approx(0.034, abs=1e-5)
 
 
+@example("posterior.py")
+def test_posterior():
+    """The truth in the intervals, a mode that is one, and deviations beside those of samples."""
+    printed = run("posterior.py")
+    assert float(re.search(r"mode: +(\S+) standard", printed)[1]) < 1e-2
+    assert 85 <= int(re.search(r"95 %: in (\d+) %", printed)[1]) <= 99
+    before, after = map(float, re.search(r"before (\S+), after (\S+),", printed).groups())
+    assert after < 0.9 * before
+    [pressure, mean] = re.findall(r"^(?:pressure|mean) .* (\d\.\d+) +(\d\.\d+)$", printed, re.MULTILINE)
+    assert float(pressure[0]) == pytest.approx(float(pressure[1]), rel=0.5)
+    assert float(mean[0]) == pytest.approx(float(mean[1]), rel=0.15)
+
+
 @example("edges.py")
 def test_edges():
     """Total variation finds field and jumps better."""

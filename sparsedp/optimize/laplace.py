@@ -179,7 +179,7 @@ def laplace(
         gradient=hessian.gradient,
         offset=vector - mean,
         tolerance=tolerance,
-        mean_square=hessian.mean_square,
+        squares=hessian.squares,
         seconds=perf_counter() - started,
     )
     if posterior.shift > FAR:
@@ -206,15 +206,15 @@ class _Hessian(NamedTuple):
     ----------
     gradient : (n,) array
         Of the misfit.
-    mean_square : float or None
-        Of the residuals.
+    squares : array or None
+        The squared residuals.
     jacobian : (m, n) array or None
     product : callable or None
         ``product(rows)`` returns H times each row.
     """
 
     gradient: NDArray
-    mean_square: float | None
+    squares: NDArray | None
     jacobian: NDArray | None = None
     product: Callable[[NDArray], NDArray] | None = None
 
@@ -234,14 +234,14 @@ def _hessian(misfit, packing, vector, rank):
     is_small = min(count, packing.size) <= rank
     linearization = Linearization(misfit, packing, vector, dense=is_small)
     gradient = linearization.vjp(linearization.flat)
-    mean_square = float(np.mean(linearization.flat**2))
+    squares = linearization.flat**2
     if is_small:
-        return _Hessian(gradient, mean_square, jacobian=linearization.jacobian())
+        return _Hessian(gradient, squares, jacobian=linearization.jacobian())
 
     def product(rows):
         return np.array([linearization.vjp(linearization.jvp(row)) for row in rows]).reshape(rows.shape)
 
-    return _Hessian(gradient, mean_square, product=product)
+    return _Hessian(gradient, squares, product=product)
 
 
 def _hessian_of_loss(loss, packing, vector):

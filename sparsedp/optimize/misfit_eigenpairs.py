@@ -224,6 +224,7 @@ class KrylovSpace:
         self._blocks: list[Block] = []
         self._next = Block(np.zeros((0, prior.size)), np.zeros((0, prior.size)))  # extends the space
         self._continues = False  # whether the next block has the components of the last one outside of the space
+        self._starts = 0
         self._open: list[tuple[slice, NDArray]] = []  # components of H C Q outside of the space, by blocks
         self.dimension = 0
         self.matrix = np.zeros((0, 0))
@@ -253,7 +254,8 @@ class KrylovSpace:
         return int(np.count_nonzero((np.abs(self.values) > self.threshold) & self._are_converged()))
 
     def _are_converged(self):
-        goal = SHARE_OF_RESIDUALS * self._tolerance / np.sqrt(max(1, self.informative))
+        # Each start leaves the components outside of the last space as they are, so the next one has a looser goal.
+        goal = self._starts * SHARE_OF_RESIDUALS * self._tolerance / np.sqrt(max(1, self.informative))
         return 2 * self.residuals <= np.maximum(goal, self._rounding)
 
     def start(self, rows: NDArray, are_samples: bool) -> float:
@@ -268,6 +270,7 @@ class KrylovSpace:
         squares = np.einsum("ij,ij->i", remainder, self._prior.apply(remainder))
         self._next, _ = self._orthonormalized(remainder)
         self._continues = False
+        self._starts += 1
         if self._next.dimension and not are_samples:
             return np.inf
         return float(np.sqrt(np.max(np.maximum(squares, 0.0))))

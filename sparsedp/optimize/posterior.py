@@ -61,9 +61,10 @@ class Posterior(Frozen):
         largest along an eigenvector, or the root mean square of a leaf in the directions that the data do not reduce.
     step : tree
         The step from x to this mode (a Newton step). For a linear function, x + step is the mode.
-    mean_square : float or None
-        The mean square of the residuals. It is about 1 if they were divided by the standard deviation of the noise;
-        None for a loss.
+    mean_square, expected_mean_square : float or None
+        The mean square of the m residuals at x, and its mean over data if the function is linear and x the mode,
+        1 - (sum of lambda / (1 + lambda)) / m. If they differ much, the residuals may not have been divided by the
+        standard deviation of the noise, or the prior is too narrow. None for a loss, and without residuals.
     products : int
         Number of products with the Hessian, or with the Jacobian if it was computed.
     seconds : float
@@ -80,6 +81,7 @@ class Posterior(Frozen):
     shift: float
     step: Any
     mean_square: float | None
+    expected_mean_square: float | None
     products: int
     seconds: float
     _pairs: MisfitEigenpairs
@@ -101,7 +103,7 @@ class Posterior(Frozen):
         gradient: NDArray,
         offset: NDArray,
         tolerance: float,
-        mean_square: float | None,
+        squares: NDArray | None,
         seconds: float,
     ) -> None:
         values = pairs.values
@@ -117,7 +119,7 @@ class Posterior(Frozen):
             expected_information_gain=0.5 * float(np.sum(np.log1p(values))),
             shift=shift,
             step=_tree(packing, step),
-            mean_square=mean_square,
+            **_mean_squares(squares, values),
             products=pairs.products,
             seconds=seconds,
             _tolerance=tolerance,
@@ -291,13 +293,25 @@ class Posterior(Frozen):
             "distance of x from the mode": f"{self.shift:.1e} standard deviations",
         }
         if self.mean_square is not None:
-            entries["mean square of the residuals"] = f"{self.mean_square:.3g} (about 1 is expected)"
+            entries["mean square of the residuals"] = (
+                f"{self.mean_square:.3g} ({self.expected_mean_square:.3g} is expected)"
+            )
         entries["prior variances"] = "exact"
         if any(block.diagonal is None for block in self._prior.blocks):
             entries["prior variances"] = "estimated, see variance_error()"
         entries[self._pairs.kind] = str(self.products)
         entries["seconds"] = f"{self.seconds:.2f}"
         return entries
+
+
+def _mean_squares(squares, values):
+    """Return the mean of the squared residuals, and its expected value."""
+    if squares is None or not squares.size:
+        return {"mean_square": None, "expected_mean_square": None}
+    return {
+        "mean_square": float(np.mean(squares)),
+        "expected_mean_square": 1 - float(np.sum(values / (1 + values))) / squares.size,
+    }
 
 
 def _reduction(values):

@@ -64,6 +64,7 @@ def test_linear_problem_with_few_residuals(rng):
     assert posterior.information_gain == pytest.approx(divergence(mean, covariance, prior), rel=1e-9)
     assert posterior.expected_information_gain == pytest.approx(0.5 * np.sum(np.log1p(exact)), rel=1e-9)
     assert posterior.mean_square == pytest.approx(np.mean(residuals(mean) ** 2))
+    assert posterior.expected_mean_square == pytest.approx(np.mean(1 / (1 + exact)), rel=1e-9)
     assert posterior.shift < 1e-9 and posterior.products == 20 and posterior.error == 0
     assert np.all(posterior.variance_error() == 0)
     with pytest.warns(dp.errors.PosteriorWarning, match="from the mode"):
@@ -87,6 +88,15 @@ def test_products_only(rng, as_loss):
     check_against(posterior, covariance, rng, 1e-3, posterior.error)
     assert 0.0 < posterior.error <= 0.011
     assert posterior.information_gain == pytest.approx(divergence(mean, covariance, prior), rel=0.01)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_number_of_products(seed):
+    """Two and a half products for each eigenpair, and those that show that none was missed."""
+    weights = 10.0 * 0.8 ** (0.5 * np.arange(300))
+    posterior = dp.laplace(lambda x: weights * x, np.zeros(300), 1.0, seed=seed)
+    assert posterior.eigenvalues[:40] == pytest.approx(weights[:40] ** 2, rel=1e-4)
+    assert 41 <= len(posterior.eigenvalues) <= 43 and posterior.products <= 2.5 * 42 + 30
 
 
 def test_multiple_eigenvalues():
@@ -137,6 +147,27 @@ def test_estimated_variances_of_low_rank(rng, monkeypatch):
     posterior = dp.laplace(lambda x: x[:0], np.zeros(60), dp.from_functions(apply, apply, 60, 60))
     assert posterior.variance(20) == pytest.approx(1e-9 + np.sum(columns**2, axis=1), rel=1e-6)
     assert np.max(posterior.variance_error(20)) < 1e-7
+
+
+def test_estimated_variances_beside_the_definition(rng, monkeypatch):
+    """XDiag: each random vector is tested with a projection onto the products with the others."""
+    monkeypatch.setattr(prior_covariance, "MOST_COLUMNS", 1)
+    root = rng.standard_normal((12, 12))
+    matrix = root @ root.T
+    functions = dp.from_functions(lambda x: matrix @ x, lambda x: matrix @ x, 12, 12)
+    signs = np.random.default_rng(3).choice([-1.0, 1.0], (5, 12))
+    estimates = []
+    for i in range(5):
+        basis = np.linalg.qr(matrix @ np.delete(signs, i, axis=0).T)[0]
+        remainder = matrix - basis @ (basis.T @ matrix)
+        estimates.append(np.diag(basis @ basis.T @ matrix) + signs[i] * (remainder @ signs[i]))
+    posterior = dp.laplace(lambda x: x[:0], np.zeros(12), functions)
+    with pytest.warns(dp.errors.PosteriorWarning, match="standard error"):
+        variance = posterior.variance(5)
+    assert variance == pytest.approx(np.maximum(np.mean(estimates, axis=0), 0.0), rel=1e-9)
+    wanted = 1.5 * np.std(estimates, axis=0, ddof=1) / 5**0.5
+    with pytest.warns(dp.errors.PosteriorWarning, match="standard error"):
+        assert posterior.variance_error(5) == pytest.approx(wanted, rel=1e-9)
 
 
 def of_root(root):
