@@ -293,9 +293,8 @@ class Posterior(Frozen):
             "distance of x from the mode": f"{self.shift:.1e} standard deviations",
         }
         if self.mean_square is not None:
-            entries["mean square of the residuals"] = (
-                f"{self.mean_square:.3g} ({self.expected_mean_square:.3g} is expected)"
-            )
+            expected = f"({self.expected_mean_square:.3g} is expected)"
+            entries["mean square of the residuals"] = f"{self.mean_square:.3g} {expected}"
         entries["prior variances"] = "exact"
         if any(block.diagonal is None for block in self._prior.blocks):
             entries["prior variances"] = "estimated, see variance_error()"
