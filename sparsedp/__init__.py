@@ -129,6 +129,7 @@ _SUGGESTIONS = {  # names that users of other libraries may try, and what to wri
     "part": "dp.component(grid, axis)",
     "periodic": "dp.Grid((64, 64), periodic=True)",
     "pmap": "dp.ensemble(loss, scenes)",
+    "posterior": "dp.laplace(residuals, x, prior)",
     "poisson": "dp.inverse(-dp.laplacian(grid, dp.dirichlet))",
     "pressure": "dp.projection(grid)",
     "rk4": "dp.stepper('rk4', rate, dt)",

@@ -141,7 +141,7 @@ class Minimum(Frozen):
         divided by known standard deviations; it is the posterior covariance for a flat prior. Bounds are ignored. All
         entries are infinite if the rank of J is less than n. Access raises ValueError, with the reason in its message,
         if the covariance is not available: for methods other than least squares, with batches, if J is not formed, if
-        n > 4000, or if m <= n without absolute_sigma.
+        n > 4000, or if m <= n without absolute_sigma. For many unknowns, or with a prior, see `laplace`.
 
     Notes
     -----

@@ -9,6 +9,7 @@ import scipy.linalg
 from scipy.stats import binom
 
 import sparsedp as dp
+from benchmarks.posterior import Problem, row
 from sparsedp.optimize import prior_covariance
 
 GRID = dp.Grid((6, 5), size=1.0)
@@ -354,3 +355,39 @@ def test_coverage(rng, data_sets):
 def sampled(prior, rng, count):
     root = scipy.linalg.cholesky(dense(prior), lower=True)
     return [root @ rng.standard_normal(len(root)) for _ in range(count)]
+
+
+@pytest.mark.slow
+def test_4096_unknowns_beside_dense_matrices():
+    figures = row(64)
+    assert figures["eigenpairs"] == 163 and figures["products"] <= figures["double pass"]
+    assert figures["mean"] < 1e-4 and figures["gain"] < 1e-4
+    assert figures["variances"] < figures["stated"] and figures["deviations"] < figures["stated"]
+
+
+@pytest.mark.slow
+def test_coverage_of_4096_unknowns(rng):
+    """200 data sets drawn from the prior: intervals of sums, of a temperature and of single cells hold the truth."""
+    problem = Problem(64)
+    posterior = problem.posterior(np.zeros(problem.grid.shape))
+    cells = [(8, 8), (32, 32), (50, 20), (1, 40)]
+    weights = rng.standard_normal(problem.grid.shape)
+    quantities = [
+        lambda x: anp.sum(x),
+        lambda x: anp.sum(weights * x),
+        lambda x: anp.sum(x[40:, :10]),
+        lambda x: problem.solve(x)[30, 40],
+        *(lambda x, cell=cell: x[cell] for cell in cells),
+    ]
+    deviations = [posterior.std_of(quantity) for quantity in quantities]
+    assert deviations[4:] == pytest.approx([posterior.variance()[cell] ** 0.5 for cell in cells])
+    held = np.zeros((len(quantities), 2), int)
+    for _ in range(200):
+        truth = problem.root(rng.standard_normal(problem.grid.shape))
+        data = problem.readings(truth) / problem.noise + rng.standard_normal(len(problem.data))
+        mean = posterior.covariance(problem.solve.T(problem.sensors.T(data))) / problem.noise
+        off = [abs(q(mean - truth)) / deviation for q, deviation in zip(quantities, deviations, strict=True)]
+        held += np.less.outer(off, [1.6449, 1.9600])
+    for share, counts in zip((0.9, 0.95), held.T):
+        least, most = binom.ppf([1e-4, 1 - 1e-4], 200, share)
+        assert np.all(counts >= least) and np.all(counts <= most)
