@@ -8,7 +8,8 @@ A beam on two supports carries a load in the middle. Half of the area may be fil
 stiffest? The MBB beam is the standard test of topology optimization, and its compliance on 60 x 20 elements is
 published. We use the published algorithm and the published filters. Only the derivatives come from this library.
 
-Run it: ``python examples/mbb_beam.py [elements] [--out FOLDER]``; it needs scikit-fem (in the extra `test`)
+Run it: ``python examples/mbb_beam.py [elements] [--out FOLDER]``; it needs scikit-fem and NLopt
+(in the extras `test` and `design`)
 
 References
 ----------
@@ -243,10 +244,40 @@ for name, iterate in {"sensitivity filter": by_sensitivity_filter, "density filt
     layouts[f"optimality criteria, {name}"] = density
 
 # %%
+# A general search
+# ----------------
+# The published loop is made for this loss and this constraint. `minimize` takes other losses and other constraints as
+# well. The volume becomes a function that is at most 0 where a layout is allowed. The method of moving asymptotes is
+# the usual one for designs. The augmented Lagrangian also takes many constraints at once, and equalities. A small
+# initial penalty suits designs: with a large one the search follows the constraint in short steps.
+
+METHODS = {"moving asymptotes": {"method": "mma"}, "augmented Lagrangian": {"method": "augmented_lagrangian"}}
+METHODS["augmented Lagrangian"]["penalty"] = 0.01
+
+for name, settings in METHODS.items():
+    began = perf_counter()
+    best = dp.minimize(
+        compliance_of_unknowns,
+        even,
+        constraints=lambda z: volume(z) - SHARE,
+        bounds=(0.0, 1.0),
+        maxiter=200,
+        tolerance=1e-4,
+        **settings,
+    )
+    seconds = perf_counter() - began
+    density = average(best.x)
+    report(f"{name}, density filter", density, best.value, len(best.history) - 1, seconds, "")
+    print(f"{'':40}multiplier {best.multipliers:.1f}, volume {np.mean(density):.6f}, {best.evaluations} gradients")
+    layouts[f"{name}, density filter"] = density
+
+# %%
 # The picture
 # -----------
-# Both layouts are trusses. The density filter leaves grey seams at the edges of bars, which cost stiffness: a full and
-# an empty element cannot be neighbours.
+# All layouts are trusses. The density filter leaves grey seams at the edges of bars, which cost stiffness: a full and
+# an empty element cannot be neighbours. The published loop stops when no unknown changes by more than 0.01; the other
+# methods get a little lower. The multiplier says what more material would be worth: the compliance falls by 0.01 times
+# the multiplier if one more percent of the area may be filled.
 #
 # Exercises
 # ---------

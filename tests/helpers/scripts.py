@@ -48,23 +48,25 @@ SMALL = {
     "ensemble.py": "5",
     "mesh_design.py": "3",
     "mbb_beam.py": "20",
+    "volume_to_point.py": "32",
     "pylops_exchange.py": "32",
     "pendulums.py": "10",
 }  # cells, the end time, or gradients; the others run with 16
 NEEDS = {
-    "torch_training.py": "torch",
-    "jax_optimiser.py": "optax",
-    "mesh_design.py": "skfem",
-    "mbb_beam.py": "skfem",
-    "pylops_exchange.py": "pylops",
+    "torch_training.py": ["torch"],
+    "jax_optimiser.py": ["optax"],
+    "mesh_design.py": ["skfem"],
+    "mbb_beam.py": ["skfem", "nlopt"],
+    "volume_to_point.py": ["nlopt"],
+    "pylops_exchange.py": ["pylops"],
 }  # libraries that need not be there
 DEFAULT = {"heat_rod.py", "new_operator.py", "plan.py", "pressure_projection.py", "two_families.py"}
 
 
 def marks(name):
     """Of whatever looks at an example: one worker runs it, once, and most of them only with the marker `whole`."""
-    needs = NEEDS.get(name, "sparsedp")
-    missing = pytest.mark.skipif(find_spec(needs) is None, reason=f"{needs} is not installed")
+    absent = [library for library in NEEDS.get(name, []) if find_spec(library) is None]
+    missing = pytest.mark.skipif(bool(absent), reason=f"{', '.join(absent)} is not installed")
     return [pytest.mark.xdist_group(name), missing, *([] if name in DEFAULT else [pytest.mark.whole])]
 
 
