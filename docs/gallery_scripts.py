@@ -104,7 +104,11 @@ def stage():
 def runnable():
     """A pattern of the scripts that need no library which is not here."""
     missing = [name for name in ("jax", "optax", "pylops", "skfem", "torch") if find_spec(name) is None]
-    needs = re.compile(rf"^import ({'|'.join(missing)})$", re.MULTILINE)
+    imports = rf"^import ({'|'.join(missing)})$"
+    if find_spec("nlopt") is None:
+        missing.append("nlopt")
+        imports += '|"mma"'  # the method of `minimize` imports it
+    needs = re.compile(imports, re.MULTILINE)
     scripts = [path for path in (ROOT / "examples").glob("*.py") if missing and needs.search(path.read_text())]
     return r"/(?!({})\.py$)[^/]*$".format("|".join(path.stem for path in scripts)) if scripts else ".*"
 

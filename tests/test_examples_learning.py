@@ -108,6 +108,24 @@ def test_mbb_beam():
     assert [row[0] for row in table] == ["sensitivity filter", "density filter"]
     for _, compliance, published, iterations in table:
         assert abs(compliance / published - 1) <= 1e-3 and iterations < 200
+    searches = rows(printed, r"^(moving asymptotes|augmented Lagrangian), density filter +(\d+\.\d+) +(\d+) ")
+    volumes = re.findall(r", volume (\S+),", printed)
+    assert len(searches) == len(volumes) == 2
+    for (_, compliance, _), volume in zip(searches, volumes):
+        assert 233.3 < compliance < 233.71 and abs(float(volume) - 0.5) < 1e-3
+
+
+@example("volume_to_point.py")
+def test_volume_to_point():
+    """Right derivatives, the volume kept in every stage, and each design best in what it was made for."""
+    printed = run("volume_to_point.py")
+    assert printed.count(": agrees") == 3
+    table = rows(printed, r"^(mean|peak), \S+ \S+ +(\d+) +(0\.\d+) +(\S+) +(\S+) +(\S+) +\S+$")
+    assert len(table) == 15 and all(abs(row[2] - 0.4) < 1e-3 for row in table)
+    by_hand, for_mean, for_peak = table[4::5]
+    assert for_mean[3] < 1.01 * by_hand[3] and for_mean[3] < for_peak[3]
+    assert for_peak[4] < 0.85 * for_mean[4]
+    assert for_mean[5] < 0.6 * table[5][5]  # projection in stages removes grey
 
 
 @example("pylops_exchange.py")

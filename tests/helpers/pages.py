@@ -24,7 +24,7 @@ else:
 
 SHELL = ("sh", "bash", "shell", "console")
 NUMBER = r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w])"
-LIBRARIES = ("PIL", "jax", "matplotlib", "pyevtk", "skfem", "torch", "xarray")  # of extras
+LIBRARIES = ("PIL", "jax", "matplotlib", "nlopt", "pyevtk", "skfem", "torch", "xarray")  # of extras
 MISSING = [name for name in LIBRARIES if importlib.util.find_spec(name) is None]
 
 
@@ -84,8 +84,9 @@ def same(wanted, got, **tolerance):
 
 
 def needs_missing_library(code):
-    """Return whether a block imports a library of an extra that is not installed."""
-    return any(re.search(rf"^(import|from) {name}\b", code, re.MULTILINE) for name in MISSING)
+    """Return whether a block imports a library of an extra that is not installed, or lets `minimize` import it."""
+    imported = any(re.search(rf"^(import|from) {name}\b", code, re.MULTILINE) for name in MISSING)
+    return imported or ("nlopt" in MISSING and '"mma"' in code)
 
 
 def run_blocks(path):
