@@ -27,6 +27,18 @@ class Bug(NamedTuple):
 
 
 BUGS = {
+    "wall values of the end of a step at its beginning": Bug(
+        "flow/scalars.py",
+        "self._parts(before + after, dtype_of(u))",
+        "self._parts(after + after, dtype_of(u))",
+        "tests/flow/test_flow_scalars.py::test_wall_values_that_are_a_function",
+    ),
+    "wall values that turn a field into double precision": Bug(
+        "flow/scalars.py",
+        "None if part is None else cast(part, dtype) for",
+        "None if part is None else part for",
+        "tests/flow/test_flow_scalars.py::test_wall_values_that_are_a_function",
+    ),
     "eigenpairs: missing copies of a multiple eigenvalue": Bug(
         "solvers/eigensolver.py",
         "    for _ in range(MOST_RESTARTS):\n        new_values, new_vectors",

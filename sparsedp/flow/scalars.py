@@ -19,7 +19,7 @@ import numpy as np
 from sparsedp._utils.pytree import mapped
 from sparsedp._utils.validation import check_finite, check_on
 from sparsedp.autodiff.program_trace import check_values, sample
-from sparsedp.autodiff.tape import cast
+from sparsedp.autodiff.tape import cast, dtype_of
 from sparsedp.autodiff.tape_constants import frozen
 from sparsedp.errors import ShapeError
 from sparsedp.flow.diffusion import Diffusion
@@ -73,16 +73,15 @@ class Scalar:
         self.source = source
         self._divergence = divergence
         self._average = average(grid, boundary)
-        self._lift = lift(grid, boundary)
+        self._build_lift = partial(lift, grid, boundary)
         self._fluid: Any = None
         if solid is not None:
             self._fluid = mask(grid.cells, ~check_solid(grid, solid))
         self._values: Any = values
         self.changes = callable(values)
-        self._constant_part: Any = None
-        self._constant_on_faces: Any = 0.0
+        self._constant_parts: tuple = (None, None)
         if values is not None and not self.changes:
-            self._constant_part, self._constant_on_faces = self._contributions(values)
+            self._constant_parts = self._contributions(values)
         build_laplacian = partial(laplacian, grid, boundary, solid)
         self.diffusion = Diffusion(f"diffusivity of {name!r}", float(diffusivity), build_laplacian, settings)
 
@@ -91,6 +90,10 @@ class Scalar:
         values = self._values(params)
         check_on(f"flow_step, as values of {self.name!r},", values, self._lift.domain, ADVICE)
         return cast(values, dtype)
+
+    @cached_property
+    def _lift(self) -> Operator:
+        return self._build_lift()
 
     def _contributions(self, values: Any) -> tuple[Any, Any]:
         """Return the contributions of wall values to the Laplacian, and to the values on faces."""
@@ -107,11 +110,12 @@ class Scalar:
         normal = self._divergence.T(np.ones(self._divergence.codomain.shape))
         return np.where(at_wall, 2 * normal, 1.0)
 
-    def _parts(self, values: Any) -> tuple[Any, Any]:
-        """Return `_contributions` of the given values, or of the constant ones if values is None."""
-        if values is None:
-            return self._constant_part, self._constant_on_faces
-        return self._contributions(values)
+    def _parts(self, values: Any, dtype: np.dtype) -> tuple[Any, ...]:
+        """Return `_contributions` of the given values, of the constant ones if values is None; None stands for 0."""
+        parts = self._constant_parts
+        if values is not None:
+            parts = self._contributions(values)
+        return tuple(None if part is None else cast(part, dtype) for part in parts)
 
     def rate(self, v: Any, scalars: dict[str, Any], params: Any, values: Any = None) -> Any:
         """Return the explicit part r of the rate of change; see the module docstring.
@@ -119,8 +123,11 @@ class Scalar:
         `values` are the wall values at the beginning of the step; None if they are constant.
         """
         u = scalars[self.name]
-        wall_part, on_faces = self._parts(values)
-        rate = -self._divergence(v * (self._average(u) + on_faces))
+        wall_part, on_walls = self._parts(values, dtype_of(u))
+        on_faces = self._average(u)
+        if on_walls is not None:
+            on_faces = on_faces + on_walls
+        rate = -self._divergence(v * on_faces)
         if self.source is not None:
             source = self.source(mapped(frozen, scalars), params)
             if np.shape(sample(source)) not in ((), u.shape):
@@ -139,9 +146,9 @@ class Scalar:
         if self.diffusion.solve is None:
             return explicit
         if before is not None:
-            wall_part, _ = self._contributions(before + after)
-        elif self._constant_part is None:
-            wall_part = None
+            wall_part, _ = self._parts(before + after, dtype_of(u))
         else:
-            wall_part = 2.0 * self._constant_part
+            wall_part, _ = self._parts(None, dtype_of(u))
+            if wall_part is not None:
+                wall_part = 2.0 * wall_part
         return self.diffusion.step_implicit(explicit, u, wall_part)

@@ -181,6 +181,11 @@ def plate(n, implicit, values):
 def test_wall_values_that_are_a_function(implicit):
     """A constant function is a constant array, bit for bit; values that vary in time keep order 2."""
     ends = []
+    for values in (np.ones(4), lambda params: np.ones(4)):
+        step, state = plate(20, implicit, values)
+        single = {"heat": np.zeros((6, 2), np.float32)}
+        state = step(step.start(state["v"].astype(np.float32), 0.0, single), 0.0)
+        assert state["s"]["heat"].dtype == np.float32
     for values in (np.array([1.0, 2.0, 3.0, 4.0]), lambda params: np.array([1.0, 2.0, 3.0, 4.0])):
         step, state = plate(20, implicit, values)
         for _ in range(3):

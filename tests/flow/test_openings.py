@@ -308,6 +308,74 @@ def test_the_force_on_all_cells_is_the_momentum_that_enters_through_the_walls(rn
     np.testing.assert_allclose(on(v, p, 0.3)[:2], wanted, rtol=1e-11, atol=1e-11)
 
 
+def operators_in_3d(grid, boundary, v, w):
+    """Return the results of viscosity, convection and projection."""
+    return [
+        dp.face_laplacian(grid, boundary)(v),
+        dp.convection(grid, boundary)(v, w),
+        dp.projection(grid, boundary=boundary)(v),
+        dp.face_lift(grid, boundary).T(v),
+    ]
+
+
+def test_openings_in_3d_that_do_not_depend_on_z_are_those_in_2d(rng):
+    deep = dp.Grid((*BOX.shape, 2), spacing=[*BOX.widths, 1.0], periodic=(False, False, True))
+    strips = {name: tuple(as_strip(wall) for wall in pair) for name, pair in SIDES.items()}
+    v, w = ([*BOX.split(u), np.zeros(BOX.shape)] for u in rng.standard_normal((2, BOX.faces.size)))
+    deep_v, deep_w = (deep.join(*(np.repeat(part[..., None], 2, axis=2) for part in parts)) for parts in (v, w))
+    flat = operators_in_3d(BOX, SIDES, BOX.join(*v[:2]), BOX.join(*w[:2]))
+    for ours, wanted in zip(operators_in_3d(deep, strips, deep_v, deep_w)[:3], flat[:3], strict=True):
+        x, y, z = deep.split(ours)
+        np.testing.assert_allclose(x[..., 1], BOX.split(wanted)[0], rtol=1e-11, atol=1e-11)
+        np.testing.assert_allclose(y[..., 1], BOX.split(wanted)[1], rtol=1e-11, atol=1e-11)
+        assert np.max(np.abs(z)) <= 1e-11
+
+
+def as_strip(wall):
+    """Return a patch of a wall in 2-D as one of a wall in 3-D that does not depend on z."""
+    if not isinstance(wall, type(INLET)):
+        return wall
+    return dp.patch(np.repeat(wall.where[:, None], 2, axis=1), wall.condition, wall.elsewhere)
+
+
+@pytest.mark.parametrize("order", [(1, 2, 0), (2, 1, 0), (0, 2, 1)])
+def test_openings_in_3d_do_not_depend_on_the_order_of_the_axes(order, rng):
+    """The same room with its axes in another order; openings with corners, in two walls."""
+    shape = (3, 4, 3)
+    window = np.zeros((4, 3), bool)
+    window[1:3, 1:] = True
+    hatch = np.zeros((3, 4), bool)
+    hatch[0, :2] = True
+    walls = [(dp.patch(window, dp.inflow), dp.no_slip), (dp.free_slip, dp.no_slip)]
+    walls.append((dp.no_slip, dp.patch(hatch, dp.outflow, elsewhere=dp.free_slip)))
+    widths = [0.1 + rng.random(n) for n in shape]
+    grid = dp.Grid(shape, spacing=widths)
+    v, w = rng.standard_normal((2, grid.faces.size))
+
+    turned_grid = dp.Grid([shape[a] for a in order], spacing=[widths[a] for a in order])
+    turned_walls = {}
+    for name, a in zip("xyz", order, strict=True):
+        others = [b for b in range(3) if b != a]
+        axes = [others.index(b) for b in order if b != a]
+        turned_walls[name] = tuple(turned_patch(wall, axes) for wall in walls[a])
+
+    def turned(u):
+        return turned_grid.join(*(np.transpose(grid.split(u)[a], order) for a in order))
+
+    ours = operators_in_3d(turned_grid, turned_walls, turned(v), turned(w))
+    wanted = operators_in_3d(grid, dict(zip("xyz", walls, strict=True)), v, w)
+    for one, other in zip(ours[:3], wanted[:3], strict=True):
+        np.testing.assert_allclose(one, turned(other), rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(np.sort(ours[3]), np.sort(wanted[3]), rtol=1e-11, atol=1e-11)
+
+
+def turned_patch(wall, axes):
+    """Return a condition of a wall whose axes are in another order."""
+    if not isinstance(wall, type(INLET)):
+        return wall
+    return dp.patch(np.transpose(wall.where, axes), wall.condition, wall.elsewhere)
+
+
 def test_openings_travel_and_have_names():
     P = dp.projection(BOX, boundary=SIDES)
     v = np.linspace(0.0, 1.0, BOX.faces.size)
