@@ -21,6 +21,17 @@ def test_conductivity_design():
     assert plate[3] < 0.5
 
 
+@example("limited_heating.py")
+def test_limited_heating():
+    """The limit is met in each cell, its price is the change of the loss, and p-norms are too strict."""
+    printed = run("limited_heating.py")
+    free, limited, low, high = rows(printed, r"^(\S.*\S) +(\d\.\d+) +(\d\.\d+) +(\d+) +\S+$")
+    assert free[2] > 1.3 and abs(limited[2] - 1.0) <= 1e-5 and max(low[2], high[2]) < 1.0
+    assert free[1] < limited[1] < high[1] < low[1] and limited[3] <= 400
+    change, price = map(float, re.findall(r"(-\d\.\d+)(?:,|$)", printed, re.MULTILINE))
+    assert abs(change - price) <= 1e-3 * abs(price)
+
+
 @example("warm_start_learned.py")
 def test_warm_start_learned():
     """Every learned guess is far better after k iterations, and none does what multigrid does from zero."""

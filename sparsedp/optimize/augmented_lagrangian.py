@@ -209,12 +209,9 @@ class AugmentedLagrangian(ConstrainedMethod):
         NoStepFound
             If several updates in succession allow no step.
         """
-        size = norm(problem.start.gradient) or 1.0
         while True:
             function: Any = self.function(state, problem)
-            current = state.inner.current
-            residual = norm(problem.projected_step(problem.at(current.point), current.gradient))
-            if residual <= state.accuracy * size or state.steps >= self.inner:
+            if self._inaccuracy(state, problem) <= state.accuracy or state.steps >= self.inner:
                 state = self._updated(state, problem)
                 if state.fruitless > FRUITLESS:
                     raise NoStepFound("updates of the multipliers allow no further step")
@@ -231,6 +228,12 @@ class AugmentedLagrangian(ConstrainedMethod):
                 continue
             return state._replace(inner=inner, steps=state.steps + 1, fruitless=0)
 
+    def _inaccuracy(self, state, problem):
+        """Return the norm of the projected gradient of the augmented Lagrangian, relative to that of the loss."""
+        current = state.inner.current
+        step = problem.projected_step(problem.at(current.point), current.gradient)
+        return norm(step) / (norm(problem.start.gradient) or 1.0)
+
     def _restarted(self, state, problem):
         """Return the state at the begin of the inner minimization, with a larger penalty.
 
@@ -244,17 +247,25 @@ class AugmentedLagrangian(ConstrainedMethod):
         return state._replace(inner=self._lbfgs.begin(first), penalty=penalty, steps=0)
 
     def _updated(self, state, problem):
-        """Return the state with updated multipliers, and with a larger penalty if the violation has not fallen."""
+        """Return the state with updated multipliers, and with a larger penalty if the violation has not fallen.
+
+        The penalty stays if the violation is below the inaccuracy of the inner minimization: a larger one would make
+        this minimization still slower.
+        """
         point = problem.at(state.inner.current.point)
         estimates = np.clip(self.function(state, problem).estimates(point), -LARGEST_MULTIPLIER, LARGEST_MULTIPLIER)
         # The change of the multipliers over the penalty: c for equalities, max(c, -y / p) for inequalities.
         violation = float(np.max(np.abs(estimates - state.multipliers), initial=0.0)) / state.penalty
         penalty = state.penalty
         inner = state.inner
-        if violation > SUFFICIENT_DECREASE * state.violation and penalty < LARGEST_PENALTY:
+        inaccuracy = self._inaccuracy(state, problem)
+        has_not_fallen = violation > SUFFICIENT_DECREASE * state.violation
+        if has_not_fallen and violation > inaccuracy and penalty < LARGEST_PENALTY:
             penalty *= self.growth
             inner = inner.without_memory()
-        accuracy = max(ACCURACY_FACTOR * state.accuracy, LEAST_ACCURACY)
+        accuracy = state.accuracy
+        if inaccuracy <= accuracy:
+            accuracy = max(ACCURACY_FACTOR * accuracy, LEAST_ACCURACY)
         fruitless = state.fruitless + 1
         state = AugmentedState(inner, estimates, penalty, accuracy, violation, 0, fruitless, point.z)
         current = self.function(state, problem).of_point(point)

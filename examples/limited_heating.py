@@ -1,0 +1,138 @@
+r"""
+Heating a plate below a temperature limit
+=========================================
+
+One constraint for each cell, their multipliers, and one constraint for all cells.
+
+A plate is heated so that its temperature comes close to a target. No cell may be hotter than a limit, and no cell can
+be cooled. We minimize under these constraints by the method of multipliers, which needs one adjoint solve for the
+constraints of all cells, and test the result by the optimality conditions.
+
+Run it: ``python examples/limited_heating.py [cells] [--out FOLDER]``
+"""
+
+import argparse
+from pathlib import Path
+
+import autograd.numpy as np
+
+import sparsedp as dp
+
+parser = argparse.ArgumentParser(description="Heating a plate below a temperature limit.")
+parser.add_argument("cells", nargs="?", type=int, default=48, help="cells along each axis")
+parser.add_argument("--out", type=Path, metavar="FOLDER", help="draw a picture into this folder")
+options = parser.parse_args()
+
+# %%
+# The problem
+# -----------
+# With the heat source :math:`q`, the temperature :math:`T`, the target :math:`T_d` and the limit :math:`T_{max}`,
+#
+# .. math:: \min_q \; \tfrac12 \int (T - T_d)^2 + \tfrac{\alpha}{2} \int q^2 \quad \text{with} \quad
+#           -\Delta T = q, \quad T \le T_{max}, \quad q \ge 0 .
+#
+# The target has a plateau that is higher than the limit. The walls are kept at :math:`T = 0`.
+
+n = options.cells
+grid = dp.Grid((n, n), size=1.0)
+temperature_of = dp.inverse(-dp.laplacian(grid, dp.dirichlet))
+x, y = grid.centres()
+target = np.where((np.abs(x - 0.35) < 0.2) & (np.abs(y - 0.5) < 0.3), 1.3, 0.5)
+limit = 1.0
+alpha = 1e-5
+area = 1 / n**2
+
+
+def loss(q):
+    return 0.5 * area * np.sum((temperature_of(q) - target) ** 2) + 0.5 * area * alpha * np.sum(q**2)
+
+
+start = np.ones(grid.shape)
+
+
+def solve(label, method="augmented_lagrangian", constraints=None, tolerance=1e-6, maxiter=2000):
+    best = dp.minimize(
+        loss, start, method, constraints=constraints, bounds=(0.0, None), tolerance=tolerance, maxiter=maxiter
+    )
+    hottest = np.max(temperature_of(best.x))
+    print(f"{label:34} {best.value:9.6f} {hottest:9.5f} {best.evaluations:9} {best.history[-1].seconds:8.2f}")
+    return best
+
+
+print("                                        loss   hottest  gradients  seconds")
+free = solve("no limit")
+
+# %%
+# One constraint for each cell
+# ----------------------------
+# The function of the constraints returns an array: the temperature of each cell minus the limit. In each iteration the
+# method of multipliers differentiates one combination of all entries.
+
+
+def too_hot(q):
+    return temperature_of(q) - limit
+
+
+limited = solve("a limit for each cell", constraints=too_hot)
+
+# %%
+# The multipliers
+# ---------------
+# The result has one multiplier for each cell: the price of the limit there. It is 0 where the plate is colder than the
+# limit. If the limit is raised by a small amount in all cells, the loss falls by their sum times this amount. We
+# compare with a second run.
+
+prices = limited.multipliers
+step = 0.01
+raised = dp.minimize(
+    loss,
+    limited.x,
+    "augmented_lagrangian",
+    constraints=lambda q: temperature_of(q) - limit - step,
+    bounds=(0.0, None),
+    tolerance=1e-6,
+    maxiter=2000,
+)
+at_limit = temperature_of(limited.x) > limit - 1e-3
+print(f"\ncells at the limit: {np.sum(at_limit)}; multipliers elsewhere: {np.max(np.abs(prices[~at_limit])):.0e}")
+mean_price = 0.5 * (np.sum(prices) + np.sum(raised.multipliers))
+print(f"change of the loss per degree: {(raised.value - limited.value) / step:.5f}")
+print(f"minus the sum of multipliers:  {-mean_price:.5f}, the mean of both limits\n")
+
+# %%
+# One constraint for all cells
+# ----------------------------
+# Methods for few constraints, such as the method of moving asymptotes, take the largest temperature as one number. The
+# p-norm is a smooth bound of it: :math:`\|T\|_p = (\sum_i T_i^p)^{1/p} \ge \max_i T_i`. It is too strict by a factor
+# that depends on the number of hot cells, so that the plate stays colder than allowed.
+
+for p in (8, 32):
+
+    def norm_too_large(q, p=p):
+        hot = np.maximum(temperature_of(q), 0.0)
+        return np.sum((hot / limit) ** p) ** (1 / p) - 1.0
+
+    solve(f"p-norm, p = {p}", constraints=norm_too_large)
+
+# %%
+# The picture
+# -----------
+# Without the limit the plateau is too hot. With it, the plate has the limit in a part of the plateau, and heat is saved
+# elsewhere. The multipliers are positive inside of this part, and largest at its corners.
+#
+# Exercises
+# ---------
+# 1. Replace the bound on :math:`q` by a limit of the total heat. What is its price?
+# 2. Raise the limit step by step. At which limit are all multipliers 0?
+# 3. Solve the problem with p-norms by ``method="mma"``.
+
+if options.out:
+    from matplotlib import pyplot, style
+
+    style.use("tableau-colorblind10")
+    picture, axes = pyplot.subplots(1, 3, figsize=(11, 3.4), layout="constrained")
+    dp.plot(grid, temperature_of(free.x), ax=axes[0], title="no limit", label="temperature")
+    dp.plot(grid, temperature_of(limited.x), ax=axes[1], title="T <= 1 in each cell", label="temperature")
+    dp.plot(grid, prices / area, ax=axes[2], title="multipliers", label="price of the limit per area")
+    options.out.mkdir(parents=True, exist_ok=True)
+    picture.savefig(options.out / "limited_heating.png", dpi=120)
