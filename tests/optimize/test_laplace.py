@@ -9,7 +9,6 @@ import scipy.linalg
 from scipy.stats import binom
 
 import sparsedp as dp
-from benchmarks.posterior import Problem, row
 from sparsedp.optimize import prior_covariance
 
 GRID = dp.Grid((6, 5), size=1.0)
@@ -359,6 +358,8 @@ def sampled(prior, rng, count):
 
 @pytest.mark.slow
 def test_4096_unknowns_beside_dense_matrices():
+    from benchmarks.posterior import row
+
     figures = row(64)
     assert figures["eigenpairs"] == 163 and figures["products"] <= figures["double pass"]
     assert figures["mean"] < 1e-4 and figures["gain"] < 1e-4
@@ -368,6 +369,8 @@ def test_4096_unknowns_beside_dense_matrices():
 @pytest.mark.slow
 def test_coverage_of_4096_unknowns(rng):
     """200 data sets drawn from the prior: intervals of sums, of a temperature and of single cells hold the truth."""
+    from benchmarks.posterior import Problem
+
     problem = Problem(64)
     posterior = problem.posterior(np.zeros(problem.grid.shape))
     cells = [(8, 8), (32, 32), (50, 20), (1, 40)]
