@@ -429,8 +429,8 @@ BUGS = {
     ),
     "a posterior whose variance is reduced by the wrong share": Bug(
         "optimize/posterior.py",
-        "np.sum(vectors**2 / (1 + self.eigenvalues)[:, None], axis=0)",
-        "np.sum(vectors**2 / (2 + self.eigenvalues)[:, None], axis=0)",
+        "np.sum(vectors**2 / (1 + self._pairs.values)[:, None], axis=0)",
+        "np.sum(vectors**2 / (2 + self._pairs.values)[:, None], axis=0)",
         "tests/optimize/test_laplace.py",
     ),
     "samples of a posterior with the square of their reduction": Bug(

@@ -17,10 +17,11 @@ from sparsedp.autodiff.derivative import check_loss, pullback, value_and_grad
 from sparsedp.autodiff.flattening import Packing
 from sparsedp.autodiff.tape import isbox
 from sparsedp.errors import DerivativeError, PosteriorWarning, ShapeError
-from sparsedp.optimize.linearization import Linearization
+from sparsedp.optimize.linearization import MOST_ENTRIES, Linearization
 from sparsedp.optimize.misfit_eigenpairs import eigenpairs_of_jacobian, eigenpairs_of_products
 from sparsedp.optimize.posterior import Posterior
 from sparsedp.optimize.prior_covariance import PriorCovariance
+from sparsedp.optimize.result import Minimum
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -143,6 +144,8 @@ def laplace(
     rank = check_whole("rank of laplace", rank, 1, "; the default is 200")
     tolerance = check_number("tolerance of laplace", tolerance, "between 0 and 1", "; the default is 0.01")
     seed = check_whole("seed of laplace", seed, 0, "; the default is 0")
+    if isinstance(x, Minimum):
+        raise TypeError("laplace takes the unknowns, got the result of minimize; write best.x")
     backend_of(leaves(x)).check("laplace")
     if any(map(isbox, leaves(x))):
         raise DerivativeError(
@@ -159,10 +162,11 @@ def laplace(
     mean = _mean(prior_mean, packing)
 
     hessian = _hessian(misfit, packing, vector, rank)
-    if hessian.jacobian is not None:
-        pairs = eigenpairs_of_jacobian(hessian.jacobian, covariance, tolerance)
-    else:
-        pairs = eigenpairs_of_products(hessian.product, covariance, rank, tolerance, seed)
+    with np.errstate(over="ignore", invalid="ignore"):  # a Hessian that is not finite raises NonFiniteError
+        if hessian.jacobian is not None:
+            pairs = eigenpairs_of_jacobian(hessian.jacobian, covariance, tolerance)
+        else:
+            pairs = eigenpairs_of_products(hessian.product, covariance, rank, tolerance, seed)
     if not pairs.is_complete:
         reason = f"there are more than rank={rank}"
         advice = "increase rank"
@@ -178,7 +182,6 @@ def laplace(
         packing=packing,
         gradient=hessian.gradient,
         offset=vector - mean,
-        tolerance=tolerance,
         squares=hessian.squares,
         seconds=perf_counter() - started,
     )
@@ -231,7 +234,8 @@ def _hessian(misfit, packing, vector, rank):
     count = np.size(value)
     if count == 0 or packing.size == 0:
         return _Hessian(np.zeros(packing.size), None, jacobian=np.zeros((count, packing.size)))
-    is_small = min(count, packing.size) <= rank
+    # A Jacobian with few rows is about as large as the eigenvectors; one with few columns may be much larger.
+    is_small = min(count, packing.size) <= rank and (count <= packing.size or count * packing.size <= MOST_ENTRIES)
     linearization = Linearization(misfit, packing, vector, dense=is_small)
     gradient = linearization.vjp(linearization.flat)
     squares = linearization.flat**2

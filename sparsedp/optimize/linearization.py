@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from sparsedp.autodiff.flattening import Packing
 
-__all__ = ["Linearization", "left_singular"]
+__all__ = ["MOST_ENTRIES", "Linearization", "left_singular"]
 
 MOST_ENTRIES = 3e7  # by default, a Jacobian with more entries (240 MB) is not formed
 LONGEST_SIDE = 4000  # by default, a Jacobian whose shorter side is longer than this is not formed

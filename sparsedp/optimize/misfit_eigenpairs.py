@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import scipy.linalg
 
-from sparsedp._utils.validation import EPS
+from sparsedp._utils.validation import EPS, check_finite
 from sparsedp.errors import DerivativeError
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ BLOCK = 10  # random samples, and vectors in a block of the Krylov space
 ROUNDING = 1e3 * EPS  # eigenvalues below this multiple of the largest are lost in rounding
 SHARE_OF_RESIDUALS = 0.1  # share of the tolerance for the residuals of the eigenpairs
 ASYMMETRY = 1e-2  # relative asymmetry of the Hessian above which its products are wrong
+RESCALE = "; write the residuals and the unknowns in units in which they are closer to 1"
 NEGATIVE = (
     "the Hessian of the loss has the eigenvalue {:.3g} in the metric of the prior, so x is not a minimum of the "
     "posterior; continue minimize from x, or return residuals, whose Gauss-Newton Hessian has no negative eigenvalue"
@@ -366,7 +367,9 @@ class KrylovSpace:
     def _by_gram_matrix(self, rows, dropped):
         """Return a Block for the longest directions, the components, and whether there are shorter directions."""
         images = self._prior.apply(rows)
-        squares, vectors = scipy.linalg.eigh(_symmetric(rows @ images.T))
+        gram = rows @ images.T
+        check_finite("the Hessian of the misfit, in the metric of the prior,", gram, advice=RESCALE)
+        squares, vectors = scipy.linalg.eigh(_symmetric(gram))
         resolved = ROUNDING * np.max(squares, initial=0.0)
         kept = squares > max(dropped**2, resolved)
         lengths = np.sqrt(squares[kept])
@@ -432,7 +435,10 @@ def _checked_asymmetry(matrix, scale=None):
     ------
     DerivativeError
         If it is large relative to the matrix, or to the given scale.
+    NonFiniteError
+        If the matrix is not finite.
     """
+    check_finite("the Hessian of the misfit, in the metric of the prior,", matrix, advice=RESCALE)
     difference = float(np.linalg.norm(matrix - matrix.T))
     if scale is None:
         scale = float(np.max(np.abs(matrix), initial=0.0))

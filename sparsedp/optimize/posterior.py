@@ -84,6 +84,7 @@ class Posterior(Frozen):
     expected_mean_square: float | None
     products: int
     seconds: float
+    _mean: NDArray[np.float64]
     _pairs: MisfitEigenpairs
     _prior: PriorCovariance
     _packing: Packing
@@ -102,7 +103,6 @@ class Posterior(Frozen):
         packing: Packing,
         gradient: NDArray,
         offset: NDArray,
-        tolerance: float,
         squares: NDArray | None,
         seconds: float,
     ) -> None:
@@ -112,7 +112,7 @@ class Posterior(Frozen):
         step, shift = _newton_step(offset + preconditioned, pairs, prior)
         super().__init__(
             x=x,
-            eigenvalues=values,
+            eigenvalues=values.copy(),
             neglected=pairs.neglected,
             error=pairs.neglected + pairs.residual,
             information_gain=0.5 * float(np.sum(divergence) + max(gradient @ preconditioned, 0.0)),
@@ -122,7 +122,7 @@ class Posterior(Frozen):
             **_mean_squares(squares, values),
             products=pairs.products,
             seconds=seconds,
-            _tolerance=tolerance,
+            _mean=packing.pack(x),
             _pairs=pairs,
             _prior=prior,
             _packing=packing,
@@ -185,7 +185,7 @@ class Posterior(Frozen):
 
     def _computed_variances(self, probes):
         vectors = self._pairs.vectors
-        informed = np.sum(vectors**2 / (1 + self.eigenvalues)[:, None], axis=0)
+        informed = np.sum(vectors**2 / (1 + self._pairs.values)[:, None], axis=0)
         # The variance that the data do not reduce, C - sum of v v^T, is 0 if there is an eigenpair for each unknown.
         others = np.zeros(self._prior.size)
         errors = np.zeros(self._prior.size)
@@ -215,7 +215,7 @@ class Posterior(Frozen):
             In the shape of the quantity. An array takes one VJP and one product with C for each entry.
         """
         check_function("std_of", quantity, "lambda x: np.mean(x)")
-        value, pull = pullback(quantity, self._packing.unpack(self._packing.pack(self.x)))
+        value, pull = pullback(quantity, self._packing.unpack(self._mean))
         if np.iscomplexobj(value):
             raise DerivativeError("std_of takes a real quantity, got a complex one; take its real part")
         check_finite("the quantity of std_of", value)
@@ -231,7 +231,7 @@ class Posterior(Frozen):
     def _variance_along(self, gradient):
         """Return g^T (H + C^-1)^-1 g."""
         components = self._pairs.vectors @ gradient
-        informed = np.sum(components**2 / (1 + self.eigenvalues))
+        informed = np.sum(components**2 / (1 + self._pairs.values))
         if len(components) == self._prior.size:
             return informed
         others = gradient @ self._prior.apply(gradient[None])[0] - np.sum(components**2)
@@ -262,11 +262,10 @@ class Posterior(Frozen):
         components = rows @ self._pairs.duals.T
         vectors = self._pairs.vectors
         if len(vectors) == self._prior.size:
-            deviations = (components / np.sqrt(1 + self.eigenvalues)) @ vectors
+            deviations = (components / np.sqrt(1 + self._pairs.values)) @ vectors
         else:
-            deviations = rows - (components * _reduction(self.eigenvalues)) @ vectors
-        mean = self._packing.pack(self.x)
-        return [self._packing.unpack(mean + deviation) for deviation in deviations]
+            deviations = rows - (components * _reduction(self._pairs.values)) @ vectors
+        return [self._packing.unpack(self._mean + deviation) for deviation in deviations]
 
     def __str__(self):
         lines = [f"{name + ':':42}{text}" for name, text in self._facts().items()]
@@ -378,5 +377,5 @@ def _estimated_diagonal(block, vectors, probes):
 
 def _tree(packing, vector):
     """Return a flat vector as a tree of float64 arrays like x, with None in place of constants."""
-    arrays = [part.reshape(value.shape) for part, value in zip(packing.split(vector), packing.values)]
+    arrays = [part.reshape(value.shape).copy() for part, value in zip(packing.split(vector), packing.values)]
     return packing.build([array if array.ndim else float(array) for array in arrays], [None] * len(packing.statics))

@@ -41,6 +41,11 @@ SKEW = np.eye(12) + 0.3 * np.triu(np.ones((12, 12)), 1)
 
 WRONG = [
     (run(misfit=3), TypeError, "laplace takes a function, got int; write lambda x: (predicted(x) - data) / noise"),
+    (
+        run(x=dp.minimize(lambda x: x**2, 1.0)),
+        TypeError,
+        "laplace takes the unknowns, got the result of minimize; write best.x",
+    ),
     (run(rank=0), ValueError, "rank of laplace must be a whole number >= 1, got 0; the default is 200"),
     (run(tolerance=1.0), ValueError, "tolerance of laplace must be between 0 and 1, got 1; the default is 0.01"),
     (run(seed=-1), ValueError, "seed of laplace must be a whole number >= 0, got -1; the default is 0"),
@@ -165,6 +170,18 @@ WRONG = [
         DerivativeError,
         "products with the Hessian are not symmetric (relative difference 1.1e-01); dp.check.gradient(loss, x) tests "
         "the derivatives of the function",
+    ),
+    (
+        run(misfit=lambda x: 1e200 * anp.reshape(x, -1)[:2]),
+        NonFiniteError,
+        "the Hessian of the misfit, in the metric of the prior, must be finite, got 4 that are NaN or infinite, the "
+        "first at (0, 0); write the residuals and the unknowns in units in which they are closer to 1",
+    ),
+    (
+        run(1e120 * C, lambda x: 1e100 * anp.reshape(x, -1)[:2], rank=1),
+        NonFiniteError,
+        "the Hessian of the misfit, in the metric of the prior, must be finite, got 100 that are NaN or infinite, the "
+        "first at (0, 0); write the residuals and the unknowns in units in which they are closer to 1",
     ),
     (lambda: run()().sample(-1), ValueError, "count of sample must be a whole number >= 0, got -1"),
     (

@@ -9,7 +9,7 @@ import scipy.linalg
 from scipy.stats import binom
 
 import sparsedp as dp
-from sparsedp.optimize import prior_covariance
+from sparsedp.optimize import laplace, prior_covariance
 
 GRID = dp.Grid((6, 5), size=1.0)
 HEAT = 20.0 * dp.identity(GRID.cells) - dp.laplacian(GRID)
@@ -88,6 +88,15 @@ def test_products_only(rng, as_loss):
     check_against(posterior, covariance, rng, 1e-3, posterior.error)
     assert 0.0 < posterior.error <= 0.011
     assert posterior.information_gain == pytest.approx(divergence(mean, covariance, prior), rel=0.01)
+
+
+def test_long_jacobian(rng, monkeypatch):
+    """With few unknowns and very many residuals, the Jacobian is not stored."""
+    monkeypatch.setattr(laplace, "MOST_ENTRIES", 10)
+    _, residuals, mean, covariance = linear_problem(rng, dense(MATERN), 40)
+    posterior = dp.laplace(residuals, mean, MATERN)
+    assert str(posterior).count("products with the Hessian") == 1
+    check_against(posterior, covariance, rng, 1e-8)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -213,6 +222,19 @@ def test_samples_depend_on_the_seed_only():
     assert not np.array_equal(first, posterior.sample(1, seed=2)[0])
     assert np.array_equal(posterior.sample(1)[0], posterior.sample(1, seed=0)[0])
     assert posterior.sample(0) == []
+
+
+def test_results_may_be_modified():
+    """A caller may write into the arguments and the results."""
+    x = np.zeros(5)
+    posterior = dp.laplace(lambda x: x[:2] + x[2] ** 2, x, 1.0)
+    expected = posterior.variance(), posterior.sample(1)[0], posterior.std_of(lambda x: anp.sum((x + 1.0) ** 2))
+    x[:] = 3.0
+    for array in (posterior.x, posterior.eigenvalues, posterior.variance(), posterior.variance_error(), posterior.step):
+        array[:] = 7.0
+    again = posterior.variance(), posterior.sample(1)[0], posterior.std_of(lambda x: anp.sum((x + 1.0) ** 2))
+    assert all(map(np.array_equal, again, expected))
+    assert np.all(posterior.variance_error() == 0)
 
 
 def test_trees(rng):
