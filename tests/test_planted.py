@@ -27,6 +27,12 @@ class Bug(NamedTuple):
 
 
 BUGS = {
+    "the points of a face field beside a patch": Bug(
+        "advection/settings.py",
+        "        if not isinstance(wall, MixedWall) or axis == number:\n            return wall\n",
+        "        if not isinstance(wall, MixedWall) or axis != number:\n            return wall\n",
+        "tests/advection/test_patches.py",
+    ),
     "wall values of the end of a step at its beginning": Bug(
         "flow/scalars.py",
         "self._parts(before + after, dtype_of(u))",
@@ -138,7 +144,7 @@ BUGS = {
         "tests/flow/test_openings.py::test_rules_for_openings",
     ),
     "the end of an opening that is free": Bug(
-        "flow/momentum.py",
+        "grid/boundary_conditions.py",
         "np.moveaxis(padded[:-1] | padded[1:], 0, position)",
         "np.moveaxis(padded[:-1] & padded[1:], 0, position)",
         "tests/flow/test_openings.py",

@@ -134,6 +134,7 @@ def components(settings: TransportSettings, limited: bool) -> list[Component]:
         wall_values = 0
         repeated = [np.zeros((2, 0), np.int64)]
         numbers = np.arange(points).reshape(shape)
+        sides = settings.sides_of(number)
         for axis, n in enumerate(shape):
             row = axes[axis]
             lines = points // n
@@ -142,8 +143,8 @@ def components(settings: TransportSettings, limited: bool) -> list[Component]:
             row[ON_SIDES] = not settings.at_points
             row[SPEED] = speeds
             row[WALL : WALL + 2] = ROUND
-            if settings.sides[axis]:
-                for side, condition in enumerate(settings.sides[axis]):
+            if sides[axis]:
+                for side, condition in enumerate(sides[axis]):
                     if condition == neumann:
                         row[WALL + side] = SAME_AS_CELL
                     else:

@@ -48,7 +48,7 @@ def ghost_sources(
     ghosts, sources : int arrays
         Indices of samples. The samples are the field with its ghost cells, followed by the inflow values.
     """
-    sides = settings.sides
+    sides = settings.sides_of(number)
     samples = np.arange(points.samples).reshape(points.padded)
     nearest = []  # for each axis the point nearest to each sample
     for n, pair in zip(points.shape, sides, strict=True):

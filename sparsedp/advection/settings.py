@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sparsedp._utils.validation import place
+from sparsedp.grid.boundary_conditions import MixedWall, dirichlet, mixed_wall, neumann, points_touching
 from sparsedp.grid.space import Space
 from sparsedp.operators.masks_and_lift import solid_faces
 
@@ -53,6 +54,24 @@ class TransportSettings:
     clamp: bool
     solid: NDArray[np.bool_] | None
     unstable: str
+
+    def sides_of(self, number: int) -> tuple:
+        """Return the conditions in the form of `sides`, for the points of a component of the field.
+
+        On a wall with several conditions, a point that lies between two faces has inflow if one of them has it.
+        """
+        if self.of == "cells":
+            return self.sides
+        return tuple(
+            pair and tuple(self._at_points(wall, axis, number) for wall in pair) for axis, pair in enumerate(self.sides)
+        )
+
+    def _at_points(self, wall, axis, number):
+        """Return the condition of the points of a component of faces at a wall, or a MixedWall of the points."""
+        if not isinstance(wall, MixedWall) or axis == number:
+            return wall
+        has_inflow = points_touching(self.grid, wall, axis, number, lambda condition: condition == dirichlet)
+        return mixed_wall([(dirichlet, has_inflow), (neumann, ~has_inflow)])
 
     @property
     def space(self) -> Space:

@@ -96,7 +96,8 @@ def transport(
         Values that enter where the velocity points inwards: for dirichlet `inflow`, for neumann the value of the point
         at the wall. Where the velocity points outwards, both conditions let the field leave. For a closed wall, set
         the velocity to 0. semi_lagrangian and maccormack use these values from one spacing beyond the last point on.
-        An inflow through part of a wall is written with `patch`, for the transport of cells.
+        An inflow through part of a wall is written with `patch`. Of a face field, the points at the end of a patch lie
+        between two faces of the wall; they have inflow if one of these faces has.
     velocity : "faces" or "cells"
         "faces": v is a flat face field. "cells": v has the shape (dim, *grid.shape), in 1-D also grid.shape.
     of : "cells" or "faces"
@@ -204,7 +205,7 @@ def transport(
     settings = TransportSettings(
         grid=grid,
         scheme=scheme,
-        sides=_sides(grid, boundary, of),
+        sides=_sides(grid, boundary),
         velocity=velocity,
         of=of,
         interpolation=interpolation,
@@ -217,9 +218,9 @@ def transport(
     return Transport(settings)
 
 
-def _sides(grid: Grid, boundary: Any, of: str) -> tuple:
+def _sides(grid: Grid, boundary: Any) -> tuple:
     """Return the conditions of both sides of each axis; raise unless they are dirichlet or neumann."""
-    sides = resolve(grid, boundary, patches=of == "cells", name="transport of faces")
+    sides = resolve(grid, boundary, patches=True)
     for _, _, wall in walls_of(sides):
         for condition in conditions_of(wall):
             if condition not in (dirichlet, neumann):

@@ -34,6 +34,7 @@ from sparsedp.grid.boundary_conditions import (
     neumann,
     no_slip,
     outflow,
+    points_touching,
     resolve,
     walls_of,
 )
@@ -431,26 +432,6 @@ def _at_points(grid: Grid, wall: Any, axis: int, component: int) -> Any:
         return wall.along
     is_fixed = points_touching(grid, wall, axis, component, lambda condition: condition.along == dirichlet)
     return mixed_wall([(dirichlet, is_fixed), (neumann, ~is_fixed)])
-
-
-def points_touching(
-    grid: Grid, wall: MixedWall, axis: int, component: int, accepts: Callable[[Any], bool]
-) -> NDArray[np.bool_]:
-    """Return the points of a tangential component at a wall that touch a face whose condition the function accepts.
-
-    Returns
-    -------
-    bool array
-        In the shape of the face field's component, without the axis across the wall.
-    """
-    faces = wall.faces_with(accepts)
-    position = component if component < axis else component - 1
-    if grid.periodic[component]:
-        return faces | np.roll(faces, 1, position)
-    width = [(0, 0)] * faces.ndim
-    width[position] = (1, 1)
-    padded = np.moveaxis(np.pad(faces, width), position, 0)
-    return np.moveaxis(padded[:-1] | padded[1:], 0, position)
 
 
 def _at_wall(grid: Grid, sides: tuple, entry: WallSide, factor: Factor) -> tuple[Term, ...]:

@@ -52,6 +52,7 @@ __all__ = [
     "occurring",
     "outflow",
     "patch",
+    "points_touching",
     "resolve",
     "robin",
     "walls_of",
@@ -547,13 +548,17 @@ def patch(where: Any, condition: Any, elsewhere: Any = None) -> Patch:
     the ends of an interval are moved to the nearest ends of faces, an error of order h in the position of the patch. To
     avoid this error, choose a grid with faces that end there.
 
+    Where dirichlet and neumann meet at the end of a patch, the exact solution is in general singular: it contains the
+    square root of the distance to this end. Its error is then of order 1/2 there and of order 1 elsewhere. Solutions
+    without this singularity keep order 2.
+
     A patch that covers all faces of a wall is the same as its condition. The values of `lift` have one entry for each
     face of a wall; each is the value of the condition that holds on this face. A number for the whole wall is therefore
     a temperature on the faces with dirichlet and a slope on those with neumann. ``heated.values(grid, "x", 20.0)``
     returns an array that is 20 on the faces of the patch `heated`, and 0 on the others.
 
     These functions accept patches: `gradient`, `laplacian`, `lift`, `average` and `upwind`, and with them `inverse` and
-    `elliptic_solver`; `transport` of cell fields; for flows `projection`, `flow_step`, `face_laplacian`, `face_lift`,
+    `elliptic_solver`; `transport`; for flows `projection`, `flow_step`, `face_laplacian`, `face_lift`,
     `convection` and `forces`. All others refuse them, and so do distributed grids. Operators with patches are not sums
     of 1-D operators: `inverse` uses sparse factors or multigrid for them, and method "separable" does not apply.
 
@@ -669,6 +674,39 @@ def conditions_of(wall: Any) -> tuple[Any, ...]:
     if isinstance(wall, MixedWall):
         return tuple(condition for condition, _ in wall.regions)
     return (wall,)
+
+
+def points_touching(
+    grid: Grid, wall: MixedWall, axis: int, component: int, accepts: Callable[[Any], bool]
+) -> NDArray[np.bool_]:
+    """Return the points of a component of a face field at a wall that touch a face whose condition is accepted.
+
+    Along its own axis, the points of the component lie between two faces of the wall.
+
+    Parameters
+    ----------
+    grid : Grid
+    wall : MixedWall
+    axis : int
+        Axis across the wall.
+    component : int
+        Another axis.
+    accepts : callable
+        ``accepts(condition)`` returns a bool.
+
+    Returns
+    -------
+    bool array
+        In the shape of the component, without the axis across the wall.
+    """
+    faces = wall.faces_with(accepts)
+    position = component if component < axis else component - 1
+    if grid.periodic[component]:
+        return faces | np.roll(faces, 1, position)
+    width = [(0, 0)] * faces.ndim
+    width[position] = (1, 1)
+    padded = np.moveaxis(np.pad(faces, width), position, 0)
+    return np.moveaxis(padded[:-1] | padded[1:], 0, position)
 
 
 def occurring(sides: tuple) -> set:

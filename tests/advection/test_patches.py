@@ -57,6 +57,34 @@ def test_each_row_of_a_flow_along_x_has_its_own_condition(name, rng):
         np.testing.assert_allclose(ours, wanted, rtol=1e-11, atol=1e-12)
 
 
+@pytest.mark.parametrize("scheme", ["upwind", "van_leer", "semi_lagrangian"])
+def test_each_row_of_a_face_field_has_its_own_condition(scheme, rng):
+    """Points between two faces of the wall have inflow if one of the faces has it."""
+    move = dp.transport(BOX, scheme, SIDES, of="faces")
+    speed = 0.5 * rng.standard_normal(7)
+    u = rng.standard_normal(BOX.faces.size)
+    inflow = rng.standard_normal(move.walls.size)
+    x_part, y_part = BOX.split(move(u, BOX.join(speed[:, None], 0.0), 0.02, inflow))
+    walls = move.walls.split(inflow)
+    has_inflow = {"lower": HERE, "upper": ~HERE}
+
+    def condition(flags):
+        return dp.dirichlet if np.any(flags) else dp.neumann
+
+    for row in range(ROWS):  # x-faces: the half control volumes at the walls
+        pair = tuple(condition(has_inflow[side][row]) for side in ("lower", "upper"))
+        line = dp.transport(LINE, scheme, pair, of="faces")
+        values = np.array([walls[0][0, row], walls[1][0, row]]) if dp.dirichlet in pair else 0.0
+        wanted = line(BOX.split(u)[0][:, row], speed, 0.02, values)
+        np.testing.assert_allclose(x_part[:, row], wanted, rtol=1e-12, atol=1e-13)
+    for row in range(ROWS + 1):  # y-faces: between two faces of the walls
+        touched = slice(max(row - 1, 0), row + 1)
+        pair = tuple(condition(has_inflow[side][touched]) for side in ("lower", "upper"))
+        values = np.array([walls[4][0, row], walls[5][0, row]])
+        wanted = dp.transport(LINE, scheme, pair)(BOX.split(u)[1][:, row], speed, 0.02, values)
+        np.testing.assert_allclose(y_part[:, row], wanted, rtol=1e-12, atol=1e-13)
+
+
 @pytest.mark.parametrize("scheme", ["upwind", "van_leer"])
 def test_loops_and_matrices_agree_at_corners_with_patches_of_two_walls(scheme, rng):
     sides = {"x": SIDES["x"], "y": dp.patch(np.arange(6) < 3, dp.dirichlet)}

@@ -147,10 +147,12 @@ TABLE = [
         "the wall, got shape (3,)",
     ),
     (
-        lambda: dp.transport(BOX, boundary={"x": WALL}, of="faces"),
+        lambda: dp.conservation_law(
+            BOX, lambda u, p, a: u, lambda u, p, a: (u, u), boundary={"x": patch((0.0, 0.3), dp.outflow)}
+        ),
         TYPE,
-        "transport of faces takes one condition for each wall, but x-lower has a patch; write one condition, "
-        "such as dp.dirichlet",
+        "conservation_law takes one condition for each wall, but x-lower has a patch; write one condition, "
+        "such as dp.outflow",
     ),
 ]
 
