@@ -453,8 +453,8 @@ BUGS = {
     ),
     "eigenvectors that are not normalized in the metric of the prior": Bug(
         "optimize/misfit_eigenpairs.py",
-        "weights = vectors[:, kept].T / np.sqrt(values)[:, None]",
-        "weights = vectors[:, kept].T / values[:, None]",
+        "scaled = (first / np.sqrt(squares[is_first])).T[::-1]",
+        "scaled = (first / squares[is_first]).T[::-1]",
         "tests/optimize/test_laplace.py",
     ),
     "multiple eigenvalues of a posterior that are missed": Bug(

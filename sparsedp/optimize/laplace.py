@@ -119,8 +119,9 @@ def laplace(
     If there are at most `rank` residuals or unknowns, the Jacobian is computed, and no eigenvalue is neglected that
     exceeds rounding errors. Otherwise the eigenpairs are computed by a randomized block Krylov method from products
     with H and C.
-    All entries of `shift`, of `step` and of the posterior assume that the misfit is nearly quadratic within some
-    standard deviations of x.
+    Variances have absolute errors of about 1e-15 times those of the prior, unless there is an eigenpair for each
+    unknown.
+    The posterior, `shift` and `step` assume that the misfit is nearly quadratic within some standard deviations of x.
 
     References
     ----------

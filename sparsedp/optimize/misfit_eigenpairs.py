@@ -44,7 +44,8 @@ FIRST_BLOCKS = 2  # convergence is not tested before the space has this number o
 SAFETY = 10.0  # the norm of a matrix is rarely larger than this multiple of its products with random vectors
 SMALLEST = np.finfo(float).tiny
 BLOCK = 10  # random samples, and vectors in a block of the Krylov space
-ROUNDING = 1e3 * EPS  # eigenvalues below this multiple of the largest are lost in rounding
+ROUNDING = 1e3 * EPS  # eigenvalues below this multiple of the largest are lost in rounding of products with H
+FIRST_GROUP = 1e-4  # roots of eigenvalues above this multiple of the largest are taken from one matrix J C J^T
 SHARE_OF_RESIDUALS = 0.1  # share of the tolerance for the residuals of the eigenpairs
 ASYMMETRY = 1e-2  # relative asymmetry of the Hessian above which its products are wrong
 RESCALE = "; write the residuals and the unknowns in units in which they are closer to 1"
@@ -96,6 +97,10 @@ class MisfitEigenpairs(NamedTuple):
 def eigenpairs_of_jacobian(jacobian: NDArray, prior: PriorCovariance, tolerance: float) -> MisfitEigenpairs:
     """Return all eigenpairs for the Gauss-Newton Hessian J^T J, from the eigenpairs of J C J^T.
 
+    In one such matrix, eigenvalues that are much smaller than the largest have lost their digits. Therefore only the
+    group of large ones is taken from it, and the others from the matrix of the remaining combinations of the rows of J,
+    and so on, as in `linearization.left_singular`.
+
     Parameters
     ----------
     jacobian : (m, n) array
@@ -107,20 +112,37 @@ def eigenpairs_of_jacobian(jacobian: NDArray, prior: PriorCovariance, tolerance:
     rows = jacobian
     if rows.shape[0] > rows.shape[1]:
         rows = scipy.linalg.qr(jacobian, mode="r", check_finite=False)[0][: rows.shape[1]]
-    images = prior.apply(rows)
-    gram = images @ rows.T
-    asymmetry = _checked_asymmetry(gram)
-    values, vectors = scipy.linalg.eigh(0.5 * (gram + gram.T))
-    largest = np.max(values, initial=0.0)
-    rounding = max(ROUNDING * largest, asymmetry)
-    kept = np.flatnonzero(values > rounding)[::-1]
-    values = values[kept]
-    weights = vectors[:, kept].T / np.sqrt(values)[:, None]
-    neglected = 0.0 if len(kept) == len(gram) else rounding
+    count = len(rows)
+    largest = 0.0
+    rounding = 0.0
+    values: list[NDArray] = []
+    vectors: list[NDArray] = []
+    duals: list[NDArray] = []
+    while len(rows):
+        images = prior.apply(rows)
+        gram = images @ rows.T
+        asymmetry = _checked_asymmetry(gram)
+        squares, weights = scipy.linalg.eigh(_symmetric(gram))
+        largest = max(largest, np.max(squares))
+        rounding = max(asymmetry, ROUNDING**2 * largest)
+        if not squares[-1] > rounding:
+            break
+        is_first = squares > max(rounding, FIRST_GROUP**2 * squares[-1])
+        first = weights[:, is_first]
+        second = weights[:, ~is_first]
+        leak = (first.T @ images) @ (second.T @ rows).T / squares[is_first, None]
+        first, second = first + second @ leak.T, second - first @ leak
+        scaled = (first / np.sqrt(squares[is_first])).T[::-1]
+        values.append(squares[is_first][::-1])
+        vectors.append(scaled @ images)
+        duals.append(scaled @ rows)
+        rows = second.T @ rows
+    neglected = rounding if len(rows) and count else 0.0
+    empty = np.zeros((0, prior.size))
     return MisfitEigenpairs(
-        values,
-        weights @ images,
-        weights @ rows,
+        np.concatenate([np.zeros(0), *values]),
+        np.concatenate([empty, *vectors]),
+        np.concatenate([empty, *duals]),
         float(neglected),
         0.0,
         products,

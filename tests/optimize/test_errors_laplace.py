@@ -234,10 +234,10 @@ def test_too_small_rank_is_reported():
 
 
 def test_loss_of_precision_is_reported():
-    rows = np.array([[1e9, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    rows = np.array([[1e14, 0.0, 0.0], [0.0, 1.0, 0.0]])
     message = (
-        "eigenvalues of the misfit up to about 2.2e+05 are neglected, because they are lost in rounding beside the "
-        "largest one: variances are too large, by a factor of up to 2.22e+05; give data with larger standard "
+        "eigenvalues of the misfit up to about 4.9e+02 are neglected, because they are lost in rounding beside the "
+        "largest one: variances are too large, by a factor of up to 494; give data with larger standard "
         "deviations, or a prior with smaller ones"
     )
     with pytest.warns(PosteriorWarning, match=re.escape(message)):

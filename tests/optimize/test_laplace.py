@@ -1,6 +1,8 @@
 """The posterior of laplace: beside dense linear algebra, for all kinds of priors and unknowns, and its intervals."""
 
 import pickle
+from fractions import Fraction
+from operator import mul
 
 import autograd.numpy as anp
 import numpy as np
@@ -296,6 +298,30 @@ def test_exact_data():
     assert posterior.variance() == pytest.approx([1e-18, 1e-18, 1e-18, 1.0, 1.0], rel=1e-9)
     assert posterior.std_of(lambda x: x[0]) == pytest.approx(1e-9, rel=1e-9)
     assert np.std(np.array(posterior.sample(500))[:, 0]) == pytest.approx(1e-9, rel=0.1)
+
+
+def test_accurate_and_inaccurate_data_together():
+    """Data whose eigenvalues span 21 decades: those of the Hilbert matrix beside exact arithmetic."""
+    hilbert = 1e3 / (np.arange(10)[:, None] + np.arange(10) + 1.0)
+    posterior = dp.laplace(lambda x: anp.dot(hilbert, x), np.zeros(10), 1.0)
+    exact = np.linalg.svd(hilbert)[1][:9] ** 2
+    assert posterior.eigenvalues == pytest.approx(exact, rel=1e-6)
+    assert exact[0] / exact[-1] > 1e21
+    fractions = [[Fraction(float(entry)) for entry in row] for row in hilbert]
+    precision = [[sum(map(mul, a, b)) + (a is b) for b in fractions] for a in fractions]  # the matrix is symmetric
+    assert posterior.variance() == pytest.approx(diagonal_of_inverse(precision), rel=1e-8)
+
+
+def diagonal_of_inverse(matrix):
+    """The diagonal of the inverse of a matrix of fractions, by Gauss-Jordan elimination."""
+    n = len(matrix)
+    rows = [[*row, *(Fraction(i == j) for j in range(n))] for i, row in enumerate(matrix)]
+    for i in range(n):
+        rows[i] = [entry / rows[i][i] for entry in rows[i]]
+        for j in range(n):
+            if j != i:
+                rows[j] = [a - rows[j][i] * b for a, b in zip(rows[j], rows[i], strict=True)]
+    return [float(rows[i][n + i]) for i in range(n)]
 
 
 def test_wide_prior_is_the_covariance_of_least_squares():
