@@ -12,6 +12,7 @@ from scipy.optimize import Bounds, LinearConstraint, NonlinearConstraint, minimi
 
 import sparsedp as dp
 
+WHOLE = pytest.mark.whole
 METHODS = ["augmented_lagrangian", "slsqp", "trust_constr"]
 METHODS += [name for name, library in (("mma", "nlopt"), ("ipopt", "cyipopt")) if importlib.util.find_spec(library)]
 
@@ -102,7 +103,7 @@ HOCK: dict[int, Any] = {
 QUICK = {("augmented_lagrangian", 71), ("augmented_lagrangian", 76), ("mma", 24), ("slsqp", 71), ("trust_constr", 24)}
 QUICK |= {("ipopt", 71)}
 PUBLISHED = [
-    pytest.param(method, number, marks=[pytest.mark.whole] * ((method, number) not in QUICK))
+    pytest.param(method, number, marks=[WHOLE] * ((method, number) not in QUICK))
     for method in METHODS
     for number in HOCK
     if (method, number) != ("mma", 71)  # it has an equality
@@ -147,7 +148,7 @@ def test_multipliers_are_the_derivative_of_the_optimal_value():
     assert best.multipliers["high"].shape == (3,) and np.all(best.multipliers["high"] >= 0)
 
 
-@pytest.mark.parametrize("method", ["augmented_lagrangian", "slsqp"])
+@pytest.mark.parametrize("method", [pytest.param("augmented_lagrangian", marks=WHOLE), "slsqp"])
 def test_a_source_with_given_temperatures_against_the_kkt_system(method, rng):
     """The smallest heat source with given readings: one equality for each of three sensors."""
     grid = dp.Grid((6, 5), size=1.0)
@@ -173,6 +174,55 @@ def test_a_source_with_given_temperatures_against_the_kkt_system(method, rng):
     assert dp.check.gradient(lagrangian, np.ones(grid.shape), quick=True).verdict == "agrees"
 
 
+def active_set(matrix, target, weight, limit):
+    """Return the source u and the multipliers for 1/2 |T u - target|^2 + weight / 2 |u|^2 with T u <= limit."""
+    size = len(matrix)
+    multipliers = np.zeros(size)
+    active = np.zeros(size, dtype=bool)
+    for _ in range(50):
+        # The rows are the gradient of the Lagrangian, and T u = limit where active, else no multiplier.
+        system = np.block(
+            [
+                [matrix.T @ matrix + weight * np.eye(size), matrix.T],
+                [matrix * active[:, None], np.diag(np.where(active, 0.0, 1.0))],
+            ]
+        )
+        solution = np.linalg.solve(system, np.concatenate([matrix.T @ target, np.where(active, limit, 0.0)]))
+        u, multipliers = solution[:size], solution[size:]
+        before = active
+        active = multipliers + (matrix @ u - limit) > 1e-12
+        if np.array_equal(active, before):
+            return u, multipliers
+    raise AssertionError("the active set does not settle")
+
+
+@pytest.mark.parametrize("cells", [6, pytest.param(20, marks=WHOLE)])
+def test_a_limit_in_each_cell_against_active_sets(cells):
+    """The penalty must not grow faster than the inner searches converge: with 400 limits it once did."""
+    grid = dp.Grid((cells, cells), size=1.0)
+    minus_laplacian = -dp.laplacian(grid, dp.dirichlet)
+    temperature_of = dp.inverse(minus_laplacian)
+    x, y = grid.centres()
+    target = np.where((x < 0.5) & (np.abs(y - 0.5) < 0.3), 1.3, 0.5)
+
+    def loss(source):
+        return 0.5 * anp.sum((temperature_of(source) - target) ** 2) + 0.5e-3 * anp.sum(source**2)
+
+    best = dp.minimize(
+        loss,
+        np.ones(grid.shape),
+        "augmented_lagrangian",
+        constraints=lambda source: temperature_of(source) - 0.6,
+        tolerance=1e-8,
+        maxiter=3000,
+    )
+    matrix = np.linalg.inv(minus_laplacian.matrix.toarray())
+    source, multipliers = active_set(matrix, target.ravel(), 1e-3, 0.6)
+    assert best.converged and np.any(multipliers > 0.01) and np.any(multipliers == 0.0)
+    assert np.allclose(best.x.ravel(), source, atol=1e-5 * np.max(np.abs(source)))
+    assert np.allclose(best.multipliers.ravel(), multipliers, atol=1e-4 * np.max(multipliers))
+
+
 @pytest.mark.parametrize("method", ["augmented_lagrangian", "slsqp"])
 def test_constraints_of_scipy(method):
     """Two-sided limits, an equality, a limit that is infinite, and a jac of the user."""
@@ -196,9 +246,7 @@ def test_constraints_of_scipy(method):
     assert np.allclose(best.multipliers[1], 0.0)
 
 
-@pytest.mark.parametrize(
-    "method", [pytest.param(one, marks=[pytest.mark.whole] * (one == "trust_constr")) for one in METHODS]
-)
+@pytest.mark.parametrize("method", [pytest.param(one, marks=[WHOLE] * (one == "trust_constr")) for one in METHODS])
 def test_contradictory_constraints_are_infeasible(method):
     constraints = [lambda x: anp.sum(x) + 1.0, lambda x: 1.0 - anp.sum(x)]
     best = dp.minimize(lambda x: anp.sum((x - 0.1) ** 2), np.full(2, 0.3), method, constraints=constraints, maxiter=60)
@@ -325,7 +373,7 @@ def without_seconds(best):
     return [record._replace(seconds=0.0) for record in best.history]
 
 
-@pytest.mark.parametrize("stop", [1, 8, 30])
+@pytest.mark.parametrize("stop", [8, pytest.param(1, marks=WHOLE), pytest.param(30, marks=WHOLE)])
 def test_a_resumed_run_has_the_same_bits(tmp_path, stop):
     loss, start, bounds, constraints, _, _ = HOCK[71]
 
@@ -417,7 +465,7 @@ def test_no_iterations_and_infeasible_starts(method):
     assert "the constraints are violated by up to" in best.message
 
 
-@pytest.mark.parametrize("method", ["augmented_lagrangian", "mma", "slsqp"])
+@pytest.mark.parametrize("method", [pytest.param("augmented_lagrangian", marks=WHOLE), "mma", "slsqp"])
 def test_a_loss_without_a_minimum_is_not_converged(method):
     """At x = -1e20 the step of a gradient of 1 is lost in rounding; that must not count as a bound."""
     if method not in METHODS:
