@@ -55,6 +55,26 @@ def test_patterns():
     assert float(re.search(r"25 steps: (\S+)", printed)[1]) == pytest.approx(0.034, abs=1e-5)
 
 
+@example("cross_validation.py")
+def test_cross_validation():
+    """The weights of the search predict omitted data and the truth better than equal ones."""
+    printed = run("cross_validation.py")
+    assert "finite differences: agrees" in printed
+    before, after = map(float, re.search(r"score (\S+) -> (\S+) in", printed).groups())
+    equal, chosen = map(float, re.search(r"estimate: (\S+) with equal weights, (\S+) with", printed).groups())
+    assert after < before / 2 and chosen < 0.7 * equal
+
+
+@example("states_in_files.py")
+def test_states_in_files():
+    """Files reduce the number of runs and not a bit; an interrupted run continues."""
+    printed = run("states_in_files.py")
+    assert printed.count("the same bits") == 5 and "DIFFERENT" not in printed
+    runs = [float(factor) for factor in re.findall(r"^(?:all|ten) .* (\d+\.\d+) +\d+\.\d+  the", printed, re.MULTILINE)]
+    assert len(runs) == 4 and runs[1] > runs[2] > runs[3] == runs[0] == 1.0
+    assert re.search(r"continued from state 2\d\d: the same bits, 0 files remain", printed)
+
+
 @example("posterior.py")
 def test_posterior():
     """The truth in the intervals, a mode that is one, and deviations beside those of samples."""
