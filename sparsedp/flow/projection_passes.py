@@ -58,7 +58,7 @@ class OperatorPasses:
 
 
 class CompiledPasses:
-    """The passes as compiled loops, for grids without obstacles.
+    """The passes as compiled loops, for grids without obstacles whose walls are each open or closed as a whole.
 
     Parameters
     ----------
@@ -112,7 +112,10 @@ def compiled_passes(grid: Grid, products: OperatorPasses) -> CompiledPasses | No
     lines = []
     for axis, faces in enumerate(grid.faces.split(products.kept)):
         n = grid.shape[axis]
-        kept = np.moveaxis(faces, axis, -1).reshape(-1, faces.shape[axis])[0]  # all lines are equal without obstacles
+        lines_of_mask = np.moveaxis(faces, axis, -1).reshape(-1, faces.shape[axis])
+        kept = lines_of_mask[0]
+        if np.any(lines_of_mask != kept):  # a wall is closed on one part and has an inflow on another
+            return None
         entries = face_entries(products.first, products.second, axis, n)
         if entries is None:
             return None

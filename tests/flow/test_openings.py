@@ -169,6 +169,21 @@ def test_projection_is_the_dense_one(method, rng):
     assert dp.check.operator(P)
 
 
+def test_projection_by_transforms_knows_where_a_wall_is_open(rng):
+    """An inflow has the pressure condition of a closed wall, so that the pressure is found by transforms."""
+    P = dp.projection(BOX, boundary={"x": (INLET, dp.outflow), "y": (dp.no_slip, CLOSED_IN_PART)})
+    assert P.method == "separable"
+    v = rng.standard_normal(BOX.faces.size)
+    solid = np.zeros(BOX.shape, bool)  # the same by factors of the matrix
+    other = dp.projection(BOX, solid, {"x": (INLET, dp.outflow), "y": (dp.no_slip, CLOSED_IN_PART)}, method="direct")
+    np.testing.assert_allclose(P(v), other(v), rtol=1e-10, atol=1e-10)
+    assert np.max(np.abs(dp.divergence(BOX)(P(v)))) <= 1e-11
+    assert dp.check.operator(P)
+
+
+CLOSED_IN_PART = dp.patch([True, False, False, True], dp.inflow, elsewhere=dp.free_slip)
+
+
 def test_mass_that_enters_leaves_through_the_opening(rng):
     v = dp.projection(BOX, boundary=SIDES)(rng.standard_normal(BOX.faces.size))
     left, right = (BOX.split(v)[0][i] for i in (0, -1))
