@@ -41,7 +41,9 @@ if TYPE_CHECKING:
 __all__ = ["MisfitEigenpairs", "eigenpairs_of_jacobian", "eigenpairs_of_products"]
 
 FIRST_BLOCKS = 2  # convergence is not tested before the space has this number of blocks
+CLEARLY = 1 + 1e-6  # eigenvalues above a threshold by this factor are not equal to it
 SAFETY = 10.0  # the norm of a matrix is rarely larger than this multiple of its products with random vectors
+ROOM = 6  # blocks beyond two vectors for each eigenpair, in the largest Krylov space
 SMALLEST = np.finfo(float).tiny
 BLOCK = 10  # random samples, and vectors in a block of the Krylov space
 ROUNDING = 1e3 * EPS  # eigenvalues below this multiple of the largest are lost in rounding of products with H
@@ -122,7 +124,7 @@ def eigenpairs_of_jacobian(jacobian: NDArray, prior: PriorCovariance, tolerance:
         images = prior.apply(rows)
         gram = images @ rows.T
         asymmetry = _checked_asymmetry(gram)
-        squares, weights = scipy.linalg.eigh(_symmetric(gram))
+        squares, weights = scipy.linalg.eigh(_symmetric(gram), driver="evd")
         largest = max(largest, np.max(squares))
         rounding = max(asymmetry, ROUNDING**2 * largest)
         if not squares[-1] > rounding:
@@ -175,20 +177,21 @@ def eigenpairs_of_products(
     DerivativeError
         If the products with H are not symmetric.
     """
-    space = KrylovSpace(product, prior, tolerance, most=min(prior.size, 2 * (rank + BLOCK)))
+    space = KrylovSpace(product, prior, tolerance, rank)
     rng = np.random.default_rng(seed)
     count = min(BLOCK, prior.size)
     least = min(FIRST_BLOCKS * count, prior.size)
     while True:
-        known = space.informative
+        threshold = space.threshold
+        known = space.count_above(threshold)
         outside = space.start(_random_rows(prior, rng, count), prior.has_root)
         if outside <= space.threshold:
-            return space.result(rank, is_complete=True, outside=outside)
-        has_converged = space.grow_until_converged(rank, least)
-        if not has_converged or space.informative > rank:
-            return space.result(rank, is_complete=False)
-        if space.informative == known:  # new random samples did not show another eigenpair
-            return space.result(rank, is_complete=True)
+            return space.result(is_verified=True, outside=outside)
+        if not space.grow_until_converged(least):
+            outside = space.start(_random_rows(prior, rng, count), are_samples=True)
+            return space.result(is_verified=False, outside=outside)
+        if space.count_above(threshold) == known:  # new random samples did not show another eigenpair
+            return space.result(is_verified=True)
 
 
 def _random_rows(prior, rng, count):
@@ -218,10 +221,8 @@ class KrylovSpace:
 
     Parameters
     ----------
-    product, prior, tolerance
+    product, prior, tolerance, rank
         As for `eigenpairs_of_products`.
-    most : int
-        Largest dimension.
 
     Attributes
     ----------
@@ -232,18 +233,20 @@ class KrylovSpace:
     residuals : (m,) array
         Norms of H C w - lambda w, relative to sqrt(1 + lambda).
     threshold : float
-        The tolerance, or the size of rounding errors of eigenvalues if it is larger.
+        The magnitude above which eigenpairs are wanted: the tolerance, the size of rounding errors of eigenvalues, or
+        the magnitude above which there are `rank` of them, whichever is largest.
     products : int
         Number of products with H.
     """
 
     def __init__(
-        self, product: Callable[[NDArray], NDArray], prior: PriorCovariance, tolerance: float, most: int
+        self, product: Callable[[NDArray], NDArray], prior: PriorCovariance, tolerance: float, rank: int
     ) -> None:
         self._product = product
         self._prior = prior
         self._tolerance = tolerance
-        self._most = most
+        self._rank = rank
+        self._most = min(prior.size, 2 * rank + ROOM * BLOCK)  # largest dimension
         self._blocks: list[Block] = []
         self._next = Block(np.zeros((0, prior.size)), np.zeros((0, prior.size)))  # extends the space
         self._continues = False  # whether the next block has the components of the last one outside of the space
@@ -260,26 +263,30 @@ class KrylovSpace:
     @property
     def threshold(self) -> float:
         """The magnitude above which eigenpairs are wanted."""
+        if len(self.values) <= self._rank:
+            return self._least_threshold
+        return max(self._least_threshold, np.sort(np.abs(self.values))[-1 - self._rank])
+
+    @property
+    def _least_threshold(self):
         return max(self._tolerance, self._rounding)
 
     @property
     def _rounding(self):
         return max(ROUNDING * np.max(np.abs(self.values), initial=0.0), self.asymmetry)
 
-    @property
-    def informative(self) -> int:
-        """The number of Ritz values above the threshold."""
-        return int(np.count_nonzero(np.abs(self.values) > self.threshold))
+    def count_above(self, threshold: float) -> int:
+        """Return the number of Ritz values whose magnitude is clearly above a threshold."""
+        return int(np.count_nonzero(np.abs(self.values) > CLEARLY * threshold))
 
     @property
-    def settled(self) -> int:
-        """The number of eigenpairs above the threshold that have converged."""
-        return int(np.count_nonzero((np.abs(self.values) > self.threshold) & self._are_converged()))
-
-    def _are_converged(self):
+    def has_converged(self) -> bool:
+        """Whether all eigenpairs above the threshold have converged."""
+        wanted = np.abs(self.values) > CLEARLY * self.threshold
         # Each start leaves the components outside of the last space as they are, so the next one has a looser goal.
-        goal = self._starts * SHARE_OF_RESIDUALS * self._tolerance / np.sqrt(max(1, self.informative))
-        return 2 * self.residuals <= np.maximum(goal, self._rounding)
+        count = max(1, int(np.count_nonzero(wanted)))
+        goal = self._starts * SHARE_OF_RESIDUALS * self._tolerance / np.sqrt(count)
+        return bool(np.all(2 * self.residuals[wanted] <= max(goal, self._rounding)))
 
     def start(self, rows: NDArray, are_samples: bool) -> float:
         """Begin a new sequence of blocks with H times random rows; return an estimate of the norm of H C outside.
@@ -298,14 +305,13 @@ class KrylovSpace:
             return np.inf
         return float(np.sqrt(np.max(np.maximum(squares, 0.0))))
 
-    def grow_until_converged(self, rank: int, least: int) -> bool:
+    def grow_until_converged(self, least: int) -> bool:
         """Add blocks until all eigenpairs above the threshold have converged; return whether they have.
 
-        It ends without convergence when more than `rank` have converged, or when there is no room.
+        It ends without convergence when the largest dimension is reached.
 
         Parameters
         ----------
-        rank : int
         least : int
             The smallest dimension at which convergence is tested.
         """
@@ -313,9 +319,7 @@ class KrylovSpace:
             if self.dimension + self._next.dimension > self._most:
                 return False
             self._grow()
-            if self.settled > rank:
-                return False
-            if self.dimension >= least and self.settled == self.informative:
+            if self.dimension >= least and self.has_converged:
                 break
         return True
 
@@ -348,7 +352,7 @@ class KrylovSpace:
         self.matrix = matrix
 
     def _update_ritz_pairs(self):
-        self.values, self._vectors = scipy.linalg.eigh(self.matrix)
+        self.values, self._vectors = scipy.linalg.eigh(self.matrix, driver="evd")
         if len(self.values) and self.values[0] <= -1:  # eigenvalues are at most as large as Ritz values
             raise ValueError(NEGATIVE.format(self.values[0]))
         squares = np.zeros(len(self.values))
@@ -391,7 +395,7 @@ class KrylovSpace:
         images = self._prior.apply(rows)
         gram = rows @ images.T
         check_finite("the Hessian of the misfit, in the metric of the prior,", gram, advice=RESCALE)
-        squares, vectors = scipy.linalg.eigh(_symmetric(gram))
+        squares, vectors = scipy.linalg.eigh(_symmetric(gram), driver="evd")
         resolved = ROUNDING * np.max(squares, initial=0.0)
         kept = squares > max(dropped**2, resolved)
         lengths = np.sqrt(squares[kept])
@@ -399,13 +403,12 @@ class KrylovSpace:
         weights = (vectors / lengths).T
         return Block(weights @ rows, weights @ images), vectors * lengths, resolved > dropped**2 and not np.all(kept)
 
-    def result(self, rank: int, is_complete: bool, outside: float = np.inf) -> MisfitEigenpairs:
+    def result(self, is_verified: bool, outside: float = np.inf) -> MisfitEigenpairs:
         """Return the eigenpairs that have converged, at most `rank`.
 
         Parameters
         ----------
-        rank : int
-        is_complete : bool
+        is_verified : bool
             Whether all eigenpairs above the threshold are in the space and have converged.
         outside : float
             The last result of `start`.
@@ -414,17 +417,17 @@ class KrylovSpace:
         is_whole = self.dimension == self._prior.size
         wanted = 2 * self.residuals <= max(self._tolerance, self._rounding)
         if not is_whole:
-            wanted &= magnitudes > self.threshold
+            wanted &= magnitudes > self._least_threshold
         kept = np.flatnonzero(wanted)
-        kept = kept[np.argsort(-magnitudes[kept], kind="stable")][:rank]
+        kept = kept[np.argsort(-magnitudes[kept], kind="stable")][: self._rank]
         others = np.ones(len(self.values), bool)
         others[kept] = False
         if is_whole:
             neglected = np.max(magnitudes[others], initial=0.0)
-        elif is_complete:
+        elif is_verified:
             neglected = max(np.max(magnitudes[others], initial=0.0), min(self.threshold, SAFETY * outside))
         else:
-            neglected = max(self.threshold, np.max((magnitudes + self.residuals)[others], initial=0.0))
+            neglected = max(self.threshold, outside, np.max((magnitudes + self.residuals)[others], initial=0.0))
         vectors = np.zeros((len(kept), self._prior.size))
         duals = np.zeros_like(vectors)
         start = 0
@@ -442,7 +445,7 @@ class KrylovSpace:
             self.products,
             "products with the Hessian",
             bool(neglected <= self._tolerance),
-            is_complete,
+            bool(self._tolerance < neglected <= self._rounding),
         )
 
 

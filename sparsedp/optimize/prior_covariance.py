@@ -100,7 +100,7 @@ class Block(Uncached):
     @cached_property
     def _matrix_root(self):
         """The symmetric square root of the dense matrix."""
-        eigenvalues, vectors = scipy.linalg.eigh(self.matrix)
+        eigenvalues, vectors = scipy.linalg.eigh(self.matrix, driver="evd")
         return (vectors * np.sqrt(np.maximum(eigenvalues, 0.0))) @ vectors.T
 
     @cached_property

@@ -92,6 +92,18 @@ def test_products_only(rng, as_loss):
     assert posterior.information_gain == pytest.approx(divergence(mean, covariance, prior), rel=0.01)
 
 
+@pytest.mark.parametrize("rank", [3, 12, 25])
+def test_multiple_eigenvalues_above_the_rank(rank):
+    """Variances are too large by at most the stated factor, if 40 equal eigenvalues are more than the rank."""
+    weights = np.where(np.arange(150) < 40, 3.0, 0.1)
+    with pytest.warns(dp.errors.PosteriorWarning, match="^eigenvalues of the misfit up to .* there are more than"):
+        posterior = dp.laplace(lambda x: weights * x, np.zeros(150), 1.0, rank=rank, tolerance=1e-3)
+    assert posterior.eigenvalues == pytest.approx(np.full(rank, 9.0))
+    assert 9.0 * (1 - 1e-9) <= posterior.neglected <= 90.0
+    ratio = posterior.variance() * (1 + weights**2)
+    assert np.all(ratio >= 1 - 1e-9) and np.all(ratio <= 1 + posterior.error)
+
+
 def test_long_jacobian(rng, monkeypatch):
     """With few unknowns and very many residuals, the Jacobian is not stored."""
     monkeypatch.setattr(laplace, "MOST_ENTRIES", 10)
@@ -442,3 +454,41 @@ def test_coverage_of_4096_unknowns(rng):
     for share, counts in zip((0.9, 0.95), held.T):
         least, most = binom.ppf([1e-4, 1 - 1e-4], 200, share)
         assert np.all(counts >= least) and np.all(counts <= most)
+
+
+SPECTRA = {
+    "geometric": lambda i, n, rng: 100 * 0.8**i,
+    "algebraic": lambda i, n, rng: 10 / (1.0 + i),
+    "quadratic": lambda i, n, rng: 100 / (1.0 + i) ** 2,
+    "equal": lambda i, n, rng: np.where(i < n // 3, 10.0, 0.0),
+    "equal, and equal below": lambda i, n, rng: np.where(i < n // 4, 10.0, 0.009),
+    "three groups": lambda i, n, rng: np.where(i < 5, 1e6, np.where(i < n // 5, 0.02, 1e-4)),
+    "random": lambda i, n, rng: 10 ** rng.uniform(-6, 4, n),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::sparsedp.errors.PosteriorWarning")
+@pytest.mark.parametrize("name", SPECTRA)
+def test_stated_errors_for_random_problems(name, rng, monkeypatch):
+    """Variances are too large by at most the stated error, for any spectrum, prior, rank and tolerance."""
+    for trial in range(30):
+        n = int(rng.integers(20, 250))
+        values = SPECTRA[name](np.arange(n), n, rng)
+        vectors = np.linalg.qr(rng.standard_normal((n, n)))[0]
+        axes = np.linalg.qr(rng.standard_normal((n, n)))[0] if trial % 2 else np.eye(n)
+        variances = rng.permutation(np.geomspace(1.0, 10 ** -rng.uniform(0.0, 8.0), n))
+        prior = (axes * variances) @ axes.T
+        inverse_root = (axes / np.sqrt(variances)) @ axes.T
+        rows = np.sqrt(values)[:, None] * vectors.T @ inverse_root
+        monkeypatch.setattr(prior_covariance, "MOST_COLUMNS", 1024 if trial % 3 else 1)
+        functions = dp.from_functions(lambda x, prior=prior: prior @ x, None, n, n)
+        tolerance = float(rng.choice([0.1, 0.01, 0.001]))
+        misfit = lambda x, rows=rows: 0.5 * anp.sum(anp.dot(rows, x) ** 2)
+        posterior = dp.laplace(misfit, np.zeros(n), functions, rank=int(rng.integers(1, n)), tolerance=tolerance)
+        gain = np.linalg.solve(rows @ prior @ rows.T + np.eye(n), rows @ prior)
+        weights = rng.standard_normal((5, n)) @ inverse_root
+        exact = np.diag(weights @ (prior - prior @ rows.T @ gain) @ weights.T)
+        ratio = posterior.std_of(lambda x, weights=weights: anp.dot(weights, x)) ** 2 / exact
+        assert np.all(ratio >= 1 - 0.3 * tolerance - 1e-6)
+        assert np.all(ratio <= 1 + 1.02 * posterior.error + 1e-6)
