@@ -126,6 +126,22 @@ def test_mbb_beam():
         assert 233.3 < compliance < 233.71 and abs(float(volume) - 0.5) < 1e-3
 
 
+@example("membrane_design.py")
+def test_membrane_design():
+    """The optimality condition of the lowest tone, a cluster that is refused, and both values of it raised alike."""
+    printed = run("membrane_design.py")
+    heavy, light = map(float, re.search(r"u\^2 up to (\S+) in heavy cells, from (\S+) in light ones", printed).groups())
+    assert heavy < light
+    before, after = map(float, re.search(r"^eigenvalue (\S+) -> (\S+)$", printed, re.MULTILINE).groups())
+    assert after > 1.35 * before
+    assert "pairs 1 to 2 of eigenpairs have no derivatives one by one" in printed
+    second, third = map(
+        float, re.search(r"second and third eigenvalue .* -> (\S+), (\S+)$", printed, re.MULTILINE).groups()
+    )
+    assert 38.5 < second <= third < 1.03 * second
+    assert np.allclose([float(mean) for mean in re.findall(r"mean density (\S+)", printed)], 1.5, atol=1e-5)
+
+
 @example("volume_to_point.py")
 def test_volume_to_point():
     """Right derivatives, the volume kept in every stage, and each design best in what it was made for."""
