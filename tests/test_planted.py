@@ -27,6 +27,12 @@ class Bug(NamedTuple):
 
 
 BUGS = {
+    "one number as a value and as a slope on a wall": Bug(
+        "operators/masks_and_lift.py",
+        "                if np.shape(part) == () and (isbox(part) or part != 0):\n",
+        "                if False:\n",
+        "tests/operators/test_patches.py",
+    ),
     "a wall that is open as its first line is": Bug(
         "flow/projection_passes.py",
         "        if np.any(lines_of_mask != kept):",

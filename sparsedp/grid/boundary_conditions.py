@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Condition",
     "FlowCondition",
+    "SIDES",
     "MixedWall",
     "Patch",
     "check_condition",
@@ -553,9 +554,10 @@ def patch(where: Any, condition: Any, elsewhere: Any = None) -> Patch:
     without this singularity keep order 2.
 
     A patch that covers all faces of a wall is the same as its condition. The values of `lift` have one entry for each
-    face of a wall; each is the value of the condition that holds on this face. A number for the whole wall is therefore
-    a temperature on the faces with dirichlet and a slope on those with neumann. ``heated.values(grid, "x", 20.0)``
-    returns an array that is 20 on the faces of the patch `heated`, and 0 on the others.
+    face of a wall; each is the value of the condition that holds on this face: a temperature on the faces with
+    dirichlet, a slope on those with neumann. A number for the whole wall is refused, unless it is 0.
+    ``heated.values(grid, "x", 20.0)`` returns an array that is 20 on the faces of the patch `heated`, and 0 on the
+    others.
 
     These functions accept patches: `gradient`, `laplacian`, `lift`, `average` and `upwind`, and with them `inverse` and
     `elliptic_solver`; `transport`; for flows `projection`, `flow_step`, `face_laplacian`, `face_lift`,

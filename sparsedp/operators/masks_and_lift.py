@@ -9,7 +9,7 @@ import numpy as np
 from sparsedp._utils.validation import check_finite, check_kind, check_on, check_plain, check_type
 from sparsedp.autodiff.tape import isbox
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.grid.boundary_conditions import describe_patches, resolve, walls_of
+from sparsedp.grid.boundary_conditions import SIDES, MixedWall, describe_patches, resolve, walls_of
 from sparsedp.grid.grid import Grid, check_grid
 from sparsedp.grid.space import Space
 from sparsedp.operators.operator import Operator
@@ -39,12 +39,13 @@ def lift(grid: Grid, boundary: Any) -> Operator:
     Operator
         in: one flat array of the values on all walls, in the order lower x, upper x, lower y, ... without periodic
         axes; out: faces [unit / length]. ``op.domain.join(...)`` builds the flat array. Its arguments are one array or
-        number for each wall; in 2-D the array has one entry for each cell along the wall.
+        number for each wall; in 2-D the array has one entry for each cell along the wall. For a wall with a patch, it
+        takes an array, such as ``patch.values(grid, "x", 1.0)``, or 0.
 
     Raises
     ------
     ValueError
-        If `boundary` names a periodic axis.
+        If `boundary` names a periodic axis. On use of ``join``, if a wall with a patch gets a number other than 0.
 
     See Also
     --------
@@ -77,8 +78,53 @@ def lift(grid: Grid, boundary: Any) -> Operator:
     for axis, side, wall in walls_of(sides):
         blocks[axis, len(parts)] = wall_slope_terms(grid, axis, side, wall)
         parts.append(tuple(1 if a == axis else n for a, n in enumerate(grid.shape)))
-    walls = Space(None, "walls", grid, parts)
+    mixed = {}
+    for number, (axis, side, wall) in enumerate(walls_of(sides)):
+        if isinstance(wall, MixedWall):
+            mixed[number] = f"{grid.axes[axis]}-{SIDES[side]}"
+    if mixed:
+        walls: Space = MixedWalls(grid, parts, mixed)
+    else:
+        walls = Space(None, "walls", grid, parts)
     return kronecker_operator(walls, grid.faces, blocks, f"lift{describe_patches(sides)}")
+
+
+class MixedWalls(Space):
+    """The space of values on walls of which some have several conditions.
+
+    Parameters
+    ----------
+    grid : Grid
+    parts : list of tuple of int
+        Shapes of the walls.
+    mixed : dict
+        Maps the numbers of the walls with several conditions to their names.
+    """
+
+    mixed: dict[int, str]
+
+    def __init__(self, grid: Grid, parts: list[tuple[int, ...]], mixed: dict[int, str]) -> None:
+        super().__init__(None, "walls", grid, parts)
+        self.__dict__["mixed"] = mixed
+
+    def join(self, *parts: Any) -> Any:
+        """Return one field of the values on all walls; see `Space.join`.
+
+        Raises
+        ------
+        ValueError
+            If a number other than 0 is given for a wall with several conditions: it would be a value on one part of the
+            wall and a slope on another.
+        """
+        if len(parts) == len(self.parts):
+            for number, name in self.mixed.items():
+                part = parts[number]
+                if np.shape(part) == () and (isbox(part) or part != 0):
+                    raise ValueError(
+                        f"{name} has several conditions, and one number does not say which of them it belongs to; "
+                        f"write patch.values(grid, {name[0]!r}, number), or one entry for each face"
+                    )
+        return super().join(*parts)
 
 
 def mask(space: Space, keep: ArrayLike) -> Operator:

@@ -9,6 +9,7 @@ from sparsedp.grid.boundary_conditions import dirichlet, neumann, patch, resolve
 
 BOX = dp.Grid((3, 4), spacing=[[0.5, 0.3, 0.2], [0.1, 0.4, 0.3, 0.2]], origin=(1.0, -0.5))
 WALL = patch((0.0, 0.3), dirichlet)
+LIFT = dp.lift(BOX, {"x": (WALL, neumann)})
 SHAPE = dp.errors.ShapeError
 FINITE = dp.errors.NonFiniteError
 DERIVATIVE = dp.errors.DerivativeError
@@ -145,6 +146,12 @@ TABLE = [
         SHAPE,
         "values of a patch takes inside as a number or an array of shape (4,), one entry for each face of "
         "the wall, got shape (3,)",
+    ),
+    (
+        lambda: LIFT.domain.join(20.0, 0.0, 0.0, 0.0),
+        VALUE,
+        "x-lower has several conditions, and one number does not say which of them it belongs to; write "
+        "patch.values(grid, 'x', number), or one entry for each face",
     ),
     (
         lambda: dp.conservation_law(

@@ -143,6 +143,16 @@ def test_a_full_patch_and_a_patch_of_the_same_condition_are_the_plain_condition(
     assert resolve(line, (patch([True], dirichlet), neumann)) == ((dirichlet, neumann),)
 
 
+def test_numbers_for_walls_with_several_conditions():
+    """Only 0, on the walls that have them; pickled too."""
+    domain = dp.lift(BOX, {"x": (patch((0.0, 0.3), dirichlet), neumann)}).domain
+    for space in (domain, pickle.loads(pickle.dumps(domain))):
+        assert np.count_nonzero(space.join(0.0, 1.0, 2.0, 3.0)) == 4 + 3 + 3
+        assert np.count_nonzero(space.join(np.ones(4), 0, 0, 0)) == 4
+        with pytest.raises(ValueError, match="x-lower has several conditions, and one number"):
+            dp.grad(lambda heat: anp.sum(space.join(heat, 0.0, 0.0, 0.0)))(0.0)
+
+
 def test_which_faces_belong_to_an_interval():
     """Those whose centre lies in it; an end on a centre belongs to the upper interval only, whatever the rounding."""
     grid = dp.Grid((1, 5), spacing=0.1)
@@ -258,7 +268,7 @@ def loss_of_data(rng):
     def loss(p):
         films = sides["x"][1].values(grid, "x", 1 / p["transfer"])
         k = 1 / (1 / p["k"] + anp.abs(B(B.domain.join(0.0, films, 0.0, 0.0))))
-        walls = B.domain.join(sides["x"][0].values(grid, "x", p["inlet"]), 0.3, 0.0, 0.0)
+        walls = B.domain.join(sides["x"][0].values(grid, "x", p["inlet"]), 0.3 * np.ones(4), 0.0, 0.0)
         return anp.sum(weights * solve(k, 1.0 + div(k * B(walls))) ** 2)
 
     p = {"transfer": 1 + rng.random(4), "k": np.array(0.7), "inlet": rng.standard_normal(4)}
