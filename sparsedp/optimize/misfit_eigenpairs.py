@@ -40,16 +40,16 @@ if TYPE_CHECKING:
 
 __all__ = ["MisfitEigenpairs", "eigenpairs_of_jacobian", "eigenpairs_of_products"]
 
+BLOCK = 10  # random samples, and vectors in a block of the Krylov space
 FIRST_BLOCKS = 2  # convergence is not tested before the space has this number of blocks
+ROOM = 6  # blocks beyond two vectors for each eigenpair, in the largest Krylov space
+SHARE_OF_RESIDUALS = 0.1  # share of the tolerance for the residuals of the eigenpairs
 CLEARLY = 1 + 1e-6  # eigenvalues above a threshold by this factor are not equal to it
 SAFETY = 10.0  # the norm of a matrix is rarely larger than this multiple of its products with random vectors
-ROOM = 6  # blocks beyond two vectors for each eigenpair, in the largest Krylov space
-SMALLEST = np.finfo(float).tiny
-BLOCK = 10  # random samples, and vectors in a block of the Krylov space
-ROUNDING = 1e3 * EPS  # eigenvalues below this multiple of the largest are lost in rounding of products with H
 FIRST_GROUP = 1e-4  # roots of eigenvalues above this multiple of the largest are taken from one matrix J C J^T
-SHARE_OF_RESIDUALS = 0.1  # share of the tolerance for the residuals of the eigenpairs
+ROUNDING = 1e3 * EPS  # eigenvalues below this multiple of the largest are lost in rounding of products with H
 ASYMMETRY = 1e-2  # relative asymmetry of the Hessian above which its products are wrong
+SMALLEST = np.finfo(float).tiny
 RESCALE = "; write the residuals and the unknowns in units in which they are closer to 1"
 NEGATIVE = (
     "the Hessian of the loss has the eigenvalue {:.3g} in the metric of the prior, so x is not a minimum of the "
@@ -114,7 +114,6 @@ def eigenpairs_of_jacobian(jacobian: NDArray, prior: PriorCovariance, tolerance:
     rows = jacobian
     if rows.shape[0] > rows.shape[1]:
         rows = scipy.linalg.qr(jacobian, mode="r", check_finite=False)[0][: rows.shape[1]]
-    count = len(rows)
     largest = 0.0
     rounding = 0.0
     values: list[NDArray] = []
@@ -123,7 +122,7 @@ def eigenpairs_of_jacobian(jacobian: NDArray, prior: PriorCovariance, tolerance:
     while len(rows):
         images = prior.apply(rows)
         gram = images @ rows.T
-        asymmetry = _checked_asymmetry(gram)
+        asymmetry = _checked_asymmetry(gram, max(largest, np.max(np.abs(gram))))
         squares, weights = scipy.linalg.eigh(_symmetric(gram), driver="evd")
         largest = max(largest, np.max(squares))
         rounding = max(asymmetry, ROUNDING**2 * largest)
@@ -139,7 +138,7 @@ def eigenpairs_of_jacobian(jacobian: NDArray, prior: PriorCovariance, tolerance:
         vectors.append(scaled @ images)
         duals.append(scaled @ rows)
         rows = second.T @ rows
-    neglected = rounding if len(rows) and count else 0.0
+    neglected = rounding if len(rows) else 0.0
     empty = np.zeros((0, prior.size))
     return MisfitEigenpairs(
         np.concatenate([np.zeros(0), *values]),
@@ -453,20 +452,18 @@ def _symmetric(matrix):
     return 0.5 * (matrix + matrix.T)
 
 
-def _checked_asymmetry(matrix, scale=None):
+def _checked_asymmetry(matrix, scale):
     """Return the norm of the difference of a matrix from its transpose.
 
     Raises
     ------
     DerivativeError
-        If it is large relative to the matrix, or to the given scale.
+        If it is large relative to the given scale.
     NonFiniteError
         If the matrix is not finite.
     """
     check_finite("the Hessian of the misfit, in the metric of the prior,", matrix, advice=RESCALE)
     difference = float(np.linalg.norm(matrix - matrix.T))
-    if scale is None:
-        scale = float(np.max(np.abs(matrix), initial=0.0))
     if difference > ASYMMETRY * scale:
         raise DerivativeError(NOT_SYMMETRIC.format(difference / scale))
     return difference

@@ -51,7 +51,7 @@ NO_ROOT = (
 OTHER_ROOT = "prior_root must satisfy R @ R.T = prior, but the products of {} differ by {:.1e}"
 
 
-class Block(Uncached):
+class PriorBlock(Uncached):
     """The prior covariance of one part of the flattened unknowns: a variance, or an Operator.
 
     Parameters
@@ -288,7 +288,7 @@ class PriorCovariance:
 
     Attributes
     ----------
-    blocks : list of Block
+    blocks : list of PriorBlock
     size : int
         The number of unknowns n.
 
@@ -350,7 +350,7 @@ def _blocks(prior, root, packing):
     if keys(prior) is None:
         shape = packing.values[0].shape if len(packing.values) == 1 else (packing.size,)
         covariance = _checked("the prior", prior, shape, "x" if len(packing.values) == 1 else "the flattened x")
-        return [Block("the prior", covariance, slice(0, packing.size), _checked_root(root, shape))]
+        return [PriorBlock("the prior", covariance, slice(0, packing.size), _checked_root(root, shape))]
     roots = [None] * len(packing.values)
     if root is not None:
         roots = _in_order(root, packing, "prior_root")
@@ -362,7 +362,7 @@ def _blocks(prior, root, packing):
     ):
         checked = _checked(name, covariance, value.shape, name.replace("prior", "x", 1))
         part = slice(start, start + value.size)
-        blocks.append(Block(name, checked, part, _checked_root(own_root, value.shape)))
+        blocks.append(PriorBlock(name, checked, part, _checked_root(own_root, value.shape)))
         start = part.stop
     return blocks
 
