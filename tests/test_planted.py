@@ -895,6 +895,24 @@ BUGS = {
         "tests/trajectory/test_rollout.py tests/trajectory/test_rollout_kinds.py",
     ),
     # ---- optimize, blackbox, network
+    "backward passes of constraints that are repeated": Bug(
+        "optimize/constrained_problem.py",
+        "product = self._products.find((v,))",
+        "product = None",
+        "tests/optimize/test_minimize_constraints.py",
+    ),
+    "a failed adjoint solve of a constraint that ends the run": Bug(
+        "optimize/constrained_problem.py",
+        "            if point is self.start:\n                raise\n",
+        "            raise\n",
+        "tests/optimize/test_minimize_constraints.py",
+    ),
+    "a penalty that grows faster than the inner searches converge": Bug(
+        "optimize/augmented_lagrangian.py",
+        "has_not_fallen and violation > inaccuracy and",
+        "has_not_fallen and",
+        "tests/optimize/test_minimize_constraints.py",
+    ),
     "multipliers with the wrong sign": Bug(
         "optimize/constraints.py",
         "function.in_shape(function.cotangent(part)) for",

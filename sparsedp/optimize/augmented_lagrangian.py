@@ -104,14 +104,15 @@ class AugmentedFunction:
 
     def of_point(self, point: Point) -> Evaluation:
         """Return the augmented Lagrangian and its gradient at a point."""
+        estimates = self.estimates(point)
+        slope = self._problem.derive(point, lambda: point.vjp(estimates))
         if point.refused:
             return Evaluation(point.z, np.inf, np.full_like(point.z, np.nan))
-        estimates = self.estimates(point)
         # (t - y) (t + y) / (2 p), where t - y has no cancellation unless t is 0
         added = (estimates - self._multipliers) * (estimates + self._multipliers) / (2.0 * self._penalty)
         value = point.value + float(np.sum(added))
         rounding = self._problem.packing.eps * max(abs(point.value), float(np.sum(np.abs(added))))
-        return Evaluation(point.z, value, point.gradient + point.vjp(estimates), rounding)
+        return Evaluation(point.z, value, point.gradient + slope, rounding)
 
     def __call__(self, z: NDArray[np.float64], below: float = np.inf) -> Evaluation:
         """Return the augmented Lagrangian at z; infinity if the loss or a constraint cannot be evaluated."""

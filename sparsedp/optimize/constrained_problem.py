@@ -12,8 +12,11 @@ from sparsedp._utils.pytree import norm, power_of_two
 from sparsedp.optimize.box import Box
 from sparsedp.optimize.objective import REFUSALS, Objective
 from sparsedp.optimize.result import Evaluation, Failure
+from sparsedp.solvers.cache import Cache
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from sparsedp.autodiff.flattening import Packing
@@ -55,6 +58,8 @@ class Point:
 
     def __init__(self, problem: ConstrainedProblem, evaluation: Evaluation, constraints: ConstraintValues | None):
         self._x_unit = problem.x_unit
+        self._failed = False
+        self._products = Cache(1)
         self.evaluation = evaluation
         self.constraints = constraints
         self.z = evaluation.point / problem.x_unit
@@ -70,12 +75,19 @@ class Point:
     @property
     def refused(self) -> bool:
         """Whether the loss or a constraint raised an error or was not finite."""
-        return self.evaluation.refused or self.constraints is None
+        return self.evaluation.refused or self.constraints is None or self._failed
+
+    def refuse(self) -> None:
+        """Mark the point as refused, because a derivative of a constraint could not be computed."""
+        self._failed = True
 
     def vjp(self, v: NDArray[np.float64]) -> Any:
-        """Return J^T v, where J is the Jacobian of the rows."""
+        """Return J^T v, where J is the Jacobian of the rows. The last product is stored."""
         assert self.constraints is not None
-        return self._x_unit * self.constraints.vjp(v)
+        product = self._products.find((v,))
+        if product is None:
+            product = self._products.put((v,), self._x_unit * self.constraints.vjp(v))
+        return product
 
     def constraint_values(self, constraints: Constraints) -> Any:
         """Return the values of the constraint functions, in the structure and the units of the user."""
@@ -174,12 +186,29 @@ class ConstrainedProblem:
         self._points = [(np.array(z), point), *self._points[: STORED_POINTS - 1]]
         return point
 
+    def derive(self, point: Point, derivative: Callable[[], Any]) -> Any:
+        """Return a derivative of the constraints at a point.
+
+        If it cannot be computed, the point is refused, and None is returned. At the start the exception is raised.
+        """
+        if point.refused:
+            return None
+        try:
+            return derivative()
+        except REFUSALS as error:
+            if point is self.start:
+                raise
+            self.objective.failures.append(Failure(type(error).__name__, str(error)))
+            point.refuse()
+            return None
+
     def functions(self, z: NDArray[np.float64]) -> Functions:
         """Return the functions at z as finite numbers, for libraries that cannot use infinity and NaN.
 
         A refused point has a very large loss, and the rows and derivatives of the last point that was not refused.
         """
         point = self.at(z)
+        self.derive(point, lambda: point.jacobian)
         if point.refused:
             usable = self._last_usable
             return Functions(REFUSED_VALUE, usable.gradient, usable.rows, usable)
@@ -276,11 +305,12 @@ class Violation:
 
     def of_point(self, point: Point) -> Evaluation:
         """Return the value and the gradient at a point."""
+        signed = point.signed_violations
+        gradient = self._problem.derive(point, lambda: point.vjp(signed))
         if point.refused:
             return Evaluation(point.z, np.inf, np.full_like(point.z, np.nan))
-        signed = point.signed_violations
         value = 0.5 * float(np.dot(signed, signed))
-        return Evaluation(point.z, value, point.vjp(signed), self._problem.packing.eps * value)
+        return Evaluation(point.z, value, gradient, self._problem.packing.eps * value)
 
     def __call__(self, z: NDArray[np.float64], below: float = np.inf) -> Evaluation:
         """Return the value and the gradient at z."""

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 __all__ = ["ConstraintValues", "Constraints", "Equality", "equal"]
 
 FINITE = "must be finite; start where every constraint is"
+FINITE_DERIVATIVE = "must be finite; start where every constraint has derivatives"
 SCIPY_DICT = {"type", "fun"}  # keys of a constraint of scipy.optimize.minimize that is a dict
 
 
@@ -241,7 +242,9 @@ class LinearizedOutputs:
         if self._matrix is not None:
             return np.asarray(self._matrix.T @ w).reshape(-1)
         cotangent = w.reshape(self.value.shape).astype(self.value.dtype)
-        return self._packing.pack_gradient(self._pull(cotangent))
+        gradient = joined(self._packing.slopes(self._pull(cotangent)))
+        check_finite(f"a derivative of {self._name}", gradient, FINITE_DERIVATIVE)
+        return gradient
 
     def jacobian(self) -> NDArray[np.float64]:
         """Return the matrix J of shape (k, n), by backward passes for its rows or forward passes for its columns."""
@@ -463,6 +466,10 @@ def _constraint_of_scipy(entry, packing, name):
 
     if hasattr(entry, "A"):
         matrix = entry.A if sp.issparse(entry.A) else np.atleast_2d(np.asarray(entry.A, dtype=float))
+        if matrix.shape[1] != packing.size:
+            raise ShapeError(
+                f"{name}: A must have a column for each of the {packing.size} unknowns, got shape {matrix.shape}"
+            )
 
         def product(vector):
             return matrix @ np.asarray(vector, dtype=float)

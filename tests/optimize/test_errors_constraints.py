@@ -6,7 +6,7 @@ import sys
 import autograd.numpy as anp
 import numpy as np
 import pytest
-from scipy.optimize import NonlinearConstraint
+from scipy.optimize import LinearConstraint, NonlinearConstraint
 
 import sparsedp as dp
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
@@ -93,6 +93,16 @@ WRONG = [
         run(NonlinearConstraint(lambda x: x, 1.0, 0.0)),
         ValueError,
         "constraints: lb must be <= ub, got 1 > 0",
+    ),
+    (
+        run(LinearConstraint(np.ones((2, 3)), 0.0, 1.0)),
+        ShapeError,
+        "constraints: A must have a column for each of the 2 unknowns, got shape (2, 3)",
+    ),
+    (
+        run(lambda x: anp.sum(anp.sqrt(x)) - 1.0, start=(0.0, 0.0)),
+        NonFiniteError,
+        "a derivative of constraints must be finite; start where every constraint has derivatives, got 2 that are NaN",
     ),
     (
         run(NonlinearConstraint(lambda x: x, np.nan, 0.0)),

@@ -196,9 +196,9 @@ def active_set(matrix, target, weight, limit):
     raise AssertionError("the active set does not settle")
 
 
-@pytest.mark.parametrize("cells", [6, pytest.param(20, marks=WHOLE)])
-def test_a_limit_in_each_cell_against_active_sets(cells):
-    """The penalty must not grow faster than the inner searches converge: with 400 limits it once did."""
+@pytest.mark.parametrize("cells, inner", [(6, 5), pytest.param(20, 50, marks=WHOLE)])
+def test_a_limit_in_each_cell_against_active_sets(cells, inner):
+    """The penalty must not grow faster than the inner searches converge."""
     grid = dp.Grid((cells, cells), size=1.0)
     minus_laplacian = -dp.laplacian(grid, dp.dirichlet)
     temperature_of = dp.inverse(minus_laplacian)
@@ -214,7 +214,8 @@ def test_a_limit_in_each_cell_against_active_sets(cells):
         "augmented_lagrangian",
         constraints=lambda source: temperature_of(source) - 0.6,
         tolerance=1e-8,
-        maxiter=3000,
+        maxiter=500,
+        inner=inner,
     )
     matrix = np.linalg.inv(minus_laplacian.matrix.toarray())
     source, multipliers = active_set(matrix, target.ravel(), 1e-3, 0.6)
@@ -455,6 +456,42 @@ def test_points_that_cannot_be_evaluated_are_avoided(method, error):
     with np.errstate(invalid="ignore"):
         best = dp.minimize(loss, np.full(2, 0.2), method, constraints=constraint, maxiter=100, tolerance=1e-5)
     assert best.converged and np.allclose(best.x, 1.0, atol=1e-4)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_adjoint_solves_that_fail_at_a_trial_point(method):
+    """The constraint has a value everywhere, but beyond x[0] == 1.5 its backward pass raises."""
+
+    def backward(nums, ans, x):
+        def pull(g):
+            if x > 1.5:
+                raise dp.errors.ConvergenceError("no adjoint solution")
+            return (g,)
+
+        return pull
+
+    identity = dp.differentiable("identity", lambda x: 1.0 * x, backward)
+    constraint = lambda x: identity(x[0]) + x[1] - 2.0
+    loss = lambda x: anp.sum((x - 2.0) ** 2)
+    best = dp.minimize(loss, np.full(2, 0.2), method, constraints=constraint, maxiter=100, tolerance=1e-5)
+    assert best.converged and np.allclose(best.x, 1.0, atol=1e-4)
+
+
+def test_one_backward_pass_of_the_constraints_in_an_evaluation():
+    passes = []
+
+    def backward(nums, ans, x):
+        def pull(g):
+            passes.append(1)
+            return (g,)
+
+        return pull
+
+    identity = dp.differentiable("identity", lambda x: 1.0 * x, backward)
+    loss = lambda x: anp.sum((x - 2.0) ** 2)
+    constraint = lambda x: identity(x) - 1.0
+    best = dp.minimize(loss, np.full(3, 1.2), "augmented_lagrangian", constraints=constraint)
+    assert best.converged and len(passes) <= best.evaluations + 12  # the unit, and updates of the multipliers
 
 
 @pytest.mark.parametrize("method", METHODS)
