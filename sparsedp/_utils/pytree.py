@@ -52,6 +52,7 @@ __all__ = [
 ]
 
 BRANCHES = tuple, list, dict  # types of containers except dataclasses
+LEAVES = {np.ndarray, float, int, str, bool, type(None), np.float64}  # the most frequent types of leaves
 DEEPEST = 100  # largest depth of nested containers; deeper recursion could exceed Python's limit
 # Products of four numbers between these limits, times a moderate factor, neither overflow nor underflow.
 SMALL = 2.0**-200
@@ -138,6 +139,8 @@ class TreeStructure:
 
     def variables(self, tree: Any, name: str = "tree", **options: Any) -> list:
         """Return the variables of a tree that must have this structure, in the order of the latter; see `paired`."""
+        if self.is_leaf and keys(tree) is None and not options:
+            return [tree]
         entries = paired(tree, self.template, name, **options)
         return [entries[place] for place in self.places]
 
@@ -173,6 +176,8 @@ def is_branch(tree: Any) -> bool:
 
 def keys(tree: Any) -> Any:
     """Return the keys of the entries of a container, see `child`; None for a leaf."""
+    if type(tree) in LEAVES:
+        return None
     if isinstance(tree, dict):
         return tree.keys()
     if isinstance(tree, (tuple, list)):

@@ -208,6 +208,8 @@ def check_leaves(name: str, tree: Any, containers: bool = True) -> None:
 def hidden_leaves(value: Any) -> list:
     """Return the leaves inside a container that is not a tree: some dataclasses, and Mappings that are not dicts."""
     hidden: list = []
+    if type(value) in PLAIN_LEAVES or type(value) is np.ndarray:
+        return hidden
     pending = [value]
     seen = set()  # a dataclass may contain itself
     while pending:

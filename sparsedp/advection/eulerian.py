@@ -108,6 +108,52 @@ class Eulerian(TransportMethod):
         return out
 
     @cached_property
+    def _is_one_loop(self) -> bool:
+        """Whether a step, and its VJP, is one call of a compiled loop."""
+        is_simple = self.scheme.stages == EULER and self.interpolation is None and self.settings.solid is None
+        return is_simple and len(self.settings.space.parts) == 1 and not self._repeated[0].size
+
+    def bound_forward(self) -> Callable[..., NDArray]:
+        """Return a function that returns what `forward` returns, with less overhead."""
+        forward = self.forward
+        if not _has_compiled_loops() or not self._is_one_loop:
+            return forward
+        new_field = self._new_field
+        stage = self._loops.stages[0]
+        slopes = self._loops.no_slopes[0][0]
+
+        def one_loop(u, v, dt, inflow):
+            out = new_field()
+            invalid = stage(u, slopes, v, dt, inflow, u, 0.0, out)
+            if invalid or (inflow.size and not isfinite(inflow.sum())):
+                return forward(u, v, dt, inflow)  # raises an error, or finds that the sum overflows
+            return out
+
+        return one_loop
+
+    def bound_vjp(self, nums: Sequence[int]) -> Callable[..., tuple[Sequence[Any], bool]]:
+        """Return a function that returns what `vjp` returns, with less overhead."""
+        if not _has_compiled_loops() or not self._is_one_loop or not {FIELD, VELOCITY} >= set(nums):
+            return super().bound_vjp(nums)
+        new_arrays = [{FIELD: self._new_field, VELOCITY: self._new_velocity}[num] for num in nums]
+        field_place = nums.index(FIELD) if FIELD in nums else None
+        velocity_place = nums.index(VELOCITY) if VELOCITY in nums else None
+        vjp = self._loops.vjps[0]
+        slopes, partials = self._loops.no_slopes[0]
+
+        def one_loop(g, u, v, dt, inflow):
+            cotangents = [new() for new in new_arrays]
+            of_u = EMPTY if field_place is None else cotangents[field_place]
+            of_w = EMPTY if velocity_place is None else cotangents[velocity_place]
+            if not g.flags.c_contiguous:
+                g = np.ascontiguousarray(g)
+            of_inflow = np.zeros(inflow.size)
+            invalid = vjp(g, u, slopes, partials, v, dt, inflow, of_u, of_inflow, of_w, True)
+            return cotangents, not invalid and (not inflow.size or isfinite(of_inflow.sum()))
+
+        return one_loop
+
+    @cached_property
     def _repeated(self) -> tuple[NDArray, NDArray]:
         """The inflow values that stand for the value of a point, and these points; see `Component`."""
         components = self.reference.components
@@ -263,6 +309,13 @@ class CompiledLoops:
     ----------
     reference : SparseReference
         The same scheme implemented by sparse matrices, which holds the tables of the components.
+
+    Attributes
+    ----------
+    stages, vjps : lists of callables
+        For each component a function that runs the loop `stage`, and one that runs `vjp` and `slope_vjp`.
+    no_slopes : list
+        For each component the empty slopes of a first-order scheme.
     """
 
     def __init__(self, reference: SparseReference) -> None:
@@ -275,9 +328,9 @@ class CompiledLoops:
         else:
             self.slopes_per_axis = 2
         self.least_weight = 1.0 - self.scheme.max_courant - ROUNDING
-        self._no_slopes = [self._empty_slopes(component, 0, 0) for component in self.components]
-        self._stages = [self._bound_stage(component) for component in self.components]
-        self._vjps = [self._bound_vjp(component) for component in self.components]
+        self.no_slopes = [self._empty_slopes(component, 0, 0) for component in self.components]
+        self.stages = [self._bound_stage(component) for component in self.components]
+        self.vjps = [self._bound_vjp(component) for component in self.components]
 
     def _bound_stage(self, part: Component) -> Callable[..., float]:
         """Return a function that runs the loop `stage` for a component of given fields."""
@@ -332,7 +385,7 @@ class CompiledLoops:
         The derivatives are empty if `partials` is False. For a first-order scheme the slopes are empty too.
         """
         if self.slope_loop is None:
-            return self._no_slopes
+            return self.no_slopes
         result = []
         for part in self.components:
             slopes, derivatives = self._empty_slopes(part, part.points, part.points if partials else 0)
@@ -365,7 +418,7 @@ class CompiledLoops:
             Number of weights below the stability limit plus the number of results that are not finite.
         """
         total = 0.0
-        for act, (values, _) in zip(self._stages, slopes):
+        for act, (values, _) in zip(self.stages, slopes):
             total += act(u, values, w, dt, inflow, first_field, keep, out)
         return total
 
@@ -394,7 +447,7 @@ class CompiledLoops:
             Number of values of `of_u` (before the contribution of the slopes) and `of_w` that are not finite.
         """
         total = 0.0
-        for act, (values, partials) in zip(self._vjps, slopes):
+        for act, (values, partials) in zip(self.vjps, slopes):
             total += act(g, u, values, partials, w, dt, inflow, of_u, of_inflow, of_w, of_w_is_set)
         return total
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from sparsedp.advection.settings import FIELD, INFLOW, VELOCITY, TransportSettin
 from sparsedp.advection.velocity_interpolation import velocity_interpolation
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -83,6 +83,14 @@ class TransportMethod:
     def interpolation(self) -> Operator | None:
         """Operator that interpolates the velocity to where the scheme needs it; None if it is given there."""
         return velocity_interpolation(self.settings)
+
+    def bound_forward(self) -> Callable[..., NDArray]:
+        """Return a function that returns what `forward` returns; a subclass may return one with less overhead."""
+        return self.forward
+
+    def bound_vjp(self, nums: Sequence[int]) -> Callable[..., tuple[Sequence[Any], bool]]:
+        """Return a function ``pull(g, u, v, dt, inflow)`` that returns what `vjp` returns, see `bound_forward`."""
+        return partial(self.vjp, nums)
 
     def interpolate_velocity(self, v: NDArray) -> NDArray:
         """Return the velocity where the scheme needs it, axis by axis for each component of the field."""

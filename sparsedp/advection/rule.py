@@ -40,8 +40,10 @@ def rule_of(method: TransportMethod) -> Rule:
         if flatten is None:
             return forward
 
+        step = method.bound_forward()
+
         def bound_forward(u, v, dt, inflow):
-            return method.forward(*flatten(u, v, dt, inflow)).reshape(space.shape)
+            return step(*flatten(u, v, dt, inflow)).reshape(space.shape)
 
         return bound_forward
 
@@ -91,6 +93,7 @@ def _bound_pull(method: TransportMethod, nums: Sequence[int], values: Sequence, 
     """
     shapes = [np.shape(values[num]) for num in nums]
     is_direct = not {STEP, INFLOW} & set(nums)
+    bound_vjp = method.bound_vjp(nums)
     velocity_place = None
     if VELOCITY in nums:
         velocity_place = nums.index(VELOCITY)
@@ -98,7 +101,7 @@ def _bound_pull(method: TransportMethod, nums: Sequence[int], values: Sequence, 
     def pull(g, u, v, dt, inflow, sums=()):
         adds = sums and velocity_place is not None and sums[velocity_place] is not None
         if is_direct and not adds and type(g) is np.ndarray and g.dtype == FLOAT:
-            cotangents, finite = method.vjp(nums, g.reshape(-1), *flatten(u, v, dt, inflow))
+            cotangents, finite = bound_vjp(g.reshape(-1), *flatten(u, v, dt, inflow))
             if finite or all(map(surely_finite, cotangents)):
                 return [cotangent.reshape(shape) for cotangent, shape in zip(cotangents, shapes)]
         return _pull(method, nums, (u, v, dt, inflow), g, sums, flatten, args_are_plain=True)

@@ -389,11 +389,16 @@ class Recorded:
         outputs, results = self.results(variables)
         return outputs.build(results)
 
-    def results(self, variables: Sequence) -> tuple[Outputs, tuple]:
-        """Return the outputs of the function, and their values by its program, checked once."""
+    def outputs(self) -> Outputs:
+        """Return the outputs of the function."""
         if self._value is None:
             self._value = self._record_value()
-        run, outputs = self._value
+        return self._value[1]
+
+    def results(self, variables: Sequence) -> tuple[Outputs, tuple]:
+        """Return the outputs of the function, and their values by its program, checked once."""
+        outputs = self.outputs()
+        run, _ = self._value
         results = run(*self.dense(variables))
         if not self._value_is_checked and self._is_to_be_checked(variables):
             check_program(self.name, self.call(self.arguments(variables)), outputs.build(results), self.eps)
@@ -491,7 +496,15 @@ class Outputs:
     ----------
     slots : list of Slot
         The leaves that the program computes. They share no memory with each other and with the inputs.
+    state_places : list of int or None
+        If the function is the step of a rollout and keeps the form of the state: for each variable of the state its
+        position among the slots. A rollout sets it.
+    state_is_known : bool
+        Whether a rollout has set `state_places`.
     """
+
+    state_places: list[int] | None = None
+    state_is_known = False
 
     def __init__(self, trace: ProgramTrace, inputs: Sequence[Slot], result: Any) -> None:
         trace.check()

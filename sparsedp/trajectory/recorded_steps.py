@@ -16,6 +16,7 @@ from sparsedp.trajectory.step_runner import State, StepRunner
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from sparsedp.autodiff.jit import Outputs
     from sparsedp.trajectory.specification import RolloutSpecification
 
 __all__ = ["recorded_runner"]
@@ -75,19 +76,34 @@ class RecordedStepRunner(StepRunner):
             nums = tuple(num for num, root in enumerate(roots) if root)
             self._program = self._recorded.pullback(nums, variables)
             outputs = self._program.outputs
-            results, _ = self._program.forward(variables)
         else:
-            outputs, results = self._recorded.results(variables)
-        # Raises an error if the result of the step does not have the form of the state.
-        _, values, _, _ = specification.state.take(outputs.build(results), "the step", self.number, self.outer)
-        slots = specification.state.variables(outputs.build(outputs.slots))
-        returned = specification.state.variables(outputs.build(results))
-        self.keeps_form = all(map(_is_same_kind, returned, values)) and all(type(slot) is Slot for slot in slots)
+            outputs = self._recorded.outputs()
+        if not outputs.state_is_known:
+            outputs.state_places = self._state_places(outputs, variables)
+            outputs.state_is_known = True
+        self.keeps_form = outputs.state_places is not None
         # For each variable of the state its position among the results of the program.
-        self._order = [outputs.slots.index(slot) for slot in slots] if self.keeps_form else []
+        self._order = outputs.state_places or []
         # For each result of the program the position of its variable in the state.
         self._places = [self._order.index(place) for place in range(len(self._order))]
         self._differentiated_params = [root for root in self.param_roots if root]
+
+    def _state_places(self, outputs: Outputs, variables: Sequence) -> list[int] | None:
+        """Return for each variable of the state its position among the results of the program.
+
+        Return None if the step does not keep the form of the state. Raise an error if its result is no such state.
+        """
+        if self._program is None:
+            _, results = self._recorded.results(variables)
+        else:
+            results, _ = self._program.forward(variables)
+        form = self.specification.state
+        _, values, _, _ = form.take(outputs.build(results), "the step", self.number, self.outer)
+        slots = form.variables(outputs.build(outputs.slots))
+        returned = form.variables(outputs.build(results))
+        if not (all(map(_is_same_kind, returned, values)) and all(type(slot) is Slot for slot in slots)):
+            return None
+        return [outputs.slots.index(slot) for slot in slots]
 
     def _variables(self, state: State) -> list:
         """Return the variables of the arguments of the step that begins at a state."""
