@@ -24,8 +24,8 @@ __all__ = ["EUCLIDEAN", "Euclidean", "Metric"]
 
 COUPLING = 1e-9  # an operator with relative off-diagonal parts below this is diagonal
 ASYMMETRY = 1e-8  # tolerated relative difference of u.Mv and v.Mu, because the metric may be an iterative solve
-ROUNDINGS = 1e3  # u.Mu is 0 if it is below this multiple of the rounding error of |u| |Mu|
-INACCURACY = 1e-4  # tolerated relative difference of u and M^-1 M u
+ROUNDINGS = 10  # u.Mu is 0 if it is below this multiple of the rounding error of |u| |Mu|
+INACCURACY = 0.1  # tolerated relative residual of a solve with M; near 1 if M is singular
 SINGULAR = "{} must not be singular, and {} is; add a multiple of dp.identity"
 
 
@@ -270,12 +270,13 @@ def _inverse(op, name):
         if isinstance(op, Inverse):
             inverted = op.solver.system.unscaled
             null_space = op.solver.system.null_space
+            residual = inverted.apply(op.apply(test)) - test
         else:
             inverted = inverse(op, nullspace="project")
             null_space = inverted.solver.system.null_space
-        difference = inverted.apply(op.apply(test)) - test
+            residual = op.apply(inverted.apply(test)) - test
     except ConvergenceError as error:
         raise ValueError(f"{name} has no inverse: {error}") from None
-    if null_space.count or not norm(difference) <= INACCURACY * norm(test):
+    if null_space.count or not norm(residual) <= INACCURACY * norm(test):
         raise ValueError(SINGULAR.format(name, op.name))
     return inverted.apply

@@ -114,6 +114,13 @@ def test_the_scale_of_the_metric_does_not_matter(method):
     assert np.allclose(huge.x, dp.minimize(saddle, 0.1 * TARGET, method, 6, metric=SMOOTH).x, rtol=1e-6)
 
 
+def test_a_metric_that_is_nearly_singular():
+    """The condition number is 1e13, and the mean of the step is that of the gradient."""
+    metric = dp.identity(GRID.cells) - 2e10 * dp.laplacian(GRID)
+    best = dp.minimize(lambda x: anp.sum((x - TARGET) ** 2), np.zeros(9), "gd", 1, rate=0.5, metric=metric)
+    assert np.allclose(best.x, np.mean(TARGET), rtol=1e-3)
+
+
 @pytest.mark.parametrize("method", MOSTLY_WHOLE)
 def test_the_identity_is_no_metric(method):
     plain, identity = (dp.minimize(valley, TARGET, method, 5, metric=m) for m in (None, dp.identity(GRID.cells)))
