@@ -92,20 +92,28 @@ class LeastSquaresMethod(Method):
 
 
 def _damped_step(
-    current: Evaluation, linearization: Linearization, objective: Objective, damping: float, unit: float
+    current: Evaluation,
+    linearization: Linearization,
+    objective: Objective,
+    damping: float,
+    unit: float,
+    accuracy: float,
 ) -> NDArray[np.float64]:
-    """Return the minimizer d of |J d + r|^2 + damping |unit d|^2, subject to the bounds on the current point + d."""
+    """Return the minimizer d of |J d + r|^2 + damping |unit d|^2, subject to the bounds on the current point + d.
+
+    `accuracy` is the relative tolerance of LSMR, if there are no bounds and J is not formed.
+    """
     if not objective.box.bounded:
-        return _unbounded_step(linearization, linearization.flat, damping, unit)
+        return _unbounded_step(linearization, linearization.flat, damping, unit, accuracy)
     problem = BoundedLeastSquares(current, linearization, objective.box, damping, unit)
 
-    def solve(restricted, r):
-        return _unbounded_step(restricted, r, damping, unit)
+    def solve(restricted, r):  # with bounds, signs of multipliers decide; they need an accurate solution
+        return _unbounded_step(restricted, r, damping, unit, LSMR_ACCURACY)
 
     return problem.minimum(solve, objective.free(current))
 
 
-def _unbounded_step(linearization, r, damping, unit):
+def _unbounded_step(linearization, r, damping, unit, accuracy):
     """Return the minimizer d of |J d + r|^2 + damping |unit d|^2, without bounds."""
     if linearization.dense:
         jacobian = linearization.jacobian()
@@ -118,7 +126,7 @@ def _unbounded_step(linearization, r, damping, unit):
         lambda w: linearization.vjp(w) / unit,
         dtype=float,
     )
-    solution = lsmr(product, r, damp=np.sqrt(damping), atol=LSMR_ACCURACY, btol=LSMR_ACCURACY, conlim=LSMR_CONDITION)
+    solution = lsmr(product, r, damp=np.sqrt(damping), atol=accuracy, btol=accuracy, conlim=LSMR_CONDITION)
     return -solution[0] / unit
 
 
@@ -145,7 +153,7 @@ def _negated_dense_step(jacobian, r, damping):
 
 
 def _advance_damped(
-    state: SquaresState, linearization: Linearization, objective: Objective, failure: str
+    state: SquaresState, linearization: Linearization, objective: Objective, failure: str, accuracy: float
 ) -> SquaresState:
     """Return the state after a damped step; the damping is increased until the step decreases the loss.
 
@@ -162,7 +170,7 @@ def _advance_damped(
         damping = state.damping
         growth = 2.0
         for _ in range(HALVINGS):
-            step = _damped_step(current, linearization, objective, damping, unit)
+            step = _damped_step(current, linearization, objective, damping, unit, accuracy)
             point = objective.box.moved(current.point, step)
             change = linearization.jvp(point - current.point)
             yield point, -float(np.dot(change, linearization.flat + 0.5 * change)), damping
@@ -213,6 +221,9 @@ class GaussNewton(LeastSquaresMethod):
         its shorter side is at most 4000.
     absolute_sigma : bool
         True if the residuals were divided by their standard deviations; the covariance is then (J^T J)^(-1).
+    accuracy : float
+        Relative tolerance of LSMR, which computes a step if J is not formed and there are no bounds. With 1e-2 or 1e-3
+        a step takes fewer products, and the search more steps.
 
     Notes
     -----
@@ -230,9 +241,11 @@ class GaussNewton(LeastSquaresMethod):
     apart: bool = False
     dense: bool | None = None
     absolute_sigma: bool = False
+    accuracy: float = LSMR_ACCURACY
 
     def __post_init__(self) -> None:
         self._check_common_options()
+        check_number("accuracy of gauss_newton", self.accuracy, "from 0 to below 1", "; the default is 1e-10")
         self.forms_jacobian = self.dense
 
     def advance(self, state: SquaresState, objective: Objective) -> SquaresState:
@@ -242,7 +255,7 @@ class GaussNewton(LeastSquaresMethod):
         unit = state.unit or safe_unit(_largest_column_norm(linearization))
         state = state._replace(unit=unit)
         if not state.damping:
-            step = _damped_step(current, linearization, objective, 0.0, unit)
+            step = _damped_step(current, linearization, objective, 0.0, unit, self.accuracy)
             try:
                 evaluation, _, share_of_decrease = backtracked(
                     current, step, objective, "the Gauss-Newton step", UNDAMPED_LENGTHS
@@ -258,7 +271,7 @@ class GaussNewton(LeastSquaresMethod):
         if not state.damping:
             state = state._replace(damping=FIRST_DAMPING * largest_diagonal or 1.0)
         failure = "no lower point along the Gauss-Newton step, damped or not"
-        state = _advance_damped(state, linearization, objective, failure)
+        state = _advance_damped(state, linearization, objective, failure, self.accuracy)
         if state.damping <= LEAST_DAMPING * largest_diagonal:
             state = state._replace(damping=0.0)
         return state
@@ -272,7 +285,7 @@ class LevenbergMarquardt(LeastSquaresMethod):
     ----------
     damping : float
         Initial damping, relative to the largest diagonal entry of J^T J.
-    apart, dense, absolute_sigma
+    apart, dense, absolute_sigma, accuracy
         As for gauss_newton.
 
     Notes
@@ -291,10 +304,12 @@ class LevenbergMarquardt(LeastSquaresMethod):
     apart: bool = False
     dense: bool | None = None
     absolute_sigma: bool = False
+    accuracy: float = LSMR_ACCURACY
 
     def __post_init__(self) -> None:
         check_number("damping of levenberg_marquardt", self.damping, "> 0", "; the default is 1e-3")
         self._check_common_options()
+        check_number("accuracy of levenberg_marquardt", self.accuracy, "from 0 to below 1", "; the default is 1e-10")
         self.forms_jacobian = self.dense
 
     def advance(self, state: SquaresState, objective: Objective) -> SquaresState:
@@ -304,7 +319,7 @@ class LevenbergMarquardt(LeastSquaresMethod):
             size = _largest_column_norm(linearization)
             unit = safe_unit(size)
             state = state._replace(unit=unit, damping=self.damping * (size / unit) ** 2 or 1.0)
-        return _advance_damped(state, linearization, objective, "no damping gives a lower point")
+        return _advance_damped(state, linearization, objective, "no damping gives a lower point", self.accuracy)
 
 
 @dataclass

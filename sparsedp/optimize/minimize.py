@@ -165,9 +165,11 @@ def minimize(
         gauss_newton         apart           False         True: residuals along axis 0 are samples, see below
         gauss_newton         dense           None          True: form the Jacobian; None: form it if it is small
         gauss_newton         absolute_sigma  False         True: residuals have unit variance, see below
+        gauss_newton         accuracy        1e-10         relative tolerance of a step if the Jacobian is not formed
         levenberg_marquardt  damping         1e-3          initial damping, relative to the largest entry of diag(J^T J)
         levenberg_marquardt  apart, dense    same          as for gauss_newton
         levenberg_marquardt  absolute_sigma  False         as for gauss_newton
+        levenberg_marquardt  accuracy        1e-10         as for gauss_newton
         half_inverse         rate            1.0           factor of the step
         half_inverse         power           0.75          the exponent p in the step J^T (J J^T)^-p r
         half_inverse         truncation      1e-10         see `update_direction`
