@@ -17,18 +17,21 @@ from sparsedp._utils.counters import active, thread
 from sparsedp._utils.pytree import TreeStructure, child, flatten, keys, labels, leaves, placed
 from sparsedp._utils.validation import check_function, check_leaves, check_native
 from sparsedp.autodiff.backend import ARRAY_KINDS
-from sparsedp.autodiff.derivative import gradient_of, hvp, random_like, taped, value_and_grad, zero_like
+from sparsedp.autodiff.derivative import forward, gradient_of, hvp, random_like, taped, value_and_grad, zero_like
 from sparsedp.autodiff.program import compile_program, free_slots, needed_calls
 from sparsedp.autodiff.program_trace import ProgramTrace, Slot, opaque, open_traces, refuse_outer_trace
 from sparsedp.autodiff.tape import (
+    ForwardNode,
     Rule,
     VJPNode,
     dtype_of,
+    forward_root,
     innermost,
     is_fresh,
     is_recorded,
     is_variable,
     isbox,
+    new_box,
     new_trace,
     recording_trace,
     sample,
@@ -78,8 +81,8 @@ def jit(function: Callable, check: bool = True) -> Jitted:
     Returns
     -------
     Jitted
-        A function with the same arguments and results. `value_and_grad`, `grad`, `vjp`, `hvp`, `minimize` and `rollout`
-        use its programs. On a tape each call is one node. In `jvp`, in nested derivatives and for distributed fields it
+        A function with the same arguments and results. `value_and_grad`, `grad`, `vjp`, `jvp`, `hvp`, `minimize` and
+        `rollout` use its programs. On a tape each call is one node. In nested derivatives and for distributed fields it
         calls the function itself.
 
     Raises
@@ -136,6 +139,7 @@ class Jitted(Reconstructible):
         self._recorded: dict[Any, Recorded] = {}
         self._gradients: dict[int, Jitted] = {}
         self._hessian_product: Jitted | None = None
+        self._tangents: dict[tuple[int, ...], Jitted] = {}
         self._lock = RLock()
         self._warned = False
         self._is_refused = False
@@ -157,6 +161,8 @@ class Jitted(Reconstructible):
         form = tree_form((args, options), variables)
         nums = _differentiated(variables)
         if form is None or nums is None:
+            if form is not None and _is_pushed(variables):
+                return self._pushed(args, options)
             return self.function(*args, **options)
         try:
             recorded = self.recorded(form, args, options, variables)
@@ -216,6 +222,32 @@ class Jitted(Reconstructible):
             product.name = f"hvp({self.name})"
             self._hessian_product = product
         return self._hessian_product(x, tangent)
+
+    def _pushed(self, args: tuple, options: dict) -> Any:
+        """Return the result in forward mode. Its values and its tangents are computed by a program."""
+        entries, rebuild = flatten((args, options))
+        places = tuple([place for place, entry in enumerate(entries) if isbox(entry)])
+        trace = entries[places[0]]._trace
+        tangents = tuple([entries[place]._node.g for place in places])
+        plain_args, plain_options = rebuild([entry._value if isbox(entry) else entry for entry in entries])
+        known = self._tangents.get(places)
+        if known is None:
+            known = Jitted(partial(_value_and_tangent, self.function, places), self.check, falls_back=True)
+            known.name = f"jvp({self.name})"
+            known = self._tangents.setdefault(places, known)
+        value, tangent = known(plain_args, plain_options, tangents)
+        results, rebuild = flatten(value)
+        for place, slope in enumerate(leaves(tangent)):
+            if slope is not None:
+                results[place] = new_box(results[place], trace, forward_root(slope))
+        return rebuild(results)
+
+
+def _value_and_tangent(function, places, args, options, tangents):
+    """Return the value of a function and its tangent, for tangents of the leaves at some places of the arguments."""
+    entries = leaves((args, options))
+    directions: list = placed([None] * len(entries), places, tangents)
+    return forward(lambda arguments: function(*arguments[0], **arguments[1]), (args, options), directions)
 
 
 # ---- forms -----------------------------------------------------------------------------------------------------------
@@ -311,8 +343,8 @@ def _name(function):
 def _differentiated(variables):
     """Return the positions of traced values whose calls can be one node on their tape.
 
-    Return an empty tuple if no value is traced. Return None where the function itself has to be called: in forward
-    mode, on nested traces, and while another program is recorded.
+    Return an empty tuple if no value is traced. Return None in forward mode, on nested traces, and while another
+    program is recorded.
     """
     nums = []
     trace = None
@@ -324,6 +356,18 @@ def _differentiated(variables):
         trace = value._trace
         nums.append(num)
     return tuple(nums)
+
+
+def _is_pushed(variables):
+    """Return whether all traced values belong to one trace of forward mode, with plain tangents."""
+    boxes = [value for value in variables if isbox(value)]
+    return all(
+        isinstance(box._node, ForwardNode)
+        and box._trace == boxes[0]._trace
+        and not isbox(box._value)
+        and not isbox(box._node.g)
+        for box in boxes
+    )
 
 
 def is_watched() -> bool:

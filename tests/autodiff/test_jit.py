@@ -284,3 +284,25 @@ def test_functions_without_jvp():
     step = dp.jit(lambda u, p: p * solved(u))
     found = dp.jvp(lambda u: dp.rollout(step, u, 1.5, 3), X, Y)[1]
     np.testing.assert_allclose(found, dp.jvp(lambda u: dp.rollout(step.function, u, 1.5, 3), X, Y)[1], rtol=1e-12)
+
+
+def test_forward_mode_runs_a_program():
+    calls = []
+
+    def step(state, params):
+        calls.append(None)
+        u, count = state
+        return u + params["dt"] * (LAPLACIAN(u) - u**3), count
+
+    jitted = dp.jit(step)
+    push = lambda function, x: dp.jvp(lambda u: function((u, 3), {"dt": 0.01 * u[0]})[0], x, Y)
+    push(jitted, X)  # records
+    push(jitted, 2 * X)  # compares
+    recorded = len(calls)
+    value, tangent = push(jitted, 4 * X)
+    assert len(calls) == recorded
+    expected = push(step, 4 * X)
+    assert np.array_equal(value, expected[0])
+    np.testing.assert_allclose(tangent, expected[1], rtol=1e-13)
+    nested = dp.grad(lambda x: anp.sum(push(jitted, x)[1] ** 2))(X)  # reverse mode around forward mode
+    np.testing.assert_allclose(nested, dp.grad(lambda x: anp.sum(push(step, x)[1] ** 2))(X), rtol=1e-12)

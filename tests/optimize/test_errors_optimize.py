@@ -145,6 +145,16 @@ WRONG = [
         ValueError,
         "damping of levenberg_marquardt must be > 0, got 0; the default is 1e-3",
     ),
+    (
+        run(method="gauss_newton", accuracy=1.0),
+        ValueError,
+        "accuracy of gauss_newton must be from 0 to below 1, got 1; the default is 1e-10",
+    ),
+    (
+        run(method="levenberg_marquardt", accuracy=-1),
+        ValueError,
+        "accuracy of levenberg_marquardt must be from 0 to below 1, got -1; the default is 1e-10",
+    ),
     (run(method="half_inverse", rate=0), ValueError, "rate of half_inverse must be > 0, got 0; the default is 1"),
     (
         run(method="physical_gradient"),

@@ -173,3 +173,19 @@ def test_covariance_of_residuals_of_any_magnitude(rng, exponent):
         assert np.allclose(
             run(factor, absolute_sigma=True).covariance * factor * factor, np.linalg.inv(matrix.T @ matrix)
         )
+
+
+@pytest.mark.parametrize("method", ["gauss_newton", "levenberg_marquardt"])
+def test_steps_of_low_accuracy_take_fewer_products(method):
+    """The step is that of LSMR with this tolerance, and the search ends at the same point."""
+    matrix = np.diag(np.geomspace(1.0, 30.0, 40)) + 0.01 * np.sin(np.arange(1600.0)).reshape(40, 40)
+    products = []
+    row = dp.from_functions(lambda v: products.append(0) or matrix @ v, lambda w: matrix.T @ w, 40, 40)
+    counts = []
+    for accuracy in (1e-10, 1e-2):
+        products.clear()
+        best = dp.minimize(lambda x: row(x) - 1.0, np.zeros(40), method, 1, dense=False, accuracy=accuracy)
+        counts.append(len(products))
+    assert counts[1] < 0.6 * counts[0]
+    best = dp.minimize(lambda x: row(x) - 1.0, np.zeros(40), method, dense=False, accuracy=1e-2)
+    assert best.converged and np.allclose(best.x, np.linalg.solve(matrix, np.ones(40)))
