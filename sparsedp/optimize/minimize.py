@@ -126,7 +126,7 @@ def minimize(
         ``project(x)``, a differentiable projection onto a linear or affine space, such as dp.projection(grid).
         loss(project(x)) is minimized, and the returned x is a projected one. At the start and at the result, test
         points check that the map is affine and idempotent; otherwise, as for np.clip, ValueError is raised. Cannot be
-        used together with bounds.
+        used together with bounds, and not with the methods for constraints.
     batches : sequence or callable, optional
         In iteration i the loss is ``loss(x, batches[i % len(batches)])``, or ``loss(x, batches(i))`` for a function.
         Available for gd with a rate, adam, half_inverse and physical_gradient. The result is the last point, not the

@@ -172,6 +172,14 @@ REFUSED = [
     ),
     (
         TypeError,
+        "minimize of fields on ranks takes lbfgs, bounds of numbers and a callback, got augmented_lagrangian, "
+        "constraints; leave the rest out, or start from dp.gather(u)",
+        lambda s: dp.minimize(
+            lambda u: anp.sum(u * u), s.u, "augmented_lagrangian", constraints=lambda u: 1.0 - anp.sum(u)
+        ),
+    ),
+    (
+        TypeError,
         "metric does not work on ranks yet; give it the grid from before dp.distribute",
         lambda s: dp.minimize(lambda u: anp.sum(u * u), np.ones((5, 4)), metric=dp.identity(s.grid.cells)),
     ),
