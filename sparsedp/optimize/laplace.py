@@ -49,7 +49,7 @@ def laplace(
     tolerance: float = 0.01,
     seed: int = 0,
 ) -> Posterior:
-    r"""Approximate the posterior of unknowns by a normal distribution with mean x (Laplace approximation).
+    """Approximate the posterior of unknowns by a normal distribution with mean x (Laplace approximation).
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def laplace(
     function and a normal prior, the result is the exact posterior if x is its mean. For a number, H is the Hessian of
     the function. With the eigenpairs H v = lambda C^-1 v, v^T C^-1 v = 1, the covariance is
 
-    .. math:: (H + C^{-1})^{-1} = C - \sum_i \frac{\lambda_i}{1 + \lambda_i} \, v_i v_i^T .
+        (H + C^-1)^-1 = C - sum over the pairs of lambda / (1 + lambda) v v^T.
 
     Data reduce the variance along v_i by the factor 1 / (1 + lambda_i). If eigenvalues below a number t are neglected,
     all variances are too large, by at most the factor 1 + t.
