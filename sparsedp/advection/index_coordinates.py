@@ -86,7 +86,7 @@ class IndexCoordinates:
                 _check_monotone(settings.scheme, gaps)
             self.axes.append(PointsOfAxis(gaps, widths.size if periodic else None, cubic))
 
-    def _scale(self, step: float) -> NDArray:
+    def scale(self, step: float) -> NDArray:
         """Return the time step divided by the widths of the cells. The array of the last step is reused."""
         last_step, scale = self._last_scale  # one attribute, so that threads read matching values
         if last_step != step:
@@ -97,7 +97,7 @@ class IndexCoordinates:
     def displacement(self, m: NDArray, step: float) -> Displacement:
         """Return the displacements for velocities m (axis, point) and a signed time step."""
         if not self.axes:
-            return Displacement(m, self._scale(step), ())
+            return Displacement(m, self.scale(step), ())
         if self.axes[0].cubic:
             slopes_per_point = 1
         else:

@@ -81,6 +81,11 @@ class Interpolant:
             self._filling = solid_filling(settings.grid, settings.solid)
             self._filling_transpose = sp.csr_array(self._filling.T)
 
+    @property
+    def is_direct(self) -> bool:
+        """Whether departure points follow from the velocity at the points alone, and no solid cell is filled."""
+        return self.half_way is None and not self.coordinates.axes and self._filling is None
+
     def _indices_of_samples(self, inflow_values: int) -> NDArray:
         """Return for each sample its index in the component followed by the inflow values."""
         n = self.points.size

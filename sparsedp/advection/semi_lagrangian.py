@@ -34,9 +34,10 @@ from sparsedp.advection.departure_points import Trajectory
 from sparsedp.advection.interpolant import Interpolant
 from sparsedp.advection.method import TransportMethod
 from sparsedp.advection.settings import FIELD, INFLOW, VELOCITY
+from sparsedp.kernels.interpolation_weights import interpolate, scatter
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -143,6 +144,60 @@ class SemiLagrangian(TransportMethod):
         for span, step in self._steps(u, v, dt, inflow):
             step.value(out[span])
         return self._keep_solid(out, u)
+
+    @property
+    def _is_direct(self) -> bool:
+        """Whether a step consists of a few calls of compiled loops for one component of the field."""
+        is_simple = self.component_step is ComponentStep and self.solid is None and len(self.components) == 1
+        return is_simple and self.components[0].is_direct
+
+    def bound_forward(self) -> Callable[..., NDArray]:
+        """Return a function that returns what `forward` returns, with less overhead."""
+        if not self._is_direct:
+            return self.forward
+        settings = self.settings
+        component = self.components[0]
+        pad, points, scale = component.pad, component.points, component.coordinates.scale
+        interpolate_velocity, new_field = self.interpolate_velocity, self._new_field
+        shape = self._velocity_parts[0][1]
+
+        def direct(u, v, dt, inflow):
+            if not (surely_finite(u) and (v is u or surely_finite(v)) and (not inflow.size or surely_finite(inflow))):
+                check_numbers(settings, u, v, inflow)
+            w = interpolate_velocity(v).reshape(shape)
+            return interpolate(points, pad(u, inflow), w, scale(dt), new_field())
+
+        return direct
+
+    def bound_vjp(self, nums: Sequence[int]) -> Callable[..., tuple[Sequence[Any], bool]]:
+        """Return a function that returns what `vjp` returns, with less overhead."""
+        if not self._is_direct or not {FIELD, VELOCITY} >= set(nums):
+            return super().bound_vjp(nums)
+        component = self.components[0]
+        pad, points, scale = component.pad, component.points, component.coordinates.scale
+        new_samples, pad_vjp = component.new_samples, component.pad_vjp
+        new_field, new_velocity = self._new_field, self._new_velocity
+        interpolate_velocity, interpolate_velocity_vjp = self.interpolate_velocity, self.interpolate_velocity_vjp
+        shape = self._velocity_parts[0][1]
+
+        def direct(g, u, v, dt, inflow):
+            if not g.flags.c_contiguous:
+                g = np.ascontiguousarray(g)
+            w = interpolate_velocity(v).reshape(shape)
+            scales = scale(dt)
+            cotangents = []
+            for num in nums:
+                if num == FIELD:
+                    of_u = new_field()
+                    pad_vjp(scatter(points, w, scales, g, new_samples()), of_u, np.zeros(inflow.size))
+                    cotangents.append(of_u)
+                else:
+                    of_w = new_velocity()
+                    interpolate(points, pad(u, inflow), w, scales, of_w.reshape(shape), g)
+                    cotangents.append(interpolate_velocity_vjp(of_w))
+            return cotangents, False
+
+        return direct
 
     def vjp(
         self,
