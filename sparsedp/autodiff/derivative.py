@@ -68,7 +68,7 @@ __all__ = [
     "unwarned",
     "value_and_grad",
     "vjp",
-    "witnessed",
+    "observed_nodes",
     "zero_like",
 ]
 
@@ -345,7 +345,7 @@ def pullback(fun: Callable, x: Any) -> tuple[Any, Callable]:
     for place, leaf in enumerate(entries):
         moving.append(is_variable(leaf))
         if moving[place]:
-            entries[place] = _apart_from_caller(leaf)
+            entries[place] = _protected_copy(leaf)
     if True not in moving:
         kinds = sorted({str(getattr(leaf, "dtype", type(leaf).__name__)) for leaf in entries})
         advice = "np.asarray(x, float)"
@@ -367,7 +367,7 @@ def pullback(fun: Callable, x: Any) -> tuple[Any, Callable]:
                 gradients[place] = gradient_of(entries[place], slope)
         return rebuild(_without_shared_memory(gradients, g))
 
-    return _apart_from_caller(value), pull
+    return _protected_copy(value), pull
 
 
 def gradient_of(leaf: Any, cotangent: Any) -> Any:
@@ -405,7 +405,7 @@ def _owner(value):
     return value
 
 
-def _apart_from_caller(value):
+def _protected_copy(value):
     """Copy an array that is not immutable, because the caller may write into it before the pullbacks use it."""
     if isinstance(value, np.ndarray) and not is_fixed(value):
         return value.copy("K")
@@ -449,7 +449,7 @@ class Tape(NamedTuple):
         return cotangents
 
 
-def taped(fun: Callable, tree: Any, moving: Iterable, *witnesses: Callable) -> Tape:
+def taped(fun: Callable, tree: Any, moving: Iterable, *callbacks: Callable) -> Tape:
     """Evaluate a function of a tree and record it.
 
     Parameters
@@ -459,10 +459,10 @@ def taped(fun: Callable, tree: Any, moving: Iterable, *witnesses: Callable) -> T
     tree : tree
     moving : iterable of bool
         For each leaf of the tree, whether it is a variable.
-    *witnesses : callables
+    *callbacks : callables
         Callbacks that are called for every node, see `Recorder`.
     """
-    recorder = Recorder(*witnesses)
+    recorder = Recorder(*callbacks)
     roots: list = []
     for moves in moving:
         if moves:
@@ -474,7 +474,7 @@ def taped(fun: Callable, tree: Any, moving: Iterable, *witnesses: Callable) -> T
     finally:
         nodes = recorder.taken()
         recorder.ended = True
-        recorder.witnesses = ()  # a callback that stores nodes would form a reference cycle with the recorder
+        recorder.callbacks = ()  # a callback that stores nodes would form a reference cycle with the recorder
     return Tape(values, rebuild, ends, nodes, roots)
 
 
@@ -513,7 +513,7 @@ def traced(fun: Callable, tree: Any, roots: Sequence) -> tuple[list, list, Calla
 
 
 @contextmanager
-def witnessed(see: Callable) -> Iterator[None]:
+def observed_nodes(see: Callable) -> Iterator[None]:
     """Call a function for each node of a reverse-mode trace that is created inside a `with` block.
 
     Parameters
@@ -841,7 +841,7 @@ def checking_derivatives() -> Iterator[None]:
 
         node.vjp = checked
 
-    with witnessed(see), np.errstate(all="ignore"):
+    with observed_nodes(see), np.errstate(all="ignore"):
         yield
 
 

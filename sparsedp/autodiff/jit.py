@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from contextlib import contextmanager
 from functools import partial, update_wrapper
+from math import inf
 from operator import getitem
 from threading import RLock
 from typing import TYPE_CHECKING, Any
@@ -17,7 +18,16 @@ from sparsedp._utils.counters import active, thread
 from sparsedp._utils.pytree import TreeStructure, child, flatten, keys, labels, leaves, placed
 from sparsedp._utils.validation import check_function, check_leaves, check_native
 from sparsedp.autodiff.backend import ARRAY_KINDS
-from sparsedp.autodiff.derivative import forward, gradient_of, hvp, random_like, taped, value_and_grad, zero_like
+from sparsedp.autodiff.derivative import (
+    forward,
+    gradient_of,
+    hvp,
+    name_of,
+    random_like,
+    taped,
+    value_and_grad,
+    zero_like,
+)
 from sparsedp.autodiff.program import compile_program, free_slots, needed_calls
 from sparsedp.autodiff.program_trace import ProgramTrace, Slot, opaque, open_traces, refuse_outer_trace
 from sparsedp.autodiff.tape import (
@@ -43,7 +53,7 @@ from sparsedp.errors import JitError, JitWarning
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-__all__ = ["Jitted", "PullbackProgram", "tree_form", "is_watched", "jit", "opaque"]
+__all__ = ["Jitted", "PullbackProgram", "gap", "tree_form", "is_watched", "jit", "opaque"]
 
 FORMS_BEFORE_WARNING = 8
 MOST_FORMS = 64  # programs of one function that are kept
@@ -133,7 +143,7 @@ class Jitted(Reconstructible):
 
     def __init__(self, function: Callable, check: bool = True, falls_back: bool = False) -> None:
         self.function = function
-        self.name = _name(function)
+        self.name = name_of(function)
         self.check = check
         self.falls_back = falls_back
         self._recorded: dict[Any, Recorded] = {}
@@ -336,10 +346,6 @@ def _described(leaf):
     return repr(leaf)
 
 
-def _name(function):
-    return getattr(function, "__name__", type(function).__name__)
-
-
 def _differentiated(variables):
     """Return the positions of traced values whose calls can be one node on their tape.
 
@@ -488,22 +494,36 @@ def check_program(name: str, expected: Any, result: Any, eps: float) -> None:
             )
 
 
-def _agree(a, b, eps=0.0):
-    if is_variable(a):
-        a = np.asarray(a)
-        b = np.asarray(b)
-        if a.shape != b.shape or a.dtype != b.dtype:
-            return a.shape == b.shape and a.ndim == 0 and np.array_equal(a, b, equal_nan=True)
-        if np.array_equal(a, b, equal_nan=True):
-            return True
-        finite = np.isfinite(a)
-        if not np.array_equal(finite, np.isfinite(b)):
-            return False
-        size = float(np.max(np.abs(a), where=finite, initial=0.0))
-        return bool(np.all(np.abs(a - b)[finite] <= VALUE_TOLERANCE * max(eps, np.finfo(a.dtype).eps) * size))
-    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
-        return np.array_equal(a, b)
-    return a is b or a == b
+def _agree(expected, found, eps=0.0):
+    """Return whether two leaves are equal up to rounding, numbers in any precision."""
+    if is_variable(expected) and np.ndim(expected) == np.ndim(found) == 0 and np.array_equal(expected, found):
+        return True
+    return gap(expected, found, eps) <= VALUE_TOLERANCE
+
+
+def gap(expected: Any, found: Any, eps: float = 0.0) -> float:
+    """Return the largest difference of two leaves relative to the largest entry, in units of the machine epsilon.
+
+    The gap is infinite if shapes, dtypes, entries that are not finite, or leaves that are not floating differ. `eps` is
+    the machine epsilon of a less precise leaf, from which both have been computed.
+    """
+    if not is_variable(expected):
+        if isinstance(expected, np.ndarray) or isinstance(found, np.ndarray):
+            is_equal = np.array_equal(expected, found)
+        else:
+            is_equal = expected is found or expected == found
+        return 0.0 if is_equal else inf
+    a = np.asarray(expected)
+    b = np.asarray(found)
+    if a.shape != b.shape or a.dtype != b.dtype:
+        return inf
+    if np.array_equal(a, b, equal_nan=True):
+        return 0.0
+    finite = np.isfinite(a)
+    if not np.array_equal(finite, np.isfinite(b)) or not np.array_equal(a[~finite], b[~finite], equal_nan=True):
+        return inf
+    size = np.max(np.abs(a[finite])) or np.max(np.abs(b[finite]))
+    return float(np.max(np.abs(a[finite] - b[finite])) / size / max(eps, np.finfo(a.dtype).eps))
 
 
 def _same(a, b):
@@ -781,7 +801,7 @@ def opaque_call(function: Callable, args: tuple, options: dict) -> Any:
     owner = getattr(function, "__self__", args[0] if args else None)
     name = getattr(owner, "name", None)
     if not isinstance(name, str):
-        name = _name(function)
+        name = name_of(function)
     rule = OpaqueCall(name, function, structure, nums)
     return rule.build(through(rule, nums, *variables))
 

@@ -219,7 +219,7 @@ class Recorder:
 
     Parameters
     ----------
-    *witnesses : callables
+    *callbacks : callables
         Callbacks ``see(node, function, value, arguments, options, numbers)``. They and those in `thread.node_hooks` are
         called for every node that is created.
 
@@ -236,9 +236,9 @@ class Recorder:
         them raises a DerivativeError.
     """
 
-    def __init__(self, *witnesses: Callable):
+    def __init__(self, *callbacks: Callable):
         self.nodes: list[ReverseNode] = []
-        self.witnesses = (*thread.node_hooks, *witnesses)
+        self.callbacks = (*thread.node_hooks, *callbacks)
         self.bytes: Any = None
         self.entries: dict[tuple, Any] = {}
         self.ended = False
@@ -341,7 +341,7 @@ class ReverseNode(VJPNode):
         recorder.nodes.append(self)
         if recorder.bytes is not None:
             recorder.weigh(value, args, nums)
-        for see in recorder.witnesses:
+        for see in recorder.callbacks:
             see(self, function, value, args, options, nums)
 
     def _differentiate_by_autograd(self, value, function, args, options, nums):

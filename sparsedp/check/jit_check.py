@@ -14,6 +14,7 @@ from sparsedp._utils.pytree import copied, labels, leaves, mapped
 from sparsedp._utils.validation import check_function
 from sparsedp.autodiff.derivative import pullback, unwarned, value_and_grad
 from sparsedp.autodiff.jit import VALUE_TOLERANCE, Jitted, is_watched, tree_form
+from sparsedp.autodiff.jit import gap as largest_gap
 from sparsedp.autodiff.jit import jit as record
 from sparsedp.autodiff.tape import is_variable
 from sparsedp.check.summary import Row, Summary, error_text
@@ -199,28 +200,12 @@ def _row(name: str, root: str, expected: Any, found: Any) -> Row:
     if names != labels(found, root):
         gap = inf
     else:
-        gaps = list(map(_gap, leaves(expected), leaves(found)))
+        gaps = list(map(largest_gap, leaves(expected), leaves(found)))
         if gaps:
             largest = int(np.argmax(gaps))
             leaf = names[largest]
             gap = gaps[largest]
     return Row(name, gap, LIMIT, gap <= LIMIT, leaf)
-
-
-def _gap(expected: Any, found: Any) -> float:
-    """Return the largest difference of two leaves relative to the largest entry, in units of eps."""
-    if not is_variable(expected):
-        return 0.0 if np.array_equal(expected, found) else inf
-    a = np.asarray(expected)
-    b = np.asarray(found)
-    if a.shape != b.shape or a.dtype != b.dtype:
-        return inf
-    if np.array_equal(a, b, equal_nan=True):
-        return 0.0
-    if not (np.isfinite(a).all() and np.isfinite(b).all()):
-        return inf
-    size = np.max(np.abs(a)) or np.max(np.abs(b))
-    return float(np.max(np.abs(a - b)) / size / np.finfo(a.dtype).eps)
 
 
 class JitSummary(Summary):

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from sparsedp.autodiff.backend import array_types
-from sparsedp.autodiff.derivative import name_of, witnessed
+from sparsedp.autodiff.derivative import name_of, observed_nodes
 from sparsedp.autodiff.tape import called, isbox, through
 
 __all__ = ["Node", "bytes_held", "calls_seen", "in_order"]
@@ -98,7 +98,7 @@ def calls_seen() -> Iterator[list[Node]]:
 
         tape_node.vjp = pull_and_nest
 
-    with witnessed(add_node):
+    with observed_nodes(add_node):
         yield calls
 
 

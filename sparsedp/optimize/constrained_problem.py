@@ -10,7 +10,7 @@ import numpy as np
 
 from sparsedp._utils.pytree import norm, power_of_two
 from sparsedp.optimize.box import Box
-from sparsedp.optimize.objective import REFUSALS, Objective
+from sparsedp.optimize.objective import TRIAL_ERRORS, Objective
 from sparsedp.optimize.result import Evaluation, Failure
 from sparsedp.solvers.cache import Cache
 
@@ -180,7 +180,7 @@ class ConstrainedProblem:
         if not evaluation.refused:
             try:
                 values = self.constraints.at(evaluation.point)
-            except REFUSALS as error:
+            except TRIAL_ERRORS as error:
                 self.objective.failures.append(Failure(type(error).__name__, str(error)))
         point = Point(self, evaluation, values)
         self._points = [(np.array(z), point), *self._points[: STORED_POINTS - 1]]
@@ -195,7 +195,7 @@ class ConstrainedProblem:
             return None
         try:
             return derivative()
-        except REFUSALS as error:
+        except TRIAL_ERRORS as error:
             if point is self.start:
                 raise
             self.objective.failures.append(Failure(type(error).__name__, str(error)))

@@ -33,7 +33,7 @@ __all__ = ["GaussNewton", "HalfInverse", "LevenbergMarquardt", "SquaresState"]
 
 RANK_TOLERANCE = 1e-12  # singular values below this multiple of the largest count as 0
 UNDAMPED_LENGTHS = 2  # trial points along an undamped Gauss-Newton step: the full step and half of it
-POOR = 0.1  # next step is damped if actual / gradient-predicted decrease is below this (1/2 if r is linear)
+DAMPED_BELOW = 0.1  # next step is damped if actual / gradient-predicted decrease is below this (1/2 if r is linear)
 FIRST_DAMPING = 1e-3  # initial damping of Gauss-Newton, relative to the largest diagonal entry of J^T J
 LEAST_DAMPING = 1e-6  # relative damping below which Gauss-Newton returns to undamped steps
 LSMR_ACCURACY = 1e-10  # relative tolerances atol and btol of LSMR
@@ -264,7 +264,7 @@ class GaussNewton(LeastSquaresMethod):
                 _check_rounding(error, current, linearization, objective)
             else:
                 damping = 0.0
-                if share_of_decrease < POOR:
+                if share_of_decrease < DAMPED_BELOW:
                     damping = FIRST_DAMPING * (_largest_column_norm(linearization) / unit) ** 2
                 return state._replace(current=evaluation, damping=damping)
         largest_diagonal = (_largest_column_norm(linearization) / unit) ** 2

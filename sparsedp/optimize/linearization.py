@@ -29,13 +29,13 @@ MOST_ENTRIES = 3e7  # by default, a Jacobian with more entries (240 MB) is not f
 LONGEST_SIDE = 4000  # by default, a Jacobian whose shorter side is longer than this is not formed
 MOST_UNKNOWNS = 4000  # the covariance of more unknowns (128 MB) is not computed
 FIRST_GROUP = 1e-4  # singular values above this multiple of the largest are taken from the first Gram matrix
-APART_ACCURACY = 1e-6  # tolerated relative difference of a product with the Jacobian of samples from the VJP
+SEPARATION_TOLERANCE = 1e-6  # tolerated relative difference of a product with the Jacobian of samples from the VJP
 
 NOT_FORMED = (
     "{}; the product of its inverse with v is dp.vjp(residuals, x)[1](dp.jvp(residuals, x, v)[1]), and "
     "scipy.sparse.linalg.cg finds columns of it"
 )
-NOT_APART = (
+NOT_SEPARATE = (
     "with apart=True every leaf of x gets a leading axis of {} copies, one for each sample, and the outputs do not "
     "follow them; write a function that broadcasts over it"
 )
@@ -180,7 +180,7 @@ class Linearization:
 
         value, pull = pullback(self._outputs, mapped(copies, self._tree))
         if value.shape != self.value.shape:
-            raise ShapeError(NOT_APART.format(samples))
+            raise ShapeError(NOT_SEPARATE.format(samples))
         width = value.size // max(samples, 1)
         jacobian = np.empty((samples, width, self.shape[1]))
         for column, unit in enumerate(np.eye(width)):
@@ -192,8 +192,8 @@ class Linearization:
         probe = np.cos(np.arange(self.shape[0]))
         by_rows = self._free * (probe @ jacobian)
         recorded = self.vjp(probe)
-        if not np.linalg.norm(by_rows - recorded) <= APART_ACCURACY * np.linalg.norm(recorded):
-            raise ShapeError(NOT_APART.format(samples))
+        if not np.linalg.norm(by_rows - recorded) <= SEPARATION_TOLERANCE * np.linalg.norm(recorded):
+            raise ShapeError(NOT_SEPARATE.format(samples))
         return jacobian
 
     def covariance(self, absolute_sigma: bool) -> NDArray[np.float64] | str:

@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 
 __all__ = ["NewtonCG", "NewtonState", "truncated_cg"]
 
-POOR, GOOD = 0.25, 0.75  # the radius shrinks (grows) if actual / predicted decrease is below POOR (above GOOD)
+# Limits of the actual decrease divided by the predicted one, for a change of the radius.
+SHRINKS_BELOW = 0.25
+GROWS_ABOVE = 0.75
 MOST_REGIONS = 60  # maximum number of radii tried in one iteration
 
 
@@ -111,9 +113,9 @@ class NewtonCG(Method):
         failure = "no trust region gives a lower point"
         evaluation, share_of_decrease, region = objective.first_lower(current, candidates(), failure)
         radius, length, on_boundary = region
-        if share_of_decrease > GOOD and on_boundary:
+        if share_of_decrease > GROWS_ABOVE and on_boundary:
             radius = 2 * length
-        elif share_of_decrease < POOR:
+        elif share_of_decrease < SHRINKS_BELOW:
             radius = length / 4
         if not np.isfinite(radius):
             radius = 0.0

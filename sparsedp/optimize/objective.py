@@ -30,7 +30,7 @@ SUFFICIENT = 1e-4  # minimum of actual / predicted decrease for an accepted step
 SMALLEST = 5e-324  # smallest positive float, the minimum of the estimated rounding error of a loss
 ROUNDINGS = 100  # a predicted decrease below this multiple of the rounding error cannot be observed
 CLEAR_ROUNDINGS = 2000  # a predicted decrease above this multiple of the rounding error can be observed
-REFUSALS = (UnstableStepError, ConvergenceError, NonFiniteError)  # at trial points they count as an infinite loss
+TRIAL_ERRORS = (UnstableStepError, ConvergenceError, NonFiniteError)  # at trial points they count as an infinite loss
 
 
 class Objective:
@@ -98,7 +98,7 @@ class Objective:
         return self.best
 
     def __call__(self, vector: NDArray[np.float64], below: float = np.inf) -> Evaluation:
-        """Return the evaluation at a point; the value is infinity if the loss raises one of `REFUSALS`.
+        """Return the evaluation at a point; the value is infinity if the loss raises one of `TRIAL_ERRORS`.
 
         Parameters
         ----------
@@ -108,7 +108,7 @@ class Objective:
         """
         try:
             evaluation = self._evaluate(vector, below)
-        except REFUSALS as error:
+        except TRIAL_ERRORS as error:
             self.failures.append(Failure(type(error).__name__, str(error)))
             return Evaluation(np.array(vector), np.inf, np.full_like(vector, np.nan))
         # Losses of different batches cannot be compared; with batches the last point is the result.

@@ -12,7 +12,7 @@ from typing import Any
 from sparsedp._utils.counters import Calls, recording
 from sparsedp._utils.pytree import leaves
 from sparsedp._utils.validation import check_function
-from sparsedp.autodiff.derivative import unwarned, value_and_grad, witnessed
+from sparsedp.autodiff.derivative import observed_nodes, unwarned, value_and_grad
 from sparsedp.autodiff.tape import is_variable
 from sparsedp.check.evaluations import solvers_of
 from sparsedp.check.nodes import bytes_held
@@ -115,7 +115,7 @@ def explain(loss: Callable[[Any], Any], x: Any, gradient: bool = True) -> Plan:
         return value
 
     start = perf_counter()
-    with recording() as calls, witnessed(lambda node, *_: nodes.append(node)), unwarned():
+    with recording() as calls, observed_nodes(lambda node, *_: nodes.append(node)), unwarned():
         if gradient:
             value, _ = value_and_grad(watched_loss)(x)
         else:

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 __all__ = ["RolloutRule"]
 
 SAMPLES = 32  # number of states of a long run at which the size of the cotangent is measured
-APART = 16  # least number of steps between two measurements, because each of them reads the whole cotangent
+LEAST_INTERVAL = 16  # least number of steps between two measurements, because each of them reads the whole cotangent
 
 
 # ---- forward ---------------------------------------------------------------------------------------------------------
@@ -149,7 +149,7 @@ def run_backward(
     """
     specification = runner.specification
     n = plan.n
-    interval = max(n // SAMPLES, APART)
+    interval = max(n // SAMPLES, LEAST_INTERVAL)
     source = outputs.sources(n, cotangents)
     sums: dict = {}  # for each root of params: (sum of cotangents so far, whether the sum may be modified in place)
     rows: list[list] = []  # for each array of inputs the cotangents of its rows, one row per step

@@ -235,6 +235,8 @@ class StepRunner:
 
     def _are_separate(self, nodes: list) -> bool:
         """Return True if no two variables of a state, and no variable and a parameter, share a node."""
+        if len(nodes) == 1:  # without building a set
+            return nodes[0] not in self.lasting_nodes
         return len({*nodes}) == len(nodes) and self.lasting_nodes.isdisjoint(nodes)
 
     def reversed_step(self, state: State) -> State:

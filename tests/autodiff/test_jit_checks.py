@@ -7,6 +7,7 @@ from differentiable_cases import LINE, PLACES, entries, field
 
 import sparsedp as dp
 from sparsedp._utils.pytree import leaves
+from sparsedp.autodiff.jit import gap
 
 SQUARE = dp.Grid((6, 5), size=(1.0, 0.8))
 RING = dp.Grid(12, periodic=True)
@@ -171,3 +172,12 @@ def test_checks_are_made_in_every_replay(function, accepted, refused):
     assert error_of(jitted, *refused) == expected
     assert error_of(dp.value_and_grad(jitted_loss), list(refused)) == error_of(dp.value_and_grad(loss), list(refused))
     assert jitted.forms == 1
+
+
+def test_gap_of_values_that_are_not_finite():
+    expected = np.array([1.0, np.inf, NAN])
+    assert gap(expected, np.array([1.0, np.inf, NAN])) == 0.0
+    assert gap(expected, np.array([1.0 + 4 * np.finfo(float).eps, np.inf, NAN])) == 4.0
+    assert gap(expected, np.array([1.0, -np.inf, NAN])) == np.inf
+    assert gap(expected, np.array([1.0, NAN, np.inf])) == np.inf
+    assert gap(expected, np.array([1.0, 2.0, NAN])) == np.inf
