@@ -186,6 +186,8 @@ class ConstrainedRun:
         self.history = history
         self._first_second -= history[-1].seconds
         self._first_solve -= history[-1].solves
+        if self._steps is not None:
+            self._steps.update(self.iteration)
 
     def resume_from(self, last: Best, best: Best, closest: Best) -> None:
         """Continue from the points of a checkpoint.
@@ -210,6 +212,10 @@ class ConstrainedRun:
     def library_ended(self, reason: str) -> None:
         """Set the message after a method has ended by itself, without meeting the tolerance."""
         best = self.closest
+        failures = self.problem.objective.pop_failures()
+        if failures:
+            last = failures[-1]
+            reason = f"{reason}, {len(failures)} points refused ({last.error}: {last.message})"
         self.message = f"stopped: {reason}; dp.check.gradient(loss, x) tells whether the gradient is right"
         stationary = max(NEARLY, np.sqrt(self.problem.packing.eps))  # rounding of the loss hides smaller gradients
         if best.point.violation <= self._nearly and best.optimality <= stationary:

@@ -458,6 +458,17 @@ def test_points_that_cannot_be_evaluated_are_avoided(method, error):
     assert best.converged and np.allclose(best.x, 1.0, atol=1e-4)
 
 
+def test_the_message_names_refused_points():
+    def constraint(x):
+        if anp.max(x) > 1.0:
+            raise dp.errors.ConvergenceError("no solution there")
+        return anp.sum(x) - 3.0
+
+    best = dp.minimize(lambda x: anp.sum((x - 2.0) ** 2), np.ones(2), "slsqp", constraints=constraint)
+    assert not best.converged and np.array_equal(best.x, [1.0, 1.0])
+    assert "points refused (ConvergenceError: no solution there); dp.check.gradient" in best.message
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_adjoint_solves_that_fail_at_a_trial_point(method):
     """The constraint has a value everywhere, but beyond x[0] == 1.5 its backward pass raises."""
