@@ -493,7 +493,7 @@ def _projected_minres(pencil, value, values, vectors, largest):
     if largest:
         sign = -1.0
         shifted = pencil.negative()
-    precondition = shifted.shifted_inverse(shifted.below_spectrum(), 1e-10, True)
+    precondition = shifted.shifted_inverse(shifted.below_spectrum(), 1e-10, shifted.is_positive)
     masses = np.array([pencil.apply_mass(vector) for vector in vectors])
     shape = pencil.size, pencil.size
 

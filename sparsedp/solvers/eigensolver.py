@@ -47,8 +47,12 @@ DENSE_UP_TO = 512  # unknowns for which "auto" takes LAPACK: 0.1 s
 GENERAL_DENSE_UP_TO = 1024  # the same for operators that are not symmetric: 1 s
 DENSE_AT_MOST = 20_000  # unknowns for which "dense" is accepted: a matrix of 3 GB
 LARGE_SHARE = 4  # "auto" takes LAPACK too where more than one eigenvalue in 4 is asked for
-SHIFT = 1e-6  # distance of the shift from the lower end of the spectrum, relative to the mean size of the rows
-NUDGE = 1e-8  # the same for a shift of the user, which may be an eigenvalue
+# Distance of the shift from 0 for operators without negative eigenvalues, relative to the mean size of the rows. It is
+# larger where 0 is an eigenvalue and multigrid solves, whose cycles in single precision must see the shift.
+SHIFT = 1e-10
+SHIFT_OF_SINGULAR = 1e-6
+NEAR = 1e-4  # the same for operators with negative eigenvalues
+NUDGE = 1e-11  # the same for a shift of the user, which may be an eigenvalue
 SYMMETRIC = 1e-12  # two products that should be equal may differ by this share of their sizes
 LARGEST_EXPONENT = 200  # an operator or a mass beyond this power of two is scaled
 AT_ROUNDOFF = 128 * EPS  # residuals below this share of the terms are rounding errors
@@ -195,12 +199,18 @@ class Pencil:
 
     @cached_property
     def scale(self) -> float:
-        """The mean sum of magnitudes in a row of A, divided by the mean of M."""
-        ones = self._masked(np.ones(self.size))
-        sums = np.sum(self.weights * self._masked(self.system.magnitude(ones)))
+        """The mean sum of magnitudes in a row of A, divided by the mean of M; 1.0 if A is 0."""
+        return float(np.mean(self._row_sums)) or 1.0
+
+    @property
+    def _row_sums(self):
+        """Sums of magnitudes in the rows of the unknowns of A, divided by the mean of M."""
+        sums = self.weights * self._masked(self.system.magnitude(self._masked(np.ones(self.size))))
         signs = self.start
-        masses = float(np.real(np.vdot(signs, self.apply_mass(signs)))) / float(np.real(np.vdot(signs, signs)))
-        return float(sums) / self.unknowns / masses if masses > 0 else 0.0
+        mass = float(np.real(np.vdot(signs, self.apply_mass(signs)))) / float(np.real(np.vdot(signs, signs)))
+        if self.active is not None:
+            sums = sums[self.active]
+        return sums / mass if mass > 0 else 0.0 * sums
 
     @cached_property
     def start(self) -> NDArray[Any]:
@@ -310,9 +320,19 @@ class Pencil:
             negative.__dict__.pop(name, None)
         return negative
 
+    def _is_singular(self):
+        """Return whether the constants or the volumes of a component are a null vector of A."""
+        try:
+            return self.system.null_space.count > 0
+        except ArithmeticError:  # a null vector without a partner on the other side
+            return True
+
     def below_spectrum(self) -> float:
         """Return a shift below all eigenvalues, near to the least one."""
         sigma = -SHIFT * self.scale
+        grid = self.op.domain.grid
+        if grid is not None and grid.dim > 1 and self._is_singular():
+            sigma = -SHIFT_OF_SINGULAR * (float(np.min(self._row_sums)) or self.scale)
         if self.is_positive or not self.op.structure.has_entries:
             return sigma
         if self.unknowns > INERTIA_UP_TO:
@@ -321,18 +341,22 @@ class Pencil:
                 "has no negative eigenvalue; give the shift: which=-1.0, below or near to the wanted eigenvalues",
                 info=failure("setup_failed"),
             )
-        upper = None
-        while self.count_below(sigma):
-            upper = sigma
-            sigma *= 30.0
-        if upper is None:
+        if not self.count_below(sigma):
             return sigma
-        for _ in range(6):  # the least eigenvalue is between sigma and upper
-            middle = -np.sqrt(sigma * upper)
-            if self.count_below(middle):
-                upper = middle
-            else:
-                sigma = middle
+        while self.count_below(sigma):
+            sigma *= 1000.0
+        return self._nearer(sigma)
+
+    def _nearer(self, sigma):
+        """Return a shift that is nearer to the least eigenvalue than one far below it."""
+        none = np.zeros((0, self.size), self.dtype)
+        for _ in range(4):
+            solve = self.shifted_inverse(sigma, LOOSE, False)
+            upper = float(_shift_invert(self, sigma, solve, none, 1, None, 1e-3)[0][0])  # the least one, or above it
+            distance = upper - sigma
+            if distance <= NEAR * self.scale or self.count_below(upper - 0.01 * distance):
+                break
+            sigma = upper - 0.01 * distance
         return sigma
 
 
@@ -448,12 +472,13 @@ def _by_arpack(pencil, k, which, maxiter):
         sigma = pencil.below_spectrum()
     else:
         sigma = which - NUDGE * pencil.scale
-    solve = pencil.shifted_inverse(sigma, INNER, isinstance(which, str))
+    solve = pencil.shifted_inverse(sigma, INNER, isinstance(which, str) and pencil.is_positive)
     known = np.zeros((0, pencil.size), pencil.dtype)
     count = k + 1
     values = np.zeros(0)
     for _ in range(MOST_RESTARTS):
-        new_values, new_vectors = _shift_invert(pencil, sigma, solve, known, count, maxiter)
+        tolerance = LOOSE if len(known) else TIGHT
+        new_values, new_vectors = _shift_invert(pencil, sigma, solve, known, count, maxiter, tolerance)
         if len(known):
             farthest = np.sort(np.abs(values - sigma))[k]
             if not np.min(np.abs(new_values - sigma)) < farthest * (1.0 - 1e-9):
@@ -467,7 +492,7 @@ def _by_arpack(pencil, k, which, maxiter):
     return sign * values, vectors
 
 
-def _shift_invert(pencil, sigma, solve, known, count, maxiter):
+def _shift_invert(pencil, sigma, solve, known, count, maxiter, tolerance):
     """Return pairs near a shift, in the complement of the known vectors."""
     from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
 
@@ -491,7 +516,7 @@ def _shift_invert(pencil, sigma, solve, known, count, maxiter):
             v0=complement(pencil.start),
             ncv=min(pencil.unknowns, max(2 * count + 1, 20)),
             maxiter=maxiter,
-            tol=LOOSE if len(known) else TIGHT,
+            tol=tolerance,
             OPinv=LinearOperator(shape, solved, dtype=dtype),
         )
     except ArpackNoConvergence as error:
@@ -580,7 +605,7 @@ def _by_lobpcg(pencil, k, maxiter):
     from scipy.sparse.linalg import LinearOperator, lobpcg
 
     sigma = pencil.below_spectrum()
-    precondition = pencil.shifted_inverse(sigma, 1e-2, True)
+    solve = pencil.shifted_inverse(sigma, INNER, pencil.is_positive)
     count = k + 1 + max(2, (k + 1) // 4)  # the last vectors converge slowly
     shape = pencil.size, pencil.size
 
@@ -591,20 +616,26 @@ def _by_lobpcg(pencil, k, maxiter):
         return LinearOperator(shape, matvec=lambda x: product(x.reshape(-1)), matmat=act, dtype=pencil.dtype)
 
     block = np.random.default_rng(1).standard_normal((count, pencil.size))
-    block = np.array([pencil._masked(line) for line in block]).T.astype(pencil.dtype)
+    block = np.array([pencil._masked(line) for line in block])
+    for _ in range(2):
+        block = np.array([solve(pencil.apply_mass(line)) for line in block])
+        bounds, block = _rayleigh_ritz(pencil, block)  # upper bounds of the eigenvalues
+    if pencil.is_positive:  # a preconditioner that is nearly singular would favour one vector
+        precondition = pencil.shifted_inverse(min(sigma, -0.1 * bounds[k]), 1e-2, True)
+    else:
+        precondition = pencil.shifted_inverse(sigma, 1e-2, False)
     mass = None if pencil.mass is None and np.ndim(pencil.weights) == 0 else of_columns(pencil.apply_mass)
     with catch_warnings():
         simplefilter("ignore")  # the residuals are tested below
         _, vectors = lobpcg(
             of_columns(pencil.apply_stiffness),
-            block,
+            block.T,
             mass,
             of_columns(precondition),
-            tol=1e-12 * pencil.scale,
+            tol=max(1e-8 * abs(bounds[k]), EPS * pencil.scale),
             maxiter=maxiter or 200,
             largest=False,
         )[:2]
-    solve = pencil.shifted_inverse(sigma, INNER, True)
     return _polished(pencil, solve, vectors.T, k)
 
 

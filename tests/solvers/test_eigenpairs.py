@@ -253,6 +253,29 @@ def test_other_parts_of_the_spectrum(which):
     assert np.allclose(pairs.values, dp.eigenpairs(op, 4, which, method="dense").values, rtol=1e-10, atol=1e-10)
 
 
+def test_a_fine_line():
+    """The shift is near to the lowest eigenvalues, though the rows are 10^6 times as large."""
+    for walls, first in ((dp.dirichlet, 1), (dp.neumann, 0)):
+        pairs = dp.eigenpairs(-dp.laplacian(dp.Grid(3000, size=1.0), walls), 3)
+        modes = np.arange(first, first + 3)
+        assert np.allclose(pairs.values, 4.0 * 3000**2 * np.sin(0.5 * np.pi * modes / 3000) ** 2, rtol=1e-10)
+
+
+def test_the_largest_eigenvalues_of_a_plane():
+    pairs = dp.eigenpairs(-dp.laplacian(dp.Grid((30, 30), size=1.0), dp.dirichlet), 2, "largest")
+    last, before = 4.0 * 900 * np.sin(0.5 * np.pi * np.array([30, 29]) / 30) ** 2
+    assert np.allclose(pairs.values, [last + before, 2 * last], rtol=1e-12) and pairs.cut == (True, False)
+
+
+def test_coefficients_that_jump():
+    grid = dp.Grid((24, 24), size=1.0)
+    solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.neumann))
+    x, y = grid.centres()
+    k = dp.harmonic_average(grid)(np.where(np.sin(9 * x) * np.sin(7 * y) > 0.3, 1e6, 1.0))
+    found, expected = (dp.eigenpairs(solve, 3, coefficients=k, method=method).values for method in ("arpack", "dense"))
+    assert np.allclose(found, expected, rtol=1e-6, atol=1e-5) and found[0] == 0.0
+
+
 def test_an_operator_with_eigenvalues_of_both_signs():
     grid = dp.Grid((25, 25), size=1.0)
     op = -dp.laplacian(grid, dp.dirichlet) - 60.0 * dp.identity(grid.cells)
