@@ -27,6 +27,13 @@ class Bug(NamedTuple):
 
 
 BUGS = {
+    "a bound step that takes a mixed wall for an inflow": Bug(
+        "advection/eulerian.py",
+        "len(self.settings.space.parts) == 1 and not self._repeated[0].size\n",
+        "len(self.settings.space.parts) == 1\n",
+        "tests/advection/test_patches.py",
+        compiled=True,
+    ),
     "one number as a value and as a slope on a wall": Bug(
         "operators/masks_and_lift.py",
         "                if np.shape(part) == () and (isbox(part) or part != 0):\n",
