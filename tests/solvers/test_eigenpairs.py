@@ -26,7 +26,7 @@ def numbers(shape, seed):
 K, MASS = numbers(GRID.faces.shape, 0), numbers(GRID.shape, 1)
 X = (K, 0.4, MASS)
 T = tuple(np.random.default_rng(2).standard_normal(np.shape(part)) for part in X)
-WEIGHTS = np.random.default_rng(3).standard_normal((5, *GRID.shape))
+WEIGHTS = np.random.default_rng(3).standard_normal((3, *GRID.shape))
 
 
 def twin(k, shift, mass):
@@ -35,11 +35,11 @@ def twin(k, shift, mass):
     roots = anp.sqrt(anp.reshape(mass, (-1,)))
     B = A / roots / anp.reshape(roots, (-1, 1))
     values, vectors = anp.linalg.eigh(0.5 * (B + B.T))
-    return values[:5], anp.reshape((vectors / anp.reshape(roots, (-1, 1))).T[:5], (5, *GRID.shape))
+    return values[:3], anp.reshape((vectors / anp.reshape(roots, (-1, 1))).T[:3], (3, *GRID.shape))
 
 
 def ours(k, shift, mass):
-    pairs = dp.eigenpairs(SOLVE, 5, coefficients=(k, shift), mass=mass)
+    pairs = dp.eigenpairs(SOLVE, 3, coefficients=(k, shift), mass=mass)
     return pairs.values, pairs.vectors
 
 
@@ -52,7 +52,7 @@ SIGNS = sign(twin(*X)[1])
 
 
 def of_pairs(values, vectors):
-    return anp.sum(values**2 * np.arange(1, 6)) + anp.sum((WEIGHTS * vectors) ** 3) + anp.sum(WEIGHTS * vectors)
+    return anp.sum(values**2 * np.arange(1, 4)) + anp.sum((WEIGHTS * vectors) ** 3) + anp.sum(WEIGHTS * vectors)
 
 
 def loss(x):
@@ -77,7 +77,8 @@ def test_derivatives_are_those_of_eigh():
     expected, slopes = value_and_grad(reference)(X)
     assert value == pytest.approx(expected, rel=1e-12)
     near(gradient, slopes)
-    assert pushforward(loss, X, T)[1] == pytest.approx(jvp(reference, X, T)[1], rel=1e-9)
+    along = sum(np.sum(slope * t) for slope, t in zip(slopes, T, strict=True))
+    assert pushforward(loss, X, T)[1] == pytest.approx(along, rel=1e-9)
     second = hvp(reference, X, T)
     near(hvp(loss, X, T), second)
     near(grad(lambda x: sum(anp.sum(part * t) for part, t in zip(grad(loss)(x), T, strict=True)))(X), second)
@@ -171,9 +172,9 @@ def test_a_cluster_is_recognised():
     assert pairs_of_square(ONES, 2).cut == (False, True)
 
 
-@pytest.mark.parametrize("direction", [np.cos(np.arange(ONES.size)), np.cos(np.arange(ONES.size)) ** 3])
-def test_functions_of_a_cluster_have_derivatives(direction):
+def test_functions_of_a_cluster_have_derivatives():
     """Against differences of second order: the perturbed values are apart, and the functions stay smooth."""
+    direction = np.cos(np.arange(ONES.size))
     step = 1e-3
     above, centre, below = (of_cluster(ONES + t * direction) for t in (step, 0.0, -step))
     first = np.sum(grad(of_cluster)(ONES) * direction)
@@ -267,8 +268,9 @@ def test_the_largest_eigenvalues_of_a_plane():
     assert np.allclose(pairs.values, [last + before, 2 * last], rtol=1e-12) and pairs.cut == (True, False)
 
 
+@pytest.mark.whole
 def test_coefficients_that_jump():
-    grid = dp.Grid((24, 24), size=1.0)
+    grid = dp.Grid((14, 14), size=1.0)
     solve = dp.elliptic_solver(dp.divergence(grid), dp.gradient(grid, dp.neumann))
     x, y = grid.centres()
     k = dp.harmonic_average(grid)(np.where(np.sin(9 * x) * np.sin(7 * y) > 0.3, 1e6, 1.0))
