@@ -6,6 +6,7 @@ Each case is written twice: with the library, and with slices (the twin), which 
 - the twin under autograd,
 - a loop of steps, and a rollout of the step,
 - the same with ``dp.jit(step)``, and ``dp.jit(loss)`` of the loss with the plain loop,
+- a rollout of ``dp.jit(step, compile=True)``, and ``dp.jit(loss, compile=True)`` of the loss with the rollout,
 - the twin under ``jax.jit``.
 
 All rows of a case run in turn. The columns are the time of the value, median and minimum of the time of value and
@@ -45,6 +46,18 @@ case = burgers()
 begun = time.process_time()
 gradient(looped(case))(case.x)
 print(time.process_time() - begun)
+"""
+
+FIRST_COMPILED = """
+import time
+
+import sparsedp as dp
+from benchmarks.small import {case}, gradient, rolled
+case = {case}()
+gradient(rolled(case._replace(n=1)))(case.x)
+begun = time.perf_counter()
+gradient(rolled(case._replace(step=dp.jit(case.step, compile=True))))(case.x)
+print(time.perf_counter() - begun)
 """
 
 
@@ -212,6 +225,37 @@ def lorenz(n=40, h=0.05):
     return Case("Lorenz-96, 40 variables", 20, start, lambda u: (u, 8.0), step, twin, total, None, 5.0, 50)
 
 
+def pendulums(n=50, intervals=60, dt=0.2):
+    """Fifty pendulums on one trolley (examples/pendulums.py): their energy at the end, derivatives in the lengths."""
+
+    def rate(np):
+        def slopes(state, lengths):
+            angle, turning = state
+            return turning, -(9.81 * np.sin(angle) + 0.3 * np.cos(angle)) / lengths
+
+        return slopes
+
+    def twin(np):
+        slopes = rate(np)
+
+        def shifted(state, slope, h):
+            return state[0] + h * slope[0], state[1] + h * slope[1]
+
+        def step(state, lengths):
+            a = slopes(state, lengths)
+            b = slopes(shifted(state, a, dt / 2), lengths)
+            c = slopes(shifted(state, b, dt / 2), lengths)
+            d = slopes(shifted(state, c, dt), lengths)
+            return tuple(u + dt / 6 * (k + 2 * l + 2 * m + q) for u, k, l, m, q in zip(state, a, b, c, d))
+
+        return step
+
+    energy = lambda np, state: np.mean(0.5 * state[1] ** 2 - 9.81 * np.cos(state[0]))
+    begin = lambda lengths: ((np.full(n, 0.5), np.zeros(n)), lengths)
+    step = dp.stepper("rk4", rate(anp), dt)
+    return Case("fifty pendulums, rk4", intervals, np.linspace(5.0, 15.0, n), begin, step, twin, energy, None, None, 20)
+
+
 def eigenvectors(grid, boundary):
     """Return the eigenvalues of the Laplacian, an array (n, n), and the eigenvectors along one axis."""
     line = dp.laplacian(dp.Grid(grid.shape[0], size=1.0), boundary).matrix.toarray()
@@ -295,8 +339,10 @@ def forms(case):
     losses["jit step in a loop"] = looped(recorded)
     losses["jit step in rollout"] = rolled(case._replace(step=dp.jit(case.step)))
     losses["jit loss"] = dp.jit(looped(case))
+    losses["compiled step in rollout"] = rolled(case._replace(step=dp.jit(case.step, compile=True)))
+    losses["compiled loss"] = dp.jit(rolled(case), compile=True)
     if case.n == 1:
-        del losses["rollout"], losses["jit step in rollout"]
+        del losses["rollout"], losses["jit step in rollout"], losses["compiled step in rollout"]
     return losses
 
 
@@ -420,7 +466,7 @@ def of_autograd():
     return 1e6 * (best[120] - best[20]) / 100
 
 
-CASES = (burgers, donor_cell, predators, lorenz, smoke, poisson, reaction_diffusion)
+CASES = (burgers, donor_cell, predators, lorenz, pendulums, smoke, poisson, reaction_diffusion)
 
 
 def main(words):
@@ -437,6 +483,10 @@ def main(words):
     for name, seconds in best_times(tasks, 10).items():
         print(f"51 gradients of Burgers composed, {name:12} {1e3 * seconds:7.1f} ms, limit 100")
     print(f"autograd's own tape takes {of_autograd():.1f} us a primitive, 5 where the limits were measured")
+    for build in (predators, lorenz, pendulums):
+        code = FIRST_COMPILED.format(case=build.__name__)
+        first = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        print(f"first gradient of a process, compiled rollout, {build().name:24} {1e3 * float(first.stdout):7.1f} ms")
     first = subprocess.run([sys.executable, "-c", FIRST], capture_output=True, text=True, check=True)
     print(f"first gradient of a process, numba loaded {1e3 * float(first.stdout):7.1f} ms, limit 50")
 

@@ -54,7 +54,7 @@ DOORS = [
     ("autograd.numpy.numpy_vspaces", r"autodiff/tape\.py", ()),
     ("autograd.numpy.numpy_wrapper", r"autodiff/tape\.py", ()),
     ("pyamg", r"solvers/algebraic_multigrid\.py", ()),
-    ("llvmlite", r"nowhere", ()),
+    ("llvmlite", r"autodiff/compiled_program\.py", ()),
     ("numba", r"kernels/.*|solvers/structured_multigrid/loops\.py", ()),
     ("matplotlib", r"report/plots\.py", ()),
     ("tqdm", r"_utils/progress\.py", ()),
@@ -87,6 +87,7 @@ EXTRAS = (
     "PIL",
     "xarray",
     "pyevtk",
+    "llvmlite",
 )  # foreign libraries that need not be there
 LAZY = (
     "pyamg",

@@ -223,6 +223,48 @@ BUGS = {
         "        if True:\n            out[...] = 0\n        out.reshape(-1)[row]",
         "tests/operators/test_patches.py",
     ),
+    "memory of a compiled program that the open loop still reads": Bug(
+        "autodiff/compiled_program.py",
+        "            start = min(start, self._group_start)\n",
+        "            pass\n",
+        "tests/autodiff/test_jit_compile.py",
+    ),
+    "entries of a movement that come from the wrong argument": Bug(
+        "autodiff/compiled_program.py",
+        'np.searchsorted(ends, places, side="right")',
+        'np.searchsorted(ends, places, side="left")',
+        "tests/autodiff/test_jit_compile.py",
+    ),
+    "a compiled loop that cuts the cotangent one step late": Bug(
+        "autodiff/compiled_program.py",
+        "builder.srem(builder.sub(n, step), period), zero)",
+        "builder.srem(builder.sub(builder.sub(n, step), ir.Constant(INDEX, 1)), period), zero)",
+        "tests/trajectory/test_rollout_compile.py",
+    ),
+    "cotangents of params of a compiled loop that are not added": Bug(
+        "autodiff/compiled_program.py",
+        "self.store(self.builder.fadd(self.load(pointer, i, dtype), entry), pointer, i, dtype)",
+        "self.store(entry, pointer, i, dtype)",
+        "tests/trajectory/test_rollout_compile.py",
+    ),
+    "a compiled program that differs and is used": Bug(
+        "autodiff/compiled_program.py",
+        "            if not all(map(self._agree, expected, results)):\n",
+        "            if False:\n",
+        "tests/autodiff/test_jit_compile.py::test_a_wrong_translation_is_not_used",
+    ),
+    "a compiled loop that is not compared": Bug(
+        "trajectory/recorded_steps.py",
+        "            if not self._agrees(loop):\n",
+        "            if False:\n",
+        "tests/autodiff/test_jit_compile.py::test_a_wrong_translation_is_not_used",
+    ),
+    "NaN that a compiled program returns without its recorded program": Bug(
+        "autodiff/compiled_program.py",
+        "        if not self._run(memory):\n            return self._recorded(*values)\n",
+        "        self._run(memory)\n",
+        "tests/autodiff/test_jit_compile.py::test_values_that_are_not_finite_are_those_of_numpy",
+    ),
     "constants of a program that the caller can still change": Bug(
         "autodiff/program_trace.py",
         "        kept = tuple(arg if type(arg) is Slot else constant(arg) for arg in args)\n",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from contextlib import contextmanager
 from functools import partial, update_wrapper
+from importlib import import_module
 from math import inf
 from operator import getitem
 from threading import RLock
@@ -29,7 +30,7 @@ from sparsedp.autodiff.derivative import (
     zero_like,
 )
 from sparsedp.autodiff.program import compile_program, free_slots, needed_calls
-from sparsedp.autodiff.program_trace import ProgramTrace, Slot, opaque, open_traces, refuse_outer_trace
+from sparsedp.autodiff.program_trace import ProgramTrace, Slot, array_copy, opaque, open_traces, refuse_outer_trace
 from sparsedp.autodiff.tape import (
     ForwardNode,
     Rule,
@@ -53,6 +54,8 @@ from sparsedp.errors import JitError, JitWarning
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from sparsedp.autodiff.program_trace import ProgramCall
+
 __all__ = ["Jitted", "PullbackProgram", "gap", "tree_form", "is_watched", "jit", "opaque"]
 
 FORMS_BEFORE_WARNING = 8
@@ -71,7 +74,7 @@ OF_TRACED_VALUES = (
 VALUE_TOLERANCE = 1e4
 
 
-def jit(function: Callable, check: bool = True) -> Jitted:
+def jit(function: Callable, check: bool = True, compile: bool = False) -> Jitted:
     """Return a function that records its first call and replays it as a program, without Python's overhead.
 
     The first call with arguments of a new form runs the function and records all calls of NumPy, rules, Operators and
@@ -87,6 +90,10 @@ def jit(function: Callable, check: bool = True) -> Jitted:
         values of arrays must not decide what it does (``if``, ``while``, ``float()``).
     check : bool
         Whether each program is compared with the function once, in its next call with other numbers.
+    compile : bool
+        Whether programs are translated to machine code. For functions of small arrays, and for rollouts of such steps,
+        whose loop becomes one call. The last bits of results may then differ from those of NumPy. Needs the extra
+        `fast`. See Notes.
 
     Returns
     -------
@@ -99,6 +106,8 @@ def jit(function: Callable, check: bool = True) -> Jitted:
     ------
     TypeError
         If `function` is not callable.
+    ImportError
+        If `compile` is used and llvmlite is not installed.
     JitError
         When the returned function is called: if the function makes a decision by values, or if its program differs from
         it because it is not pure.
@@ -117,7 +126,17 @@ def jit(function: Callable, check: bool = True) -> Jitted:
     **Cost.** A recording takes about as long as ten calls. It pays for small arrays, where Python takes most of the
     time of a call. Use it for the step of a `rollout`, or for a whole loss.
 
-    **Numbers.** Values are equal bit for bit to those of the function, and derivatives up to rounding.
+    **Numbers.** Values are equal bit for bit to those of the function, and derivatives up to rounding. With `compile`,
+    values are equal up to rounding too: `exp`, `log`, `tanh`, `pow` and others are those of the C library, which differ
+    from NumPy's in the last bit for a few per cent of all arguments, and sums along axes have another order. NumPy's
+    warnings, for example of a division by zero, are not issued.
+
+    **Machine code.** Programs of arithmetic, functions of entries, comparisons, `where`, `sum`, `mean`, products of
+    small matrices, Operators, and functions that move entries (slices, `roll`, `reshape`, `concatenate`) are translated
+    by LLVM, the compiler of numba, in 0.1 to 1 s. Programs with any other call, a rule or a solve for example, and
+    programs of complex numbers or integers remain as they are: ``jitted.not_compiled`` names these calls. A rollout is
+    one call of machine code unless `memory` is a number, `progress` is used or `keep` is a function; then each step is
+    one. Whenever a result is not finite, the recorded program runs instead, with its checks and errors.
 
     Examples
     --------
@@ -127,7 +146,9 @@ def jit(function: Callable, check: bool = True) -> Jitted:
     (5.0, array([2., 4.]))
     """
     check_function("jit", function, "lambda x: ...")
-    return Jitted(function, bool(check))
+    if compile:
+        import_module("sparsedp.autodiff.compiled_program")  # raises ImportError without llvmlite
+    return Jitted(function, bool(check), compiles=bool(compile))
 
 
 class Jitted(Reconstructible):
@@ -139,13 +160,19 @@ class Jitted(Reconstructible):
         The function itself.
     forms : int
         Number of forms that were recorded.
+    not_compiled : tuple of str
+        With ``compile=True``: the calls because of which programs were not translated to machine code.
     """
 
-    def __init__(self, function: Callable, check: bool = True, falls_back: bool = False) -> None:
+    def __init__(
+        self, function: Callable, check: bool = True, falls_back: bool = False, compiles: bool = False
+    ) -> None:
         self.function = function
         self.name = name_of(function)
         self.check = check
         self.falls_back = falls_back
+        self.compiles = compiles
+        self._reasons: dict[str, None] = {}  # why programs were not compiled, in order
         self._recorded: dict[Any, Recorded] = {}
         self._gradients: dict[int, Jitted] = {}
         self._hessian_product: Jitted | None = None
@@ -158,10 +185,29 @@ class Jitted(Reconstructible):
 
     def recipe(self) -> tuple[Callable, tuple]:
         """Return the call that constructs this object again."""
-        return Jitted, (self.function, self.check, self.falls_back)
+        return Jitted, (self.function, self.check, self.falls_back, self.compiles)
 
     def __repr__(self) -> str:
-        return f"<jit of {self.name}: {self.forms} forms recorded>"
+        text = f"jit of {self.name}: {self.forms} forms recorded"
+        if self._reasons:
+            text = f"{text}, not compiled because of {', '.join(self._reasons)}"
+        return f"<{text}>"
+
+    @property
+    def not_compiled(self) -> tuple[str, ...]:
+        """Return the calls because of which programs were not translated to machine code."""
+        return tuple(self._reasons)
+
+    def note_not_compiled(self, reason: str) -> None:
+        """Note why a program was not translated to machine code."""
+        if reason != "rollout":  # its steps are translated by themselves
+            self._reasons[reason] = None
+
+    def related(self, function: Callable, falls_back: bool) -> Jitted:
+        """Return another function that is recorded with the same options, for a part or derivative of this one."""
+        other = Jitted(function, self.check, falls_back, self.compiles)
+        other._reasons = self._reasons
+        return other
 
     def __call__(self, *args: Any, **options: Any) -> Any:
         """Call the function, by its program if there is one for arguments of this form."""
@@ -179,6 +225,7 @@ class Jitted(Reconstructible):
             if not nums:
                 return recorded.value(variables)
             program = recorded.pullback(nums, variables)
+            program.compile()
         except JitError:
             if not self.falls_back:
                 raise
@@ -220,7 +267,7 @@ class Jitted(Reconstructible):
         """Return the jitted function ``value_and_grad(function, argnum)``, which `value_and_grad` calls."""
         known = self._gradients.get(argnum)
         if known is None:
-            known = Jitted(value_and_grad(self.function, argnum), self.check, self.falls_back)
+            known = self.related(value_and_grad(self.function, argnum), self.falls_back)
             known.name = f"value_and_grad({self.name})"
             known = self._gradients.setdefault(argnum, known)
         return known
@@ -228,7 +275,7 @@ class Jitted(Reconstructible):
     def jitted_hvp(self, x: Any, tangent: Any) -> Any:
         """Return ``hvp(function, x, tangent)`` by a program."""
         if self._hessian_product is None:
-            product = Jitted(partial(hvp, self.function), self.check, falls_back=True)
+            product = self.related(partial(hvp, self.function), falls_back=True)
             product.name = f"hvp({self.name})"
             self._hessian_product = product
         return self._hessian_product(x, tangent)
@@ -242,7 +289,7 @@ class Jitted(Reconstructible):
         plain_args, plain_options = rebuild([entry._value if isbox(entry) else entry for entry in entries])
         known = self._tangents.get(places)
         if known is None:
-            known = Jitted(partial(_value_and_tangent, self.function, places), self.check, falls_back=True)
+            known = self.related(partial(_value_and_tangent, self.function, places), falls_back=True)
             known.name = f"jvp({self.name})"
             known = self._tangents.setdefault(places, known)
         value, tangent = known(plain_args, plain_options, tangents)
@@ -399,9 +446,10 @@ class Recorded:
 
     def __init__(self, jitted: Jitted, args: tuple, options: dict, variables: Sequence) -> None:
         self.name = jitted.name
+        self.jitted = jitted
         self._check = jitted.check
         self._function = jitted.function
-        self.first = [_copied(sample(variable)) for variable in variables]
+        self.first = [array_copy(sample(variable)) for variable in variables]
         self.eps = max([np.finfo(dtype_of(value)).eps for value in self.first], default=0.0)
         self._strided = [num for num, variable in enumerate(variables) if _is_strided(sample(variable))]
         check_leaves("args", (args, options))
@@ -412,7 +460,11 @@ class Recorded:
         self._rebuild = flatten(_without_leaves((args, options)))[1]
         self._pullbacks: dict[tuple, PullbackProgram] = {}
         self._value: Any = None
-        self._value_is_checked = False
+        self.value_is_checked = False
+        self._loops: dict[tuple, Any] = {}
+        # For a step of a rollout, by the number of variables of the state: for each of them its position among the
+        # results, see `trajectory.recorded_steps`.
+        self.orders: dict[int, list[int]] = {}
 
     def arguments(self, variables: Sequence) -> tuple[tuple, dict]:
         """Return the arguments of the function with the given floating leaves."""
@@ -426,33 +478,39 @@ class Recorded:
     def begin(self) -> tuple[ProgramTrace, list[Slot]]:
         """Return a new trace, and the slots of the variables."""
         trace = ProgramTrace(new_trace(), opaque_call)
-        return trace, [trace.slot(_copied(value)) for value in self.first]
+        trace.owner = self.jitted
+        return trace, [trace.slot(array_copy(value)) for value in self.first]
 
     def dense(self, variables: Sequence) -> Sequence:
         """Return the variables with copies of arrays that are not contiguous, in the layout of the recording."""
         if not self._strided:
             return variables
-        return placed(variables, self._strided, [_copied(variables[num]) for num in self._strided])
+        return placed(variables, self._strided, [array_copy(variables[num]) for num in self._strided])
 
     def value(self, variables: Sequence) -> Any:
         """Return the result of the function by its program."""
         outputs, results = self.results(variables)
         return outputs.build(results)
 
-    def outputs(self) -> Outputs:
-        """Return the outputs of the function."""
+    def value_program(self) -> tuple[Executable, Outputs]:
+        """Return the program of the function, and its outputs."""
         if self._value is None:
             self._value = self._record_value()
-        return self._value[1]
+        return self._value
 
-    def results(self, variables: Sequence) -> tuple[Outputs, tuple]:
+    def outputs(self) -> Outputs:
+        """Return the outputs of the function."""
+        return self.value_program()[1]
+
+    def results(self, variables: Sequence, compiles: bool = True) -> tuple[Outputs, tuple]:
         """Return the outputs of the function, and their values by its program, checked once."""
-        outputs = self.outputs()
-        run, _ = self._value
-        results = run(*self.dense(variables))
-        if not self._value_is_checked and self._is_to_be_checked(variables):
+        program, outputs = self.value_program()
+        if compiles:
+            program.compile()
+        results = program.run(*self.dense(variables))
+        if not self.value_is_checked and self._is_to_be_checked(variables):
             check_program(self.name, self.call(self.arguments(variables)), outputs.build(results), self.eps)
-            self._value_is_checked = True
+            self.value_is_checked = True
         return outputs, results
 
     def pullback(self, nums: tuple[int, ...], variables: Sequence) -> PullbackProgram:
@@ -478,7 +536,79 @@ class Recorded:
         with _recording(self.name):
             result = self.call(self.arguments(boxes))
         outputs = Outputs(trace, inputs, result)
-        return compile_program(trace, needed_calls(trace.calls, outputs.slots), inputs, outputs.slots), outputs
+        return Executable(self, trace, needed_calls(trace.calls, outputs.slots), inputs, outputs.slots), outputs
+
+    def compiled_loop(
+        self, parts: tuple[Any, Any], order: Sequence[int], n_params: int, nums: Sequence[int] = (), n_saved: int = 0
+    ) -> Any:
+        """Return all steps of a rollout as machine code, None if that is not possible; see `CompiledLoop`."""
+        from sparsedp.autodiff.compiled_program import CompiledLoop, NotCompiled
+
+        key = tuple(order), n_params, tuple(nums)
+        if key not in self._loops:
+            self._loops[key] = None
+            try:
+                self._loops[key] = CompiledLoop(parts[0], parts[1], order, n_params, nums, n_saved)
+            except NotCompiled as error:
+                self.jitted.note_not_compiled(str(error))
+        return self._loops[key]
+
+    def refuse_loop(self, loop: Any, reason: str) -> None:
+        """Do not use a `CompiledLoop` any more."""
+        for key, known in self._loops.items():
+            if known is loop:
+                self._loops[key] = None
+        self.jitted.note_not_compiled(reason)
+
+    def agree(self, expected: Any, result: Any) -> bool:
+        """Return whether a result of machine code equals that of the recorded program up to rounding."""
+        return _agree(expected, result, self.eps)
+
+
+class Executable:
+    """A program: Python code or, once it has been compiled, machine code.
+
+    Parameters
+    ----------
+    recorded : Recorded
+    trace, calls, inputs, results
+        The arguments of `compile_program`.
+
+    Attributes
+    ----------
+    run : callable
+        ``run(*inputs) -> results``.
+    parts : tuple or None
+        The parameters `trace`, `calls`, `inputs` and `results`, if machine code is wanted.
+    """
+
+    def __init__(
+        self,
+        recorded: Recorded,
+        trace: ProgramTrace,
+        calls: Sequence[ProgramCall],
+        inputs: Sequence[Slot],
+        results: Sequence[Any],
+    ) -> None:
+        self.run = compile_program(trace, calls, inputs, results)
+        self.parts: tuple | None = None
+        self._recorded = recorded
+        if recorded.jitted.compiles:
+            self.parts = trace, calls, inputs, results
+        self._is_compiled = False
+
+    def compile(self) -> None:
+        """Translate the program to machine code, if that is wanted and possible."""
+        if self._is_compiled or self.parts is None:
+            return
+        self._is_compiled = True
+        from sparsedp.autodiff.compiled_program import CompiledProgram, NotCompiled
+
+        recorded = self._recorded
+        try:
+            self.run = CompiledProgram(self.parts, self.run, recorded.agree, recorded.jitted.note_not_compiled)
+        except NotCompiled as error:
+            recorded.jitted.note_not_compiled(str(error))
 
 
 def check_program(name: str, expected: Any, result: Any, eps: float) -> None:
@@ -496,8 +626,12 @@ def check_program(name: str, expected: Any, result: Any, eps: float) -> None:
 
 def _agree(expected, found, eps=0.0):
     """Return whether two leaves are equal up to rounding, numbers in any precision."""
-    if is_variable(expected) and np.ndim(expected) == np.ndim(found) == 0 and np.array_equal(expected, found):
-        return True
+    if is_variable(expected) and is_variable(found) and np.ndim(expected) == np.ndim(found) == 0:
+        dtypes = dtype_of(expected), dtype_of(found)
+        eps = max(eps, *[np.finfo(dtype).eps for dtype in dtypes])
+        common = np.result_type(*dtypes)
+        expected = np.asarray(expected, common)
+        found = np.asarray(found, common)
     return gap(expected, found, eps) <= VALUE_TOLERANCE
 
 
@@ -533,12 +667,6 @@ def _same(a, b):
 
 def _is_strided(value):
     return isinstance(value, np.ndarray) and not value.flags.c_contiguous
-
-
-def _copied(value):
-    if isinstance(value, np.ndarray):
-        return value.copy("K")
-    return value
 
 
 def _without_leaves(tree):
@@ -583,7 +711,7 @@ class Outputs:
             elif isbox(end):
                 refuse_outer_trace()
             elif isinstance(end, np.ndarray):
-                slot = trace.call(_copied, end)
+                slot = trace.call(array_copy, end)
             else:
                 self._statics.append(constant(end))
                 continue
@@ -603,13 +731,13 @@ def _own_array(trace, slot, others):
         return slot
     producer = next((call for call in trace.calls if call.result is slot), None)
     if producer is None:
-        return trace.call(_copied, slot)
+        return trace.call(array_copy, slot)
     used = [trace.sample(arg) for arg in producer.args]
     shares = any(isinstance(arg, np.ndarray) and np.may_share_memory(value, arg) for arg in used)
     is_new = is_fresh(producer.function) or (value.base is None and not shares)
     if is_new and all(slot.number != other.number for other in others):
         return slot
-    return trace.call(_copied, slot)
+    return trace.call(array_copy, slot)
 
 
 class PullbackProgram:
@@ -668,12 +796,26 @@ class PullbackProgram:
         self.saved_bytes = _bytes_of(trace, self._saved, inputs)
         results_and_saved = [*self.outputs.slots, *self._saved]
         forward_calls = needed_calls(trace.calls[:n_forward], results_and_saved)
-        self._forward = compile_program(trace, forward_calls, inputs, results_and_saved)
-        self.backward = compile_program(trace, backward_calls, [*self._saved, *cotangent_slots], cotangents)
+        self._forward = Executable(recorded, trace, forward_calls, inputs, results_and_saved)
+        self._backward = Executable(recorded, trace, backward_calls, [*self._saved, *cotangent_slots], cotangents)
+
+    def compile(self) -> None:
+        """Translate both programs to machine code, if that is wanted and possible."""
+        self._forward.compile()
+        self._backward.compile()
+
+    def backward(self, *saved_and_cotangents: Any) -> tuple:
+        """Return the cotangents of the variables `nums`; None for a variable that the result does not depend on."""
+        return self._backward.run(*saved_and_cotangents)
+
+    def compiled_loop(self, order: Sequence[int], n_params: int) -> Any:
+        """Return all steps of a rollout as machine code, None if that is not possible; see `CompiledLoop`."""
+        parts = self._forward.parts, self._backward.parts
+        return self._recorded.compiled_loop(parts, order, n_params, self.nums, len(self._saved))
 
     def forward(self, variables: Sequence) -> tuple[tuple, tuple]:
         """Return the values of the result, and the values that `backward` needs before the cotangents."""
-        values = self._forward(*self._recorded.dense(variables))
+        values = self._forward.run(*self._recorded.dense(variables))
         return values[: self._n_results], values[self._n_results :]
 
     def compare(self, variables: Sequence) -> None:
@@ -800,7 +942,7 @@ def opaque_call(function: Callable, args: tuple, options: dict) -> Any:
     nums = innermost(variables)
     owner = getattr(function, "__self__", args[0] if args else None)
     name = getattr(owner, "name", None)
-    if not isinstance(name, str):
+    if not isinstance(name, str) or isinstance(owner, Jitted):
         name = name_of(function)
     rule = OpaqueCall(name, function, structure, nums)
     return rule.build(through(rule, nums, *variables))

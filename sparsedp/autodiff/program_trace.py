@@ -38,7 +38,9 @@ __all__ = [
     "ProgramNode",
     "ProgramTrace",
     "Slot",
+    "array_copy",
     "check_values",
+    "finiteness_check",
     "is_recorded",
     "opaque",
     "open_traces",
@@ -118,6 +120,8 @@ class ProgramTrace:
         The values in the execution that was recorded, in the order of the slots.
     refusal : JitError or None
         The reason why the function cannot be recorded.
+    owner : Jitted or None
+        The jitted function that is recorded.
     """
 
     def __init__(self, number: int, opaque_call: Callable) -> None:
@@ -126,6 +130,7 @@ class ProgramTrace:
         self.calls: list[ProgramCall] = []
         self.samples: list[Any] = []
         self.refusal: JitError | None = None
+        self.owner: Any = None
 
     def refused(self, error: JitError) -> JitError:
         """Return an error to be raised, which `check` raises again if the recorded function catches it."""
@@ -240,6 +245,13 @@ def _refuse_hidden(function, args):
 notrace_primitives[ProgramNode] = OF_SHAPES
 
 
+def array_copy(value: Any) -> Any:
+    """Return a copy of an array in the same memory layout, and any other value unchanged."""
+    if isinstance(value, np.ndarray):
+        return value.copy("K")
+    return value
+
+
 def is_recorded(value: Any) -> bool:
     """Return True if the outermost box of a value belongs to a `ProgramTrace`."""
     return type(value) in box_types and type(value._node) is ProgramNode
@@ -280,6 +292,12 @@ def check_values(check: Callable, *args: Any) -> None:
     if trace is not None:
         slots = [trace.unboxed(recorded_level(arg)) for arg in args]
         trace.add(check, slots, {}, None, has_effect=True)
+
+
+def finiteness_check(function: Callable) -> Callable:
+    """Mark a function for `check_values` that does nothing if all its arguments are finite."""
+    function.checks_finiteness = True  # type: ignore[attr-defined]
+    return function
 
 
 def opaque(function: Callable) -> Callable:

@@ -78,6 +78,7 @@ __all__ = [
     "Rule",
     "VJPNode",
     "VSpace",
+    "add_at",
     "added",
     "apply_operator",
     "autograd_rules",
@@ -87,11 +88,13 @@ __all__ = [
     "cast",
     "differentiable",
     "dtype_of",
+    "embedded",
     "executed_function",
     "fit",
     "forward_root",
     "innermost",
     "is_fresh",
+    "is_operator_call",
     "is_variable",
     "isbox",
     "linear",
@@ -632,7 +635,7 @@ def _add_recorded(total, g):
     return add_outgrads((total[0], False), g)[0], False
 
 
-def _add_at(total, g, index):
+def add_at(total: Any, g: Any, index: Any) -> Any:
     """Add g to the entries of an array at an index, in place."""
     total[index] += g
     return total
@@ -649,7 +652,7 @@ def _add_part(total, part):
         and not (isbox(g) and not is_recorded(g))
     ):
         trace = total[0]._node.trace
-        return trace.box(trace.call(_add_at, total[0]._node.slot, trace.unboxed(g), index)), True
+        return trace.box(trace.call(add_at, total[0]._node.slot, trace.unboxed(g), index)), True
     if total is not None and total[1] and type(total[0]) is np.ndarray and type(g) in REAL:
         total[0][index] += g
         return total
@@ -661,19 +664,20 @@ def _add_part(total, part):
 
 def _whole(g, index, shape):
     """Return an array of this shape with the part g, which may be traced, at the index and zeros elsewhere."""
-
-    def around(g):
-        whole = np.zeros(shape)
-        whole[index] = g
-        return whole[()]
-
     if not isbox(g):
-        return around(g)
+        return embedded(g, index, shape)
     if is_recorded(g):
         trace = g._node.trace
-        return trace.box(trace.call(around, g._node.slot))
-    embed, _ = linear("entries", around, lambda whole: whole[index])
+        return trace.box(trace.call(embedded, g._node.slot, index, shape))
+    embed, _ = linear("entries", lambda g: embedded(g, index, shape), lambda whole: whole[index])
     return embed(g)
+
+
+def embedded(g: Any, index: Any, shape: tuple) -> Any:
+    """Return an array of this shape with the part g at the index and zeros elsewhere."""
+    whole = np.zeros(shape)
+    whole[index] = g
+    return whole[()]
 
 
 # ---- calls -----------------------------------------------------------------------------------------------------------
@@ -1380,6 +1384,11 @@ def called(function: Callable, args: Sequence) -> Any:
     if function in (_primitive, _operator, through):
         return args[0]
     return function
+
+
+def is_operator_call(function: Callable) -> bool:
+    """Return whether a recorded function is the primitive of all Operators, whose arguments are (op, u)."""
+    return function is _operator
 
 
 def executed_function(function: Callable, args: Sequence, samples: Sequence) -> tuple[Callable, Sequence]:

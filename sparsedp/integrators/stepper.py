@@ -22,7 +22,7 @@ from sparsedp._utils.validation import (
     rounded_down,
 )
 from sparsedp.autodiff.derivative import is_finite
-from sparsedp.autodiff.program_trace import check_values, opaque, open_traces, recording_trace, sample
+from sparsedp.autodiff.program_trace import check_values, finiteness_check, opaque, open_traces, recording_trace, sample
 from sparsedp.autodiff.tape import is_variable, plain
 from sparsedp.errors import JitError, NonFiniteError, UnstableStepError
 from sparsedp.integrators.problem import Problem, check_pair, like, real_number
@@ -590,6 +590,7 @@ class Step(Reconstructible):
         for name, value in zip(*self._named_variables(state, params), strict=True):
             check_finite(f"{name} of {self.name}", np.asarray(sample(value)))
 
+    @finiteness_check
     def _check_finite_ends(self, n_ends: int, names: Sequence[str], h: Any, *values: Any) -> None:
         """Raise NonFiniteError if one of the first `n_ends` values, those of the new state, is not finite.
 

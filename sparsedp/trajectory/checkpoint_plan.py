@@ -94,6 +94,8 @@ class CheckpointPlan:
         """Return the indices of the states that the forward pass keeps, the last one included."""
         if self.is_reversing:
             return {self.n}
+        if not self.disk_slots and self.slots is None:
+            return set(range(self.n + 1))
         if not self.disk_slots:
             return {*checkpoints(self.n, self.slots), self.n}
         in_files = self.disk_indices()

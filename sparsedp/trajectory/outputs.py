@@ -60,6 +60,7 @@ class LastState:
 
     enters_everywhere = False  # whether the result depends directly on other states than the last one
     is_exact = True  # whether the states of the backward pass equal those of the forward pass bit for bit
+    takes_trajectories = True  # whether states may be given all at once, by `take`
     holds_all_states = False  # whether the result contains every state, so that none has to be computed again
 
     def __init__(self, form: ArgumentForm) -> None:
@@ -72,6 +73,13 @@ class LastState:
     def see(self, state: State) -> State:
         """Process the next state of the run; return the same state, possibly stored in other arrays."""
         return state
+
+    def take(self, trajectories: list, last: State) -> None:
+        """Process all states of a run, which are the rows of an array for each variable."""
+
+    def entering(self, n: int, cotangents: list) -> list | None:
+        """Return for each variable the cotangents of the result at states 0 to n; None if only the last has one."""
+        return None
 
     def finish(self, last: State) -> tuple:
         """End a run; return the arrays of the result."""
@@ -156,6 +164,26 @@ class SelectedStates(LastState):
             if np.ndim(values[k]) and self.holds_all_states:
                 values[k] = block[row]
         return state.with_values(values)
+
+    def take(self, trajectories: list, last: State) -> None:
+        """Store the selected states of a run, which are rows of an array for each variable."""
+        self._statics = [last.statics] * len(self._rows)
+        if self.holds_all_states:
+            self._blocks = list(trajectories)
+        else:
+            self._blocks = [block[list(self._rows)] for block in trajectories]
+
+    def entering(self, n: int, cotangents: list) -> list | None:
+        """Return for each variable an array of the cotangents of the result at states 0 to n."""
+        arrays = []
+        for block, shape, dtype in zip(self._grouped(cotangents), self.form.shapes, self.form.dtypes, strict=True):
+            if self.holds_all_states:
+                arrays.append(np.ascontiguousarray(block, dtype))
+            else:
+                array = np.zeros((n + 1, *shape), dtype)
+                array[list(self._rows)] = block
+                arrays.append(array)
+        return arrays
 
     def finish(self, last: State) -> tuple:
         """End a run; return the arrays of the result.
@@ -245,6 +273,7 @@ class FunctionOfStates(LastState):
     """
 
     enters_everywhere = True
+    takes_trajectories = False
 
     def __init__(self, form: ArgumentForm, function: Callable) -> None:
         super().__init__(form)

@@ -22,7 +22,7 @@ from sparsedp.autodiff.tape import Rule, fit, innermost, isbox, through
 from sparsedp.errors import DerivativeError, NonFiniteError
 from sparsedp.trajectory.disk_states import BackwardProgress, DiskStates, state_digest
 from sparsedp.trajectory.record import Record, backward_record, largest
-from sparsedp.trajectory.recorded_steps import recorded_runner
+from sparsedp.trajectory.recorded_steps import CompiledRun, compiled_run, recorded_runner
 from sparsedp.trajectory.specification import RolloutSpecification, stacked
 from sparsedp.trajectory.step_runner import State, StepRunner
 
@@ -365,7 +365,8 @@ class RolloutRule(Rule):
             self.stored = plan.stored_indices()
         else:
             self.stored = {0}
-        self._runs: list[tuple[StepRunner, KeptStates]] = []  # for the backward pass
+        self._runs: list[tuple[StepRunner, Any]] = []  # for the backward pass
+        self._compiles = True  # whether all steps may be one call of machine code
         self._last_fingerprint: list = []
 
     def forward(self, *args: Any) -> Any:
@@ -376,15 +377,22 @@ class RolloutRule(Rule):
             runner = recorded_runner(specification, args)
         if runner is None:
             runner = StepRunner(specification, args)
-        kept: KeptStates = []
+        kept: Any = []
         if self.disk is not None:
             kept = self._new_store(args)  # may contain states of an interrupted run
         with runner.errors_named():
-            try:
-                last = run_forward(runner, self.plan, self.outputs, self.stored, self.progress, kept)
-            except BaseException as error:
-                release(kept, error)
-                raise
+            run = None
+            if self._compiles and self.disk is None:
+                run = compiled_run(runner, self.plan, self.outputs, self.progress)
+            if run is not None:
+                last = run.last
+                kept = run
+            else:
+                try:
+                    last = run_forward(runner, self.plan, self.outputs, self.stored, self.progress, kept)
+                except BaseException as error:
+                    release(kept, error)
+                    raise
         for value in last.values:
             if not is_finite(value):
                 refuse_nonfinite_step(runner)
@@ -460,24 +468,25 @@ class RolloutRule(Rule):
         forward pass is repeated first.
         """
         specification = self.specification
-        if not runs:
+        interval = max(specification.n // SAMPLES, LEAST_INTERVAL)
+        compiled = None
+        if runs and isinstance(runs[0][1], CompiledRun):
+            if not any(map(isbox, g)):
+                compiled = runs[0][1].backward(self.outputs, g, interval)
+            if compiled is None:  # follow the steps of the recorded program
+                self._compiles = False
+                self.forward(*args)
+                runs[:] = self._take_runs()
+        elif not runs:
             last_fingerprint = self._last_fingerprint
             self.forward(*args)
             check_repeated(specification, self._last_fingerprint, last_fingerprint)
             runs.extend(self._take_runs())
-        runner, kept = runs[0] if self.plan.slots is None else runs.pop()
-        if runs:
-            kept = list(kept)
-        runner.recorder.ended = False
-        with runner.errors_named("in the backward pass through step"):
-            try:
-                backs, norms, recomputed = run_backward(runner, self.plan, self.outputs, kept, g, self.progress)
-            except BaseException as error:
-                release(kept, error)
-                raise
-        if isinstance(kept, DiskStates):
-            kept.remove()
-        runner.recorder.ended = True
+        if compiled is None:
+            backs, norms, recomputed = self._backward_steps(runs, g)
+        else:
+            backs, norms = compiled
+            recomputed = 0
         count("rollout.step", "vjp", specification.n)
         count("rollout.step", "recomputed", recomputed)
         last_cut = max(specification.cuts, default=-1)
@@ -492,3 +501,20 @@ class RolloutRule(Rule):
             else:
                 cotangents.append(back)
         return tuple(cotangents)
+
+    def _backward_steps(self, runs: list, g: list) -> tuple[list, list[tuple[int, float]], int]:
+        """Run a backward pass step by step, see `run_backward`."""
+        runner, kept = runs[0] if self.plan.slots is None else runs.pop()
+        if runs:
+            kept = list(kept)
+        runner.recorder.ended = False
+        with runner.errors_named("in the backward pass through step"):
+            try:
+                results = run_backward(runner, self.plan, self.outputs, kept, g, self.progress)
+            except BaseException as error:
+                release(kept, error)
+                raise
+        if isinstance(kept, DiskStates):
+            kept.remove()
+        runner.recorder.ended = True
+        return results

@@ -6,20 +6,26 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sparsedp.autodiff.derivative import zero_like
+from sparsedp.autodiff.derivative import random_like, zero_like
 from sparsedp.autodiff.jit import Jitted, is_watched, tree_form
 from sparsedp.autodiff.program_trace import Slot
-from sparsedp.autodiff.tape import added, isbox
+from sparsedp.autodiff.tape import added, fit, isbox
 from sparsedp.errors import JitError
+from sparsedp.trajectory.record import largest
 from sparsedp.trajectory.step_runner import State, StepRunner
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from sparsedp.autodiff.compiled_program import CompiledLoop
     from sparsedp.autodiff.jit import Outputs
+    from sparsedp.trajectory.checkpoint_plan import CheckpointPlan
+    from sparsedp.trajectory.outputs import LastState
     from sparsedp.trajectory.specification import RolloutSpecification
 
-__all__ = ["recorded_runner"]
+__all__ = ["CompiledRun", "compiled_run", "recorded_runner"]
+
+MOST_BYTES = 2**28  # memory for the states of a run without derivatives, of which some are returned
 
 
 def recorded_runner(specification: RolloutSpecification, args: Sequence) -> RecordedStepRunner | None:
@@ -68,7 +74,7 @@ class RecordedStepRunner(StepRunner):
         variables: list = []
         form = tree_form((arguments, {}), variables)
         self._n_state = len(self.first.values)
-        self._params = variables[self._n_state : self._n_state + len(self.params)]
+        self.plain_params = variables[self._n_state : self._n_state + len(self.params)]
         self._recorded = step.recorded(form, arguments, {}, variables)
         self._program: Any = None
         if specification.differentiated:
@@ -78,6 +84,8 @@ class RecordedStepRunner(StepRunner):
             outputs = self._program.outputs
         else:
             outputs = self._recorded.outputs()
+            if outputs.state_is_known and not self._recorded.value_is_checked:
+                self._recorded.results(variables, compiles=False)
         if not outputs.state_is_known:
             outputs.state_places = self._state_places(outputs, variables)
             outputs.state_is_known = True
@@ -86,6 +94,7 @@ class RecordedStepRunner(StepRunner):
         self._order = outputs.state_places or []
         # For each result of the program the position of its variable in the state.
         self._places = [self._order.index(place) for place in range(len(self._order))]
+        self._is_prepared = False
         self._differentiated_params = [root for root in self.param_roots if root]
 
     def _state_places(self, outputs: Outputs, variables: Sequence) -> list[int] | None:
@@ -94,7 +103,7 @@ class RecordedStepRunner(StepRunner):
         Return None if the step does not keep the form of the state. Raise an error if its result is no such state.
         """
         if self._program is None:
-            _, results = self._recorded.results(variables)
+            _, results = self._recorded.results(variables, compiles=False)
         else:
             results, _ = self._program.forward(variables)
         form = self.specification.state
@@ -107,7 +116,7 @@ class RecordedStepRunner(StepRunner):
 
     def _variables(self, state: State) -> list:
         """Return the variables of the arguments of the step that begins at a state."""
-        variables = state.values + self._params
+        variables = state.values + self.plain_params
         for block in self.inputs:
             variables.append(block[state.i])
         return variables
@@ -118,6 +127,9 @@ class RecordedStepRunner(StepRunner):
         variables = self._variables(state)
         if is_taped:
             program = self._program
+            if not self._is_prepared:
+                self._is_prepared = True
+                program.compile()
             if not program.is_checked:
                 self._recorded.pullback(program.nums, variables)
             results, saved = program.forward(variables)
@@ -125,6 +137,76 @@ class RecordedStepRunner(StepRunner):
         else:
             _, results = self._recorded.results(variables)
         return State(state.i + 1, [results[place] for place in self._order], state.statics)
+
+    def compiled_loop(self) -> CompiledLoop | None:
+        """Return all steps as machine code, if the user wants it and if it is possible."""
+        if not self._recorded.jitted.compiles or not all(map(is_plain_number, self.first.values)):
+            return None
+        loop = None
+        if self._program is not None:
+            loop = self._program.compiled_loop(self._order, len(self.params))
+        else:
+            program, _ = self._recorded.value_program()
+            loop = self._recorded.compiled_loop((program.parts, None), self._order, len(self.params))
+        if loop is not None and not loop.is_checked:
+            if not self._agrees(loop):
+                self._recorded.refuse_loop(loop, loop.DIFFERENT)
+                return None
+            loop.is_checked = True
+        return loop
+
+    def _agrees(self, loop):
+        """Return whether a loop of machine code agrees with the recorded programs for the first two steps."""
+        n = min(self.specification.n, 2)
+        program = self._program
+        state = self.first
+        tapes = []
+        for _ in range(n):
+            self.current = state
+            variables = self._variables(state)
+            if program is None:
+                _, results = self._recorded.results(variables, compiles=False)
+            else:
+                if not program.is_checked:
+                    self._recorded.pullback(program.nums, variables)
+                results, saved = program.forward(variables)
+                tapes.append(saved)
+            state = State(state.i + 1, [results[place] for place in self._order], state.statics)
+        trajectories = loop.trajectories(self.first.values, n + 1)
+        saved_blocks = loop.saved_blocks(n)
+        params = self.plain_params
+        if not loop.forward(trajectories, params, self.inputs, saved_blocks, 0, n):
+            return True  # not finite: the recorded programs run in any case
+        agree = self._recorded.agree
+        if not all(agree(value, block[n]) for value, block in zip(state.values, trajectories, strict=True)):
+            return False
+        if program is None:
+            return True
+        g = [random_like(value) for value in state.values]
+        inputs = [block[:n] for block in self.inputs]
+        found = loop.backward(trajectories, params, inputs, saved_blocks, g, None, n, 0, 0, 0, n)
+        if found is None:
+            return True
+        backs, input_cotangents, _ = found
+        sums: dict[int, Any] = {}
+        rows: dict[int, list] = {}
+        for saved in reversed(tapes):
+            pulled = program.backward(*saved, *[g[place] for place in self._places])
+            pulled = [
+                zero_like(variables[num]) if back is None else back
+                for num, back in zip(program.nums, pulled, strict=True)
+            ]
+            g = list(pulled[: self._n_state])
+            for num, back in zip(program.nums[self._n_state :], pulled[self._n_state :], strict=True):
+                if num < self._n_state + len(self.params):
+                    sums[num] = sums.get(num, 0.0) + back
+                else:
+                    rows.setdefault(num, []).insert(0, back)
+        expected = [*g, *sums.values(), *map(np.stack, rows.values())]
+        first_input = self._n_state + len(self.params)
+        results = backs[: self._n_state] + [backs[num] for num in sums]
+        results += [input_cotangents[num - first_input] for num in rows]
+        return all(map(agree, expected, results))
 
     def tape_size(self, state: State) -> int:
         """Return an estimate of the bytes that the tape of a state takes beside the state."""
@@ -159,6 +241,139 @@ class RecordedStepRunner(StepRunner):
         if all(back is None for back in backs):
             return None
         return backs
+
+
+def is_plain_number(value: Any) -> bool:
+    """Return whether a value is a number or array of NumPy of real numbers."""
+    return isinstance(value, (np.ndarray, np.floating)) and value.dtype.char in "df"
+
+
+def compiled_run(
+    runner: StepRunner, plan: CheckpointPlan, outputs: LastState, progress: bool | str
+) -> CompiledRun | None:
+    """Run all steps as one call of machine code, if that is wanted and possible.
+
+    Return None if the steps have to be run one by one: if the program of the step was not translated, with `memory` for
+    fewer than all states and tapes, with `progress`, if a function sees each state, or if a state is not finite.
+    """
+    if not isinstance(runner, RecordedStepRunner) or progress or plan.is_reversing or not outputs.takes_trajectories:
+        return None
+    specification = runner.specification
+    n = plan.n
+    rows = 2
+    if specification.differentiated:
+        if plan.slots is not None and plan.slots < n:
+            return None
+        rows = n + 1
+    elif outputs.enters_everywhere:
+        if (n + 1) * specification.state.nbytes > MOST_BYTES and not outputs.holds_all_states:
+            return None
+        rows = n + 1
+    loop = runner.compiled_loop()
+    if loop is None or n * loop.saved_bytes > plan.tape_bytes and specification.differentiated:
+        return None
+    run = CompiledRun(runner, loop, rows)
+    if not run.is_finite:
+        return None
+    outputs.start(runner)
+    outputs.take(run.trajectories, run.last)
+    return run
+
+
+class CompiledRun:
+    """A run of all steps as one call of machine code.
+
+    Parameters
+    ----------
+    runner : RecordedStepRunner
+    loop : CompiledLoop
+    rows : int
+        Number of states that are in memory at a time.
+
+    Attributes
+    ----------
+    is_finite : bool
+        Whether all states are finite.
+    last : State
+        The last state.
+    trajectories : list of arrays
+        For each variable of the state its values, state i in row ``i % rows``.
+    """
+
+    def __init__(self, runner: RecordedStepRunner, loop: CompiledLoop, rows: int) -> None:
+        self._runner = runner
+        self._loop = loop
+        n = runner.specification.n
+        self.trajectories = loop.trajectories(runner.first.values, rows)
+        self._params = runner.plain_params
+        self._saved = loop.saved_blocks(n)
+        self.is_finite = loop.forward(self.trajectories, self._params, runner.inputs, self._saved, 0, n)
+        self.last = State(n, [block[n % rows] for block in self.trajectories], runner.first.statics)
+
+    def backward(
+        self, outputs: LastState, cotangents: list, interval: int
+    ) -> tuple[list, list[tuple[int, float]]] | None:
+        """Run the backward pass.
+
+        Parameters
+        ----------
+        outputs : LastState or SelectedStates
+        cotangents : list of arrays
+            Those of the results.
+        interval : int
+            Number of steps between two measurements of the cotangent.
+
+        Returns
+        -------
+        cotangents : list
+            Cotangents of the variables of all arguments; None for one that is not differentiated.
+        norms : list of (int, float)
+            Index of a state and the largest magnitude of an entry of its cotangent.
+
+        None instead of both if a value is not finite.
+        """
+        runner = self._runner
+        specification = runner.specification
+        n = specification.n
+        cuts = specification.cuts
+        low = 0
+        if cuts and not outputs.enters_everywhere:
+            low = cuts[0]
+        total = outputs.sources(n, cotangents)(self.last)
+        entering = outputs.entering(n, cotangents)
+        if total is None:
+            total = [None] * len(self.last.values)
+        total = [
+            zero_like(value) if back is None else back for back, value in zip(total, self.last.values, strict=True)
+        ]
+        found = self._loop.backward(
+            self.trajectories,
+            self._params,
+            runner.inputs,
+            self._saved,
+            total,
+            entering,
+            n,
+            low,
+            specification.first_traced,
+            specification.truncate or 0,
+            interval,
+        )
+        if found is None:
+            return None
+        backs, input_cotangents, sizes = found
+        norms = [(n, largest(total))]
+        for i in range((n - 1) // interval * interval, low - 1, -interval):
+            if i not in cuts and i >= specification.first_traced:
+                norms.append((i, float(sizes[i // interval])))
+        n_state = len(self.last.values)
+        is_reached = low == 0 and specification.first_traced == 0
+        results: list = [back if is_reached else None for back in backs[:n_state]]
+        for root, value, back in zip(runner.param_roots, runner.params, backs[n_state:], strict=True):
+            results.append(root and fit("the step", value, back, back))
+        for root, back in zip(runner.input_roots, input_cotangents, strict=True):
+            results.append(root and back)
+        return results, norms
 
 
 def _is_same_kind(returned: Any, converted: Any) -> bool:

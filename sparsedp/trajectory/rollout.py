@@ -179,10 +179,11 @@ def rollout(
     if isbox(n):
         raise DerivativeError("rollout needs n as a plain whole number, got a traced value; it has no derivative")
     n = check_integer("n of rollout", n, 0, "; for a time T write round(T / dt)")
-    if open_traces and recording_trace(leaves((state, params, inputs))) is not None:
+    trace = recording_trace(leaves((state, params, inputs))) if open_traces else None
+    if trace is not None:
         jitted = step
         if memory != "reverse" and not isinstance(step, Jitted):
-            jitted = Jitted(step, falls_back=True)
+            jitted = trace.owner.related(step, falls_back=True)
         return opaque(rollout)(
             jitted, state, params, n, inputs, memory, keep, truncate, disk=disk, progress=progress, record=record
         )
