@@ -382,7 +382,7 @@ class RolloutRule(Rule):
             kept = self._new_store(args)  # may contain states of an interrupted run
         with runner.errors_named():
             run = None
-            if self._compiles and self.disk is None:
+            if self._compiles and self.disk is None and isinstance(specification.step, Jitted):
                 run = compiled_run(runner, self.plan, self.outputs, self.progress)
             if run is not None:
                 last = run.last
