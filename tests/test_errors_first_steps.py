@@ -123,7 +123,7 @@ WRONG = [
         lambda: dp.minimize(lambda x: x**2, 1.0, method="L-BFGS-B"),
         ValueError,
         "method must be one of lbfgs, gd, adam, newton_cg, gauss_newton, levenberg_marquardt, half_inverse, "
-        "physical_gradient, admm, got 'L-BFGS-B'; write 'lbfgs'",
+        "physical_gradient, admm, augmented_lagrangian, mma, slsqp, trust_constr, ipopt, got 'L-BFGS-B'; write 'lbfgs'",
     ),
     (
         lambda: dp.inverse(dp.laplacian(GRID), method="cg"),

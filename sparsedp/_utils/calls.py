@@ -42,7 +42,6 @@ FOREIGN_KEYWORDS = {
     "bcs": {"boundary": "boundary=..."},
     "boundaries": {"boundary": "boundary=..."},
     "boundary_conditions": {"boundary": "boundary=..."},
-    "constraints": {"bounds": "bounds=(lower, upper), project= for linear equations, or a penalty added to the loss"},
     "epochs": {"maxiter": "maxiter=..."},
     "fun": {"loss": "loss=...", "fun": "fun=..."},
     "grad": {"gradient": "gradient=function, or omit it: it is computed in reverse mode"},

@@ -82,8 +82,10 @@ class Point:
         self._failed = True
 
     def vjp(self, v: NDArray[np.float64]) -> Any:
-        """Return J^T v, where J is the Jacobian of the rows. The last product is stored."""
+        """Return J^T v, where J is the Jacobian of the rows: by J if it is known, else by a stored backward pass."""
         assert self.constraints is not None
+        if "jacobian" in vars(self):
+            return v @ self.jacobian
         product = self._products.find((v,))
         if product is None:
             product = self._products.put((v,), self._x_unit * self.constraints.vjp(v))

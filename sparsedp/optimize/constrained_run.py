@@ -247,7 +247,7 @@ class ConstrainedRun:
             point = problem.at(state.current.point)
             if point.violation <= self.feasible:
                 return best, f"{message}; there are feasible points: try another start, method or maxiter"
-        if not problem.violation_is_stationary(point):
+        if not problem.derive(point, lambda: problem.violation_is_stationary(point)):
             return best, message
         message = (
             "infeasible: near x no step reduces the violation of the constraints, which is "

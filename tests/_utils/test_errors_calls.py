@@ -128,9 +128,8 @@ TABLE = [
     # minimize
     (
         lambda: dp.minimize(square, U, constraints=[]),
-        TypeError,
-        f"lbfgs has no option 'constraints'; {LBFGS}; write bounds=(lower, upper), project= for linear equations, or a "
-        "penalty added to the loss",
+        ValueError,
+        "lbfgs takes no constraints; write method= one of augmented_lagrangian, mma, slsqp, trust_constr, ipopt",
     ),
     (
         lambda: dp.minimize(square, U, lr=0.1),
