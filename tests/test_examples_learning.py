@@ -155,6 +155,21 @@ def test_volume_to_point():
     assert for_mean[5] < 0.6 * table[5][5]  # projection in stages removes grey
 
 
+@example("data_assimilation.py")
+def test_data_assimilation():
+    """The analysis is better than the background, the weak constraint than the strong one, and a transform pays."""
+    printed = run("data_assimilation.py")
+    assert "gradient: agrees" in printed and float(re.search(r"adjoint test: (\S+)", printed)[1]) < 1e-12
+    (_, *strong), (_, *weak) = rows(printed, r"^(strong|weak) +(\S+) +(\S+) +(\S+) ")
+    assert strong[2] < strong[0] < strong[1] and weak[2] < 0.85 * strong[2] and weak[0] < 0.85 * strong[0]
+    searches = {row[0]: row[1:] for row in rows(printed, r"^(\w+, \w+) +(\S+) +(\d+) +(\S+) +(\S+) +(\S+)$")}
+    assert len(searches) == 4
+    for name in ("gauss_newton, z", "lbfgs, z", "lbfgs, metric"):
+        assert searches[name][3] < 0.35 and searches[name][4] < 0.3
+        assert searches[name][0] < 0.7 * searches["lbfgs, plain"][0]
+    assert abs(searches["lbfgs, z"][0] / searches["lbfgs, metric"][0] - 1) < 0.02
+
+
 @example("pylops_exchange.py")
 def test_pylops_exchange():
     """PyLops solves with our heat, and we search through a camera of PyLops."""

@@ -1022,6 +1022,24 @@ BUGS = {
         "np.sqrt(mean_square)",
         "tests/optimize/test_minimize.py",
     ),
+    "a product with a transpose that is taken for a symmetric one": Bug(
+        "solvers",
+        "return not np.iscomplexobj(weights) and all(axis.matrices is None for axis in spectrum.axes)",
+        "return True",
+        "tests/optimize/test_data_assimilation.py",
+    ),
+    "steps of a given accuracy that are exact": Bug(
+        "optimize",
+        "atol=accuracy, btol=accuracy",
+        "atol=LSMR_ACCURACY, btol=LSMR_ACCURACY",
+        "tests/optimize/test_minimize_squares.py",
+    ),
+    "tangents of a program in the wrong order": Bug(
+        "autodiff",
+        "len(entries), places, tangents)",
+        "len(entries), places[::-1], tangents)",
+        "tests/autodiff/test_jit.py",
+    ),
     "a first curvature that is not measured in the metric": Bug(
         "optimize",
         "metric.square(changes[-1], metric.representer(changes[-1]))",

@@ -635,6 +635,12 @@ class SpectralFunction(Transposable):
     transposed : bool
     """
 
+    @property
+    def is_symmetric(self) -> bool:
+        """Whether f(A) is its own transpose: its eigenvectors are orthonormal and its eigenvalues real."""
+        spectrum, weights = self.inner
+        return not np.iscomplexobj(weights) and all(axis.matrices is None for axis in spectrum.axes)
+
     def act(self, x: NDArray[Any], out: NDArray[Any]) -> None:
         """Set out = f(A) x, or the transpose of f(A) times x."""
         spectrum, weights = self.inner
@@ -657,7 +663,7 @@ def find_eigenbasis(structure: Structure) -> Eigenbasis | None:
         size = structure.shape[0]
         identity = AxisBasis("identity", np.zeros(size))
         return Eigenbasis(Spectrum((size,), (identity,), 0.0), structure.values)
-    if isinstance(structure, SpectralFunction) and not structure.transposed:
+    if isinstance(structure, SpectralFunction) and (structure.is_symmetric or not structure.transposed):
         return structure.inner
     if isinstance(structure, Sum):
         return _combine_eigenbases(structure.members, np.add)

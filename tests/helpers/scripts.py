@@ -13,6 +13,7 @@ from sparsedp.kernels.team import NOTICE
 
 EXAMPLES = sorted(path.name for path in (ROOT / "examples").glob("*.py"))
 SMALL = {
+    "data_assimilation.py": "32",
     "poisson_adjoint.py": "32",
     "two_families.py": "24",
     "poisson_control.py": "64",
