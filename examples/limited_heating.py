@@ -28,7 +28,7 @@ options = parser.parse_args()
 # -----------
 # With the heat source :math:`q`, the temperature :math:`T`, the target :math:`T_d` and the limit :math:`T_{max}`,
 #
-# .. math:: \min_q \; \tfrac12 \int (T - T_d)^2 + \tfrac{\alpha}{2} \int q^2 \quad \text{with} \quad
+# .. math:: \min_q \; \tfrac{1}{2} \int (T - T_d)^2 + \tfrac{\alpha}{2} \int q^2 \quad \text{with} \quad
 #           -\Delta T = q, \quad T \le T_{max}, \quad q \ge 0 .
 #
 # The target has a plateau that is higher than the limit. The walls are kept at :math:`T = 0`.

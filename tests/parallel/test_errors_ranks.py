@@ -78,8 +78,18 @@ REFUSED = [
     ),
     (
         TypeError,
-        "eigenpairs does not work on ranks yet; give it the grid from before dp.distribute",
+        "eigenpairs does not work on a field on ranks; write dp.gather(u) for the whole array",
         lambda s: dp.eigenpairs(dp.identity(dp.Grid((5, 4)).cells), mass=s.u),
+    ),
+    (
+        TypeError,
+        "a batch of coefficients does not work on ranks yet; give it the grid from before dp.distribute",
+        lambda s: dp.elliptic_solver(dp.divergence(s.grid), s.G)(np.array([[1.0], [2.0]]), s.u),
+    ),
+    (
+        TypeError,
+        "disk of rollout cannot be used with distributed fields; leave it out",
+        lambda s: dp.rollout(lambda u, p: u, s.u, None, 3, memory="1 MB", disk="."),
     ),
     (
         TypeError,
