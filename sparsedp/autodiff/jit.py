@@ -49,7 +49,7 @@ from sparsedp.autodiff.tape import (
     through,
 )
 from sparsedp.autodiff.tape_constants import constant, constant_args
-from sparsedp.errors import JitError, JitWarning
+from sparsedp.errors import JitError, JitWarning, SparsedpError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -487,6 +487,17 @@ class Recorded:
             return variables
         return placed(variables, self._strided, [array_copy(variables[num]) for num in self._strided])
 
+    def run(self, program: Callable[..., tuple], variables: Sequence) -> tuple:
+        """Call a program with the variables; if it raises an error of this library, raise that of the function.
+
+        The function wraps errors of its parts: it names the stage of a time step, for example.
+        """
+        try:
+            return program(*self.dense(variables))
+        except SparsedpError:
+            self.call(self.arguments(variables))
+            raise
+
     def value(self, variables: Sequence) -> Any:
         """Return the result of the function by its program."""
         outputs, results = self.results(variables)
@@ -507,7 +518,7 @@ class Recorded:
         program, outputs = self.value_program()
         if compiles:
             program.compile()
-        results = program.run(*self.dense(variables))
+        results = self.run(program.run, variables)
         if not self.value_is_checked and self._is_to_be_checked(variables):
             check_program(self.name, self.call(self.arguments(variables)), outputs.build(results), self.eps)
             self.value_is_checked = True
@@ -815,7 +826,7 @@ class PullbackProgram:
 
     def forward(self, variables: Sequence) -> tuple[tuple, tuple]:
         """Return the values of the result, and the values that `backward` needs before the cotangents."""
-        values = self._forward.run(*self._recorded.dense(variables))
+        values = self._recorded.run(self._forward.run, variables)
         return values[: self._n_results], values[self._n_results :]
 
     def compare(self, variables: Sequence) -> None:

@@ -181,3 +181,21 @@ def test_gap_of_values_that_are_not_finite():
     assert gap(expected, np.array([1.0, -np.inf, NAN])) == np.inf
     assert gap(expected, np.array([1.0, NAN, np.inf])) == np.inf
     assert gap(expected, np.array([1.0, 2.0, NAN])) == np.inf
+
+
+@pytest.mark.parametrize("method", ["imex", "etdrk4"])
+@pytest.mark.parametrize("factor", [1e200, NAN])
+@pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning", "ignore:invalid value:RuntimeWarning")
+def test_errors_inside_a_time_step_have_the_message_of_the_function(method, factor):
+    step = dp.stepper(method, lambda u, p: -p * u**3, 0.1, linear=(dp.laplacian(RING), 1e-3))
+    jitted = dp.jit(step)
+    jitted(RINGED, 1.0)
+    jitted(1.1 * RINGED, 1.0)
+    with pytest.raises(dp.errors.NonFiniteError) as of_function:
+        step(factor * RINGED, 1.0)
+    with pytest.raises(dp.errors.NonFiniteError) as of_program:
+        jitted(factor * RINGED, 1.0)
+    assert str(of_program.value) == str(of_function.value)
+    with pytest.raises(dp.errors.NonFiniteError) as of_gradient:
+        dp.value_and_grad(lambda u: anp.sum(jitted(u, 1.0)))(factor * RINGED)
+    assert str(of_gradient.value) == str(of_function.value)
