@@ -813,11 +813,25 @@ def _install():
     BOX.shape = property(_shape)
     BOX.__getitem__ = _binary(ITEM)
     BOX.__neg__ = direct(anp.negative)
+    reflected: dict[Callable, Callable] = {}  # function of NumPy -> operator for an array and a traced value
     for name, function in OPERATORS.items():
         act = _binary(function)
         setattr(BOX, f"__{name}__", act)
         setattr(BOX, f"__r{name}__", _reflected(act))
+        if name != "pow":  # NumPy's power and the operator may differ in the last bit
+            reflected[function.fun] = act
+    dispatch = BOX.__array_ufunc__
 
+    @wraps(dispatch)
+    def array_ufunc(box, function, method, *operands, **options):
+        """Call the faster operators for ``array * traced``, for which NumPy does not call ``traced.__rmul__``."""
+        if function in reflected and method == "__call__" and not options and len(operands) == 2:
+            x, y = operands
+            if type(x) is np.ndarray and type(y) is BOX and type(y._node) in OWN_NODES:
+                return reflected[function](x, y)
+        return dispatch(box, function, method, *operands, **options)
+
+    BOX.__array_ufunc__ = array_ufunc
     copy = direct(COPY)
 
     @wraps(COPY)
