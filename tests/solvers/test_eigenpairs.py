@@ -317,6 +317,17 @@ def test_a_hermitian_operator():
     assert np.allclose(pairs.vectors @ matrix.T, pairs.values[:, None] * pairs.vectors)
 
 
+@pytest.mark.whole
+@pytest.mark.parametrize("which", ["smallest", "largest", 300.2])
+def test_a_large_hermitian_operator(which):
+    n = 600
+    one, other = (sp.random_array((n, n), density=0.01, random_state=seed) for seed in (0, 1))
+    matrix = one + one.T + 1j * (other - other.T) + sp.diags_array(np.arange(n) * 1.0)
+    pairs = dp.eigenpairs(dp.from_matrix(matrix), 4, which, method="arpack")
+    assert np.allclose(pairs.values, dp.eigenpairs(dp.from_matrix(matrix), 4, which, method="dense").values)
+    assert np.allclose(pairs.vectors.conj() @ pairs.vectors.T, np.eye(4))
+
+
 def test_values_of_an_operator_that_is_not_symmetric():
     matrix = np.random.default_rng(0).standard_normal((6, 6))
     values = dp.eigenpairs(dp.from_matrix(matrix), 6, symmetric=False).values
