@@ -32,7 +32,7 @@ from autograd.numpy import numpy_vjps
 from sparsedp._utils.validation import check_finite
 from sparsedp.autodiff.fast_derivatives import ARRAY, COPY, ITEM
 from sparsedp.autodiff.program_trace import Slot, array_copy
-from sparsedp.autodiff.tape import add_at, called, embedded, is_operator_call
+from sparsedp.autodiff.tape import add_at, called, embedded, is_operator_call, sparse_add
 
 try:
     from llvmlite import binding, ir
@@ -217,6 +217,9 @@ MOVEMENTS = {ITEM.fun, ARRAY.fun, COPY.fun, anp.concatenate_args.fun, array_copy
 ADJOINTS = {getattr(numpy_vjps, f"{name}_adjoint_{num}").fun for name in ("dot", "tensordot") for num in (0, 1)}
 PRODUCTS = {np.dot, np.matmul, np.tensordot, np.inner, np.outer, np.einsum} | ADJOINTS
 SUMS = {np.sum, np.mean}
+# The cotangents of entries of an array: the first function describes them, the second adds them to those of the array.
+DESCRIBE_PART = numpy_vjps.untake.fun
+ADD_PART = sparse_add.fun
 
 
 def _plain_function(function):
@@ -479,6 +482,7 @@ class _Translator:
         self._position = 0  # of the present call
         self._last = 0  # of the calls that use its result
         self._values: dict[int, _Value] = {}
+        self._parts: dict[int, ProgramCall] = {}
         self._live: list[_Value] = []
 
     # ---- memory ----
@@ -744,10 +748,17 @@ class _Translator:
         self._trace = trace
         calls, self._aliases = _without_repetitions(calls)
         self._last_use: dict[int, int] = {}
+        described: dict[int, ProgramCall] = {}
         for position, call in enumerate(calls):
+            if _plain_function(call.function) is DESCRIBE_PART:
+                described[call.result.number] = call
             for arg in call.args:
                 if type(arg) is Slot:
                     self._last_use[arg.number] = position
+                    if arg.number in described:  # the addition reads the arguments of the description
+                        for inner in described[arg.number].args:
+                            if type(inner) is Slot:
+                                self._last_use[inner.number] = position
         for result in results:
             if type(result) is Slot:
                 self._last_use[self._aliases.get(result.number, result.number)] = sys.maxsize
@@ -761,6 +772,9 @@ class _Translator:
         if call.has_effect:
             self._check(call)
             return
+        if _plain_function(call.function) is DESCRIBE_PART:
+            self._parts[call.result.number] = call
+            return
         sample = self._trace.sample(call.result)
         dtype = _dtype_of(sample, _name_of(call))
         self._last = self._last_use.get(call.result.number, self._position)
@@ -772,7 +786,10 @@ class _Translator:
         elif function in FLOATING or function in COMPARISONS or function in LOGICAL:
             value = self._entrywise(call, self._ufunc(call, function, dtype), sample, dtype)
         elif function is add_at:
-            value = self._add_at(call, dtype)
+            total, g, index = call.args
+            value = self._add_at(total, g, index, dtype)
+        elif function is ADD_PART:
+            value = self._add_part(call, sample, dtype)
         elif function in MOVEMENTS:
             value = self._movement(call, function, sample, dtype)
         elif function in SUMS:
@@ -992,21 +1009,30 @@ class _Translator:
         index_of = self._index(positions)
         self.loop(positions.size, lambda i: self.store(read(i), result.pointer, index_of(i), result.dtype))
 
-    def _add_at(self, call, dtype):
-        """Translate ``total[index] += g``; the index selects no entry twice."""
-        total, g = (self._argument(arg) for arg in call.args[:2])
-        index = call.args[2]
-        if type(index) is Slot or total.dtype != dtype:
+    def _add_part(self, call, sample, dtype):
+        """Translate the addition of the cotangents of entries, of which the index may select some twice."""
+        _, total, part = call.args
+        if type(part) is not Slot or part.number not in self._parts:
+            raise NotCompiled(_name_of(call))
+        g, index, _ = self._parts[part.number].args
+        if total is None:
+            total = np.zeros(np.shape(sample), DTYPES[dtype])
+        return self._add_at(total, g, index, dtype)
+
+    def _add_at(self, total_arg, g_arg, index, dtype):
+        """Translate ``total[index] += g``, for an index that may select entries twice as ``numpy.add.at``."""
+        total, g = map(self._argument, (total_arg, g_arg))
+        if type(index) is Slot or (type(total_arg) is Slot and total.dtype != dtype):
             raise NotCompiled("an addition at a traced index")
-        shape = np.shape(self._trace.sample(call.args[0]))
+        shape = np.shape(self._trace.sample(total_arg))
         places = np.arange(total.size).reshape(shape)[index]
-        g_shape = np.shape(self._trace.sample(call.args[1]))
+        g_shape = np.shape(self._trace.sample(g_arg))
         numbers = np.arange(g.size).reshape(g_shape)
         numbers = np.broadcast_to(numbers, np.shape(places)).reshape(-1)
         places = np.reshape(places, -1)
         result = self._new_value(dtype, total.size)
         if result.size <= UNROLLED:
-            result.entries = [self.entry(total, place) for place in range(total.size)]
+            result.entries = [self.cast(self.entry(total, place), total.dtype, dtype) for place in range(total.size)]
             for place, number in zip(places, numbers, strict=True):
                 entry = self.cast(self.entry(g, int(number)), g.dtype, dtype)
                 result.entries[place] = self.builder.fadd(result.entries[place], entry)
@@ -1018,7 +1044,8 @@ class _Translator:
             result.base = owner
         else:
             self.new_region(result)
-            self._copy(np.arange(total.size), self.reader(total), result)
+            read_total = self.reader(total)
+            self._copy(np.arange(total.size), lambda i: self.cast(read_total(i), total.dtype, dtype), result)
         if not places.size:
             return result
         read = self.reader(g, numbers)

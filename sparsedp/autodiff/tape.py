@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import autograd.numpy as anp
 import numpy as np
-from autograd.core import JVPNode, VJPNode, add_outgrads, primitive_jvps, primitive_vjps
+from autograd.core import JVPNode, VJPNode, add_outgrads, primitive_jvps, primitive_vjps, sparse_add
 from autograd.extend import VSpace, defjvp, defjvp_argnums, defvjp, defvjp_argnums, primitive
 from autograd.numpy.numpy_vjps import match_complex, replace_zero, unbroadcast_f
 from autograd.tracer import Node, box_types, isbox, new_box, notrace_primitives, trace_stack
@@ -104,6 +104,7 @@ __all__ = [
     "recorded_level",
     "recording_trace",
     "sample",
+    "sparse_add",
     "split_boxes",
     "through",
     "traces_of",

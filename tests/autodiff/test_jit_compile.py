@@ -115,6 +115,24 @@ def test_single_precision_and_booleans():
 
 
 @pytest.mark.whole
+def test_entries_chosen_twice():
+    few = np.array([1, 1, 2])
+
+    def loss(u):
+        return anp.sum(u[few] * u[4]) ** 2 + anp.sum(u[np.arange(24) % 12] * u[::-1][np.arange(24) // 2]) + u[3]
+
+    for dtype in (float, np.float32):
+        jitted = dp.jit(loss, compile=True)
+        for x in (X.astype(dtype), Y.astype(dtype)):
+            value, gradient = dp.value_and_grad(loss)(x)
+            found, slope = dp.value_and_grad(jitted)(x)
+            np.testing.assert_allclose(found, value, rtol=1e-6 if dtype is np.float32 else 1e-14)
+            np.testing.assert_allclose(slope, gradient, rtol=0, atol=1e-5 if dtype is np.float32 else 1e-13)
+            assert slope.dtype == dtype
+        assert not jitted.not_compiled
+
+
+@pytest.mark.whole
 def test_results_share_no_memory_and_have_their_types():
     jitted = dp.jit(lambda u: (u, u[:3], 2.0 * u[0], anp.sum(u)), compile=True)
     whole, part, number, total = jitted(X)
