@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 from sparsedp._utils.counters import count
 from sparsedp._utils.pytree import labels, leaves
 from sparsedp.autodiff.backend import folded
-from sparsedp.autodiff.tape import plain
+from sparsedp.autodiff.tape import sample
 
 __all__ = ["Agreement", "end_all", "end_all_after_error", "state"]
 
@@ -99,7 +99,7 @@ class Agreement:
     def record_leaves(self, root: str, what: str, tree: Any) -> None:
         """Add the numbers, arrays and strings of a tree to the mark; distributed fields need no comparison."""
         for name, leaf in zip(labels(tree, root), leaves(tree)):
-            value = plain(leaf)
+            value = sample(leaf)
             if isinstance(value, (Number, np.ndarray, np.generic, str)):
                 self.record(f"{name} of {what}", folded(np.asarray(value)))
 

@@ -20,7 +20,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from sparsedp._utils.pytree import leaves
 from sparsedp.autodiff.backend import ARRAY_KINDS, BOX, NUMPY, ArrayKind
-from sparsedp.autodiff.tape import VSpace, autograd_rules, isbox, linear, plain
+from sparsedp.autodiff.tape import VSpace, autograd_rules, isbox, linear, plain, sample
 from sparsedp.errors import ShapeError
 from sparsedp.grid.space import Space
 from sparsedp.parallel.agreement import Agreement, state
@@ -334,7 +334,7 @@ def everywhere(x: Any, space: Space) -> Any:
     """Return a distributed field, given a number or an array that is the same on every rank. Differentiable."""
     if not isbox(x):
         return block(x, space)
-    value = plain(x)
+    value = sample(x)
     if isinstance(value, DistributedField):
         return x
     if np.shape(value) not in ((), space.shape):
@@ -344,10 +344,10 @@ def everywhere(x: Any, space: Space) -> Any:
 
 def converted_like(derivative: Any, value: Any) -> Any:
     """Convert a cotangent or tangent to the kind of its value: a number, a whole array, or a distributed field."""
-    plain_value = plain(value)
+    plain_value = sample(value)
     if isinstance(plain_value, DistributedField):
         return everywhere(derivative, plain_value.space)
-    plain_derivative = plain(derivative)
+    plain_derivative = sample(derivative)
     if isinstance(plain_derivative, DistributedField):
         _, collect = _spread(np.shape(plain_value), plain_derivative.space)
         return collect(derivative)
@@ -367,8 +367,8 @@ def formulas(fun: Callable, value: Any, args: Sequence[Any], nums: Sequence[int]
     """
     if fun not in AUTOGRAD_FUNCTIONS:
         return None
-    space = next(plain(arg).space for arg in args if isinstance(plain(arg), DistributedField))
-    if not isinstance(plain(value), DistributedField):
+    space = next(sample(arg).space for arg in args if isinstance(sample(arg), DistributedField))
+    if not isinstance(sample(value), DistributedField):
         if fun not in REDUCTIONS:
             raise TypeError(
                 f"the derivative of {fun.__name__} of a field on ranks is not known; write sums of products"
@@ -493,7 +493,7 @@ def together(what: str, arguments: Any, act: Callable, *args: Any) -> Any:
 def _agreement(arguments: Any) -> Agreement | None:
     """Return the Agreement of the distributed fields among the arguments, else the one used last in this call."""
     for leaf in leaves(arguments):
-        backend: Any = getattr(plain(leaf), "backend", NUMPY)
+        backend: Any = getattr(sample(leaf), "backend", NUMPY)
         if not backend.whole_fields:
             return backend.agreement
     if state.messages_before_call is not None and state.messages > state.messages_before_call:

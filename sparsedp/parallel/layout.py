@@ -17,7 +17,7 @@ from sparsedp.advection.method import TransportMethod
 from sparsedp.advection.settings import TransportSettings
 from sparsedp.advection.transport import method_and_rule
 from sparsedp.autodiff.backend import Backend
-from sparsedp.autodiff.tape import Rule, linear, plain
+from sparsedp.autodiff.tape import Rule, linear, sample
 from sparsedp.errors import ShapeError
 from sparsedp.flow.projection_setup import ProjectionSetup
 from sparsedp.grid.grid import Grid, node_axes
@@ -288,7 +288,7 @@ class Piece(NamedTuple):
 
 
 def _is_distributed(value):
-    return isinstance(plain(value), DistributedField)
+    return isinstance(sample(value), DistributedField)
 
 
 def _pieces(space):

@@ -329,3 +329,14 @@ def test_a_rank_that_ends_ends_all(how, message):
     done = launched("faults.py", 2, how, seconds=30)
     assert done.returncode != 0 and message in done.stderr + done.stdout
     assert how == "kill" or "rank 1 of 2: Traceback" in done.stderr
+
+
+@on_ranks
+def test_jitted_functions_of_arrays_where_fields_on_ranks_exist():
+    """The ranks look at the kinds of arguments, which a recorded program does not need."""
+    Scene()
+    loss = dp.jit(lambda x: np.sum(x**2))
+    value, slope = dp.value_and_grad(loss)(np.array([1.0, 2.0]))
+    assert value == 5.0 and slope.tolist() == [2.0, 4.0]
+    end = dp.jit(lambda p: np.sum(dp.rollout(lambda u, p: u * p, np.ones(3), p, 4)))
+    assert end(2.0) == 48.0
