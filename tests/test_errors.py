@@ -153,16 +153,6 @@ TABLE = [
         "solid_boundary needs one condition, dirichlet, neumann or robin(a, b), got 'dirichlet'",
     ),
     (
-        lambda: dp.laplacian(LINE, solid_boundary=dp.dirichlet),
-        VALUE,
-        "solid_boundary=dirichlet has no effect without solid=; write solid=mask, or leave it out",
-    ),
-    (
-        lambda: dp.face_laplacian(LINE, solid_boundary=dp.free_slip),
-        VALUE,
-        "solid_boundary=free_slip has no effect without solid=; write solid=mask, or leave it out",
-    ),
-    (
         lambda: dp.laplacian(LINE, solid=np.zeros(3, bool), solid_boundary={"x": dp.neumann}),
         TYPE,
         "solid_boundary needs one condition, dirichlet, neumann or robin(a, b), got {'x': neumann}",

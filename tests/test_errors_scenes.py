@@ -97,12 +97,6 @@ TABLE = [
         "conservation_law got a side of dp.inflow without inflow=, or inflow= without such a side; give both or none",
     ),
     (
-        lambda: law(momentum=1),
-        VALUE,
-        "conservation_law uses momentum at sides of dp.free_slip only, and boundary= has none; "
-        "write boundary=dp.free_slip, or leave momentum out",
-    ),
-    (
         lambda: law(inflow=1.0),
         VALUE,
         "conservation_law got a side of dp.inflow without inflow=, or inflow= without such a side; give both or none",

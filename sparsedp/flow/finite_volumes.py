@@ -128,8 +128,7 @@ def conservation_law(
     ------
     ValueError
         If scheme, boundary or momentum is not one of the above, or if `inflow` does not go together with an inflow
-        boundary, or `momentum` with a free_slip boundary. On use, if a speed is negative, or a function changes its
-        argument in place.
+        boundary. On use, if a speed is negative, or a function changes its argument in place.
     ShapeError
         If the state, or the result of a function, has the wrong shape, or the state has no field for a momentum.
     NonFiniteError
@@ -192,11 +191,6 @@ def conservation_law(
         )
     if free_slip in conditions:
         fields = _momentum_fields(grid, momentum)
-    elif momentum is not None:
-        raise ValueError(
-            "conservation_law uses momentum at sides of dp.free_slip only, and boundary= has none; write "
-            "boundary=dp.free_slip, or leave momentum out"
-        )
     else:
         fields = None
     return ConservationLaw(grid, flux, speed, scheme, sides, fields, inflow, source, equilibrium)

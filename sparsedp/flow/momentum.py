@@ -41,7 +41,7 @@ from sparsedp.grid.boundary_conditions import (
 from sparsedp.grid.grid import Grid
 from sparsedp.grid.space import Space
 from sparsedp.operators.difference import divergence, gradient
-from sparsedp.operators.masks_and_lift import check_solid, check_solid_boundary, solid_faces
+from sparsedp.operators.masks_and_lift import check_solid, solid_faces
 from sparsedp.operators.operator import Operator
 from sparsedp.operators.stencils import (
     along,
@@ -263,7 +263,6 @@ def stresses(grid: Grid, sides: tuple, solid: ArrayLike | None, solid_boundary: 
     """
     if solid_boundary not in (no_slip, free_slip):
         raise TypeError(f"solid_boundary needs dp.no_slip or dp.free_slip, got {solid_boundary!r}")
-    check_solid_boundary(solid, solid_boundary, no_slip)
     if solid is None:
         blocks: dict = {}
         for component in range(grid.dim):

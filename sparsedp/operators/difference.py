@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from sparsedp.grid.boundary_conditions import check_condition, describe_patches, neumann, resolve
 from sparsedp.grid.grid import Grid, check_grid
 from sparsedp.grid.space import Space
-from sparsedp.operators.masks_and_lift import check_solid, check_solid_boundary, region_of, solid_faces
+from sparsedp.operators.masks_and_lift import check_solid, region_of, solid_faces
 from sparsedp.operators.operator import Operator
 from sparsedp.operators.stencils import along, differences, kronecker_operator, one_sided, pick, slope_terms, to_faces
 from sparsedp.operators.structure.base import Matrix
@@ -53,8 +53,7 @@ def gradient(
     TypeError
         If `grid` is not a Grid, `solid` is not boolean, or `solid_boundary` is not a single condition.
     ValueError
-        If `boundary` names an axis that is periodic or that the grid does not have, or if `solid_boundary` is given
-        without `solid`.
+        If `boundary` names an axis that is periodic or that the grid does not have.
 
     See Also
     --------
@@ -78,7 +77,6 @@ def gradient(
     """
     sides = resolve(grid, boundary, patches=True)
     check_condition("solid_boundary", solid_boundary)
-    check_solid_boundary(solid, solid_boundary, neumann)
     name = f"gradient{describe_patches(sides)}"
     slope = to_faces(name, grid, [slope_terms(grid, axis, sides[axis]) for axis in range(grid.dim)])
     if solid is None:

@@ -289,14 +289,6 @@ def check_solid(grid: Grid, solid: ArrayLike | None) -> NDArray:
     return _boolean(solid, grid.cells, "solid")
 
 
-def check_solid_boundary(solid: Any, solid_boundary: Any, default: Any) -> None:
-    """Raise ValueError if a condition at obstacles is given without obstacles."""
-    if solid is None and solid_boundary != default:
-        raise ValueError(
-            f"solid_boundary={solid_boundary} has no effect without solid=; write solid=mask, or leave it out"
-        )
-
-
 def _boolean(flags, space, name):
     """Return an argument as a boolean array of the shape of a space; raise if it is anything else."""
     if isbox(flags):

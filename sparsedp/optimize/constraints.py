@@ -72,6 +72,7 @@ def equal(function: Callable[[Any], Any]) -> Equality:
     --------
     >>> import autograd.numpy as anp
     >>> import numpy as np
+    >>> from sparsedp import minimize
     >>> best = minimize(
     ...     lambda x: anp.sum(x**2), np.zeros(2), "augmented_lagrangian", constraints=equal(lambda x: anp.sum(x) - 1.0)
     ... )
