@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import sparsedp as dp
+from sparsedp import kernels
 from sparsedp.autodiff.tape import MOST_BOUND, Rule
 
 SCHEMES = ["upwind", "van_leer", "semi_lagrangian", "maccormack"]
@@ -71,6 +72,7 @@ def test_bound_pullback_has_the_same_bits(scheme, of, rng):
         assert rule.bound_vjp((0,), *args) is rule.bound_vjp((0,), *args)
 
 
+@pytest.mark.skipif(not kernels.compiled(), reason="NumPy computes the cotangent in an array of its own")
 def test_bound_pullback_adds_to_a_sum(rng):
     """The cotangent of a velocity that many steps share is added in place."""
     move = dp.transport(GRIDS[0], "upwind", velocity="cells")
@@ -84,6 +86,7 @@ def test_bound_pullback_adds_to_a_sum(rng):
     np.testing.assert_allclose(total, wanted, rtol=0, atol=1e-14)
 
 
+@pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning")
 @pytest.mark.parametrize("scheme", ["upwind", "semi_lagrangian"])
 def test_bound_pullback_checks_its_result(scheme, rng):
     move = dp.transport(GRIDS[0], scheme, velocity="cells")
