@@ -123,7 +123,7 @@ def eigenpairs_of_jacobian(jacobian: NDArray, prior: PriorCovariance, tolerance:
         images = prior.apply(rows)
         gram = images @ rows.T
         asymmetry = _checked_asymmetry(gram, max(largest, np.max(np.abs(gram))))
-        squares, weights = scipy.linalg.eigh(_symmetric(gram), driver="evd")
+        squares, weights = np.linalg.eigh(_symmetric(gram))
         largest = max(largest, np.max(squares))
         rounding = max(asymmetry, ROUNDING**2 * largest)
         if not squares[-1] > rounding:
@@ -351,7 +351,7 @@ class KrylovSpace:
         self.matrix = matrix
 
     def _update_ritz_pairs(self):
-        self.values, self._vectors = scipy.linalg.eigh(self.matrix, driver="evd")
+        self.values, self._vectors = np.linalg.eigh(self.matrix)
         if len(self.values) and self.values[0] <= -1:  # eigenvalues are at most as large as Ritz values
             raise ValueError(NEGATIVE.format(self.values[0]))
         squares = np.zeros(len(self.values))
@@ -394,7 +394,7 @@ class KrylovSpace:
         images = self._prior.apply(rows)
         gram = rows @ images.T
         check_finite("the Hessian of the misfit, in the metric of the prior,", gram, advice=RESCALE)
-        squares, vectors = scipy.linalg.eigh(_symmetric(gram), driver="evd")
+        squares, vectors = np.linalg.eigh(_symmetric(gram))
         resolved = ROUNDING * np.max(squares, initial=0.0)
         kept = squares > max(dropped**2, resolved)
         lengths = np.sqrt(squares[kept])

@@ -100,7 +100,8 @@ class PriorBlock(Uncached):
     @cached_property
     def _matrix_root(self):
         """The symmetric square root of the dense matrix."""
-        eigenvalues, vectors = scipy.linalg.eigh(self.matrix, driver="evd")
+        assert self.matrix is not None
+        eigenvalues, vectors = np.linalg.eigh(self.matrix)
         return (vectors * np.sqrt(np.maximum(eigenvalues, 0.0))) @ vectors.T
 
     @cached_property
