@@ -1,4 +1,4 @@
-"""Atomic writing: a file is complete or unchanged, even if the disk is full or the process is killed."""
+"""Atomic writing: a file is complete or unchanged, even if the disk is full or the process is killed; file locks."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, BinaryIO
 from uuid import uuid4
 
 import numpy as np
 
-__all__ = ["UNFINISHED", "load_tree", "path_errors", "save_tree", "write_file", "write_through"]
+__all__ = ["UNFINISHED", "load_tree", "open_locked", "path_errors", "save_tree", "write_file", "write_through"]
 
 PATH_ADVICE = {
     errno.EEXIST: "give the path of a folder, this is a file",
@@ -28,7 +28,7 @@ SEQUENCES = {"list": list, "tuple": tuple}
 UNFINISHED = ".part"  # suffix of incomplete files; they remain only if the process was killed while it wrote them
 
 
-def write_file(path: str | os.PathLike, content: Any) -> None:
+def write_file(path: str | os.PathLike, content: Any, durable: bool = True) -> None:
     """Write a file atomically.
 
     The content is written to a temporary file in the same folder, flushed to disk, and renamed to `path`. Symbolic
@@ -39,6 +39,8 @@ def write_file(path: str | os.PathLike, content: Any) -> None:
     path : str or path
     content : str, bytes or callable
         The content, or a function that is called with the open binary stream and writes the content.
+    durable : bool
+        Whether the file is flushed to disk, so that it survives a power failure. This may take milliseconds.
 
     Raises
     ------
@@ -63,11 +65,12 @@ def write_file(path: str | os.PathLike, content: Any) -> None:
                 return
             if exists:
                 open(target, "rb+").close()  # raises an error for a read-only file, so that it is not replaced
-            _write(part, "xb", content)
+            _write(part, "xb", content, durable)
             if exists:
                 shutil.copymode(target, part)
             os.replace(part, target)
-            _sync(target.parent)
+            if durable:
+                _sync(target.parent)
         finally:
             with contextlib.suppress(OSError):  # without an error it has been renamed and does not exist
                 part.unlink()
@@ -90,8 +93,8 @@ def path_errors(path: Any, reading: bool = False) -> Iterator[None]:
         raise
 
 
-def _write(path, mode, content):
-    """Open a file in the given mode and write content to it."""
+def _write(path, mode, content, durable=False):
+    """Open a file in the given mode and write content to it; flush it to disk if it is to be durable."""
     with open(path, mode) as stream:
         if callable(content):
             content(stream)
@@ -100,7 +103,7 @@ def _write(path, mode, content):
                 content = content.encode("utf-8", "backslashreplace")
             stream.write(content)
         stream.flush()
-        if mode == "xb":
+        if durable:
             os.fsync(stream.fileno())
 
 
@@ -112,6 +115,38 @@ def _sync(folder):
             os.fsync(handle)
         finally:
             os.close(handle)
+
+
+def open_locked(path: str | os.PathLike) -> BinaryIO | None:
+    """Open a file, create it if necessary, and lock it until it is closed or the process ends.
+
+    Return None if another process or another part of this one has locked it, if its folder does not exist, or if it was
+    removed in the meantime.
+    """
+    try:
+        file = open(path, "ab")
+    except OSError:
+        return None
+    try:
+        _lock(file)
+        if os.path.samestat(os.fstat(file.fileno()), os.stat(path)):  # else the file was removed in the meantime
+            return file
+    except OSError:
+        pass
+    file.close()
+    return None
+
+
+def _lock(file):
+    """Lock an open file; raise OSError if it is locked."""
+    try:
+        import fcntl
+    except ImportError:  # on Windows
+        import msvcrt
+
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
+    else:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def write_through(path: str | os.PathLike, write: Callable) -> None:

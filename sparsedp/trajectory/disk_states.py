@@ -35,7 +35,7 @@ from sparsedp._utils.calls import frames_inside
 from sparsedp.autodiff.backend import folded
 from sparsedp.autodiff.tape import isbox
 from sparsedp.errors import DiskWarning
-from sparsedp.io.atomic_files import UNFINISHED, load_tree, path_errors, save_tree
+from sparsedp.io.atomic_files import UNFINISHED, load_tree, open_locked, path_errors, save_tree, write_file
 from sparsedp.io.fingerprint import fingerprint
 from sparsedp.trajectory.step_runner import State
 
@@ -50,6 +50,7 @@ __all__ = ["BackwardProgress", "DiskStates", "free_bytes", "state_digest"]
 
 FORMAT = "sparsedp rollout 1"
 PREFIX = "rollout-"
+LOCK = "lock"  # name of the lock file in the folder of a run
 FREE_SHARE = 0.5  # fraction of the free space of the disk that is used if the user gives no limit
 INTERVAL = 30.0  # least number of seconds between two writes of the cotangents
 SHARE = 0.05  # writing the cotangents may take at most this fraction of the time
@@ -106,7 +107,7 @@ def _new_run(parent: Path, key: str) -> tuple[Path, BinaryIO]:
     """Return a new folder and its locked file; warn if the folder above contains runs that did not end."""
     others = []
     for folder in parent.glob(f"{PREFIX}*"):
-        lock = _locked(folder)
+        lock = open_locked(folder / LOCK)
         if lock is not None:
             others.append(sum(file.stat().st_size for file in folder.glob("*") if file.is_file()))
             lock.close()
@@ -121,7 +122,7 @@ def _new_run(parent: Path, key: str) -> tuple[Path, BinaryIO]:
     while True:
         folder = parent / f"{PREFIX}{key}-{uuid4().hex[:8]}"
         folder.mkdir()
-        lock = _locked(folder)
+        lock = open_locked(folder / LOCK)
         if lock is not None:
             return folder, lock
 
@@ -129,49 +130,20 @@ def _new_run(parent: Path, key: str) -> tuple[Path, BinaryIO]:
 def _unfinished_run(parent: Path, key: str) -> tuple[Path, BinaryIO] | None:
     """Return the folder of an interrupted run with the given key and its locked file, or None."""
     for folder in sorted(parent.glob(f"{PREFIX}{key}-*")):
-        lock = _locked(folder)
+        lock = open_locked(folder / LOCK)
         if lock is not None:
             return folder, lock
     return None
 
 
-def _locked(folder: Path) -> BinaryIO | None:
-    """Return the open lock file of a folder, locked; None if a run uses the folder or if it does not exist."""
-    path = folder / "lock"
-    try:
-        lock = open(path, "ab")
-    except OSError:
-        return None
-    try:
-        _lock(lock)
-        if os.path.samestat(os.fstat(lock.fileno()), path.stat()):  # else the folder was removed in the meantime
-            return lock
-    except OSError:
-        pass
-    lock.close()
-    return None
-
-
-def _lock(file: BinaryIO) -> None:
-    """Lock an open file until it is closed or the process ends; raise OSError if another process has locked it."""
-    try:
-        import fcntl
-    except ImportError:  # on Windows
-        import msvcrt
-
-        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
-    else:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
 def _remove(folder: Path, lock: BinaryIO) -> None:
     """Remove the folder of a run. The lock file is removed last, so that no other run takes over a part."""
     for file in folder.glob("*"):
-        if file.name != "lock":
+        if file.name != LOCK:
             with suppress(OSError):
                 file.unlink()
     with suppress(OSError):
-        (folder / "lock").unlink()  # an open file cannot be removed on Windows
+        (folder / LOCK).unlink()  # an open file cannot be removed on Windows
     lock.close()
     shutil.rmtree(folder, ignore_errors=True)
 
@@ -240,18 +212,14 @@ def _bytes_of(value: Any) -> memoryview:
 
 def write_state(path: Path, state: State) -> None:
     """Write the arrays of a state to a file. A full disk leaves no file."""
-    part = path.with_name(path.name + UNFINISHED)
     header = {"format": FORMAT, "i": state.i, "depends": state.depends, "digest": state_digest(state.values)}
-    try:
-        with open(part, "wb") as file:
-            file.write(json.dumps(header).encode() + b"\n")
-            for value in state.values:
-                file.write(_bytes_of(value))
-        part.replace(path)
-    except OSError:
-        with suppress(OSError):
-            part.unlink()
-        raise
+
+    def write(stream: BinaryIO) -> None:
+        stream.write(json.dumps(header).encode() + b"\n")
+        for value in state.values:
+            stream.write(_bytes_of(value))
+
+    write_file(path, write, durable=False)  # after a power failure the run begins anew
 
 
 def read_state(path: Path, form: Any, statics: Sequence) -> State | None:
@@ -331,6 +299,8 @@ class DiskStates:
 
     Attributes
     ----------
+    in_memory : int
+        Number of states in memory.
     written : int
         Number of states that were written to files.
     resumed_at : int or None
@@ -348,14 +318,13 @@ class DiskStates:
         form = specification.state
         self._form = form
         self._plan = plan
-        self._has_statics = len(form.places) < len(form.statics)
-        self._is_resumable = is_resumable and not self._has_statics
+        self._is_resumable = is_resumable and len(form.places) == len(form.statics)
         key = run_key(specification, args) if self._is_resumable else uuid4().hex
         self._folder = RunFolder(parent, key)
         self._entries: list[State | FileState] = []
         self._popped: FileState | None = None  # its file is removed when the next state is appended or popped
         self._first_file: Path | None = None
-        self._in_memory = 0
+        self.in_memory = 0
         self._is_full = False
         self._disk_indices = plan.disk_indices()
         self._is_forward = True
@@ -371,11 +340,6 @@ class DiskStates:
     def __getitem__(self, position: int) -> State | FileState:
         return self._entries[position]
 
-    @property
-    def in_memory(self) -> int:
-        """Return the number of states in memory."""
-        return self._in_memory
-
     def append(self, state: State) -> None:
         """Add a state to the stack. If it belongs into a file and the disk is full, it is not kept."""
         if self._popped is not None and self._popped.i == state.i:
@@ -385,7 +349,7 @@ class DiskStates:
         self._remove_popped()
         if not self._is_forward or state.i not in self._disk_indices:
             self._entries.append(state)
-            self._in_memory += 1
+            self.in_memory += 1
         elif not self._is_full:
             path = self._folder.path / f"state-{state.i:012d}"
             self._first_file = self._first_file or path
@@ -396,8 +360,7 @@ class DiskStates:
     def _written(self, path: Path, state: State) -> bool:
         """Write a state to a file; return whether there was enough space."""
         try:
-            with path_errors(path):
-                write_state(path, state)
+            write_state(path, state)
         except OSError as error:
             if error.errno not in DISK_IS_FULL:
                 raise
@@ -417,7 +380,7 @@ class DiskStates:
         self._remove_popped()
         entry = self._entries.pop()
         if isinstance(entry, State):
-            self._in_memory -= 1
+            self.in_memory -= 1
             return entry
         state = read_state(entry.path, self._form, entry.statics)
         if state is None or state.i != entry.i:
@@ -428,7 +391,7 @@ class DiskStates:
     def _drop_last(self) -> None:
         entry = self._entries.pop()
         if isinstance(entry, State):
-            self._in_memory -= 1
+            self.in_memory -= 1
         else:
             self._popped = entry
             self._remove_popped()
@@ -442,12 +405,12 @@ class DiskStates:
     def clear(self) -> None:
         """Remove all states."""
         for file in self._folder.path.glob("*"):
-            if file.name != "lock":
+            if file.name != LOCK:
                 file.unlink(missing_ok=True)
         self._entries.clear()
         self._popped = None
         self._first_file = None
-        self._in_memory = 0
+        self.in_memory = 0
         self.written = 0
         self.resumed_at = None
 
@@ -478,7 +441,7 @@ class DiskStates:
                 entries.append(FileState(int(path.name.removeprefix("state-")), first.statics, path))
         newest = self._confirmed(entries, runner, first)
         self._entries.append(first)
-        self._in_memory = 1
+        self.in_memory = 1
         if newest is None:
             return first
         self._entries += entries
@@ -509,7 +472,7 @@ class DiskStates:
         self._is_forward = False
         if self._entries[-1].i != last.i:  # the interrupted run had ended its forward pass
             self._entries.append(last)
-            self._in_memory += 1
+            self.in_memory += 1
         if self._is_resumable and not self._is_full:
             self._written(self._folder.path / "last", last)
 

@@ -52,18 +52,14 @@ def contents(folder):
 
 
 def test_no_other_file_opens_one_for_writing():
-    """Every file of the package that writes calls `write_file`; the command line opens the null device.
-
-    The states of a running rollout are renamed in the same way, but need not survive a power failure.
-    """
+    """Every file of the package that writes calls `write_file`; the command line opens the null device."""
     calls = [(module.place, node) for module in modules() for node in module.nodes(ast.Call)]
     modes = [
         (place, next((a.value for a in [*node.args, *(k.value for k in node.keywords)] if is_mode(a)), "r"))
         for place, node in calls
         if called(node) in ("open", "fdopen")
     ]
-    places = {"io/atomic_files.py", "__main__.py", "trajectory/disk_states.py"}
-    assert {place for place, mode in modes if set(mode) & set("wax+")} == places
+    assert {place for place, mode in modes if set(mode) & set("wax+")} == {"io/atomic_files.py", "__main__.py"}
     assert not [place for place, node in calls if called(node) in ("write_text", "write_bytes")]
 
 
