@@ -87,17 +87,13 @@ class ParametricSolver(Reconstructible):
         self._cache = Cache()
         self._batch_cache = Cache()  # of lists of inverses
 
-    def _solution(self, k, b, shift):
-        rule = solve_rule(self.name, self._solve, self._negative_gradient, self._product, checked=True)
+    def _solution(self, k, b, shift, solve=None):
+        """Return the solution; `solve` is the function of `solve_rule`, by default that for one operator."""
+        rule = solve_rule(self.name, solve or self._solve, self._negative_gradient, self._product, checked=True)
         return rule(b, k, shift)
 
     def _solve(self, transposed, checked, b, k, shift):
-        inverse = self._inverse(k, shift)
-        if transposed:
-            return inverse.T.apply(b)
-        if checked:
-            return inverse.apply(b)
-        return inverse.tangent.apply(b)
+        return _solved(self._inverse(k, shift), transposed, checked, b)
 
     def _negative_gradient(self, params, places, y, x):
         """Return -grad <y, A x> in k (place 0) and shift (place 1)."""
@@ -139,6 +135,15 @@ class ParametricSolver(Reconstructible):
         if not len(self._cache):
             return f"{self!r}, not set up yet"
         return f"{self!r}, {len(self._cache)} of {self._cache.most} set-ups kept, the last one:\n{self._cache.last}"
+
+
+def _solved(inverse, transposed, checked, b):
+    """Return the solution for b by an inverse or its transpose; see `solve_rule`."""
+    if transposed:
+        return inverse.T.apply(b)
+    if checked:
+        return inverse.apply(b)
+    return inverse.tangent.apply(b)
 
 
 def _in_floating_dtype(values):
@@ -285,7 +290,8 @@ class EllipticSolver(ParametricSolver):
             return solver._solution(k, b, shift)
         self.D.backend.check("a batch of coefficients")
         sizes = {"k": n_k, "shift": n_shift, "b": _batch_of_right_hand_sides(b, self.D.codomain)}
-        return BatchSolver(solver, _common_size(sizes), n_k, n_shift)._solution(k, b, shift)
+        batch = Batch(solver, _common_size(sizes), n_k is not None, n_shift is not None)
+        return solver._solution(k, b, shift, batch.solve)
 
     def flux(self, k: Any, slopes: Any) -> Any:
         """Return the flux k g, or K g of a tensor, from slopes g on the faces, as the solve discretises it.
@@ -406,42 +412,32 @@ class EllipticSolver(ParametricSolver):
         return f"<elliptic_solver: shift - {self.D.name} @ diag(k) @ {self.G.name} on {self.G.domain}>"
 
 
-class BatchSolver:
-    """The solves of a batch of independent systems with coefficients of their own, as one rule.
+class Batch:
+    """The solves of a batch of independent systems with coefficients of their own.
 
     Parameters
     ----------
     solver : EllipticSolver or TensorSolver
-    batch : int
+    size : int
         Number of systems.
-    n_k, n_shift : int or None
-        None if k, or shift, is the same for all systems.
+    has_k, has_shift : bool
+        Whether k, or shift, has a leading axis; else it is the same for all systems.
     """
 
-    def __init__(self, solver: ParametricSolver, batch: int, n_k: int | None, n_shift: int | None) -> None:
+    def __init__(self, solver: ParametricSolver, size: int, has_k: bool, has_shift: bool) -> None:
         self._solver = solver
-        self._batch = batch
-        self._has_k = n_k is not None
-        self._has_shift = n_shift is not None
+        self._size = size
+        self._has_k = has_k
+        self._has_shift = has_shift
 
-    def _solution(self, k, b, shift):
-        solver = self._solver
-        rule = solve_rule(solver.name, self._solve, solver._negative_gradient, solver._product, checked=True)
-        return rule(b, k, shift)
-
-    def _solve(self, transposed, checked, b, k, shift):
+    def solve(self, transposed: bool, checked: bool, b: Any, k: Any, shift: Any) -> NDArray[Any]:
+        """Return the solutions, stacked along the first axis; see `solve_rule`."""
         space = self._solver.D.codomain
-        inverses = self._inverses(k, shift)
         solutions = []
         has_b = np.ndim(b) > len(space.shape)
-        for i, inverse in enumerate(inverses):
-            solve: Operator = inverse
-            if transposed:
-                solve = inverse.T
-            elif not checked:
-                solve = inverse.tangent
+        for i, inverse in enumerate(self._inverses(k, shift)):
             try:
-                solutions.append(solve.apply(b[i] if has_b else b))
+                solutions.append(_solved(inverse, transposed, checked, b[i] if has_b else b))
             except ConvergenceError as error:
                 error.args = (f"entry {i} of the batch: {error}", *error.args[1:])
                 raise
@@ -458,7 +454,7 @@ class BatchSolver:
         if inverses is not None:
             return inverses
         inverses = []
-        for i in range(self._batch):
+        for i in range(self._size):
             k_of_entry = k
             shift_of_entry = shift
             if self._has_k:
@@ -515,9 +511,16 @@ def _checked_parameter(name, parameter, space, advice="", other_space=None):
         raise ShapeError(
             f"{name} takes a number or a field on {space.described}, got an array of shape {values.shape}{hint}"
         )
-    check_kind(name, values.dtype, "numbers", f"; write np.asarray({name}, float)")
-    check_values(partial(check_finite, name), parameter if isbox(parameter) else values)
-    return parameter if isbox(parameter) else values
+    return _finite_numbers(name, parameter)
+
+
+def _finite_numbers(name, parameter):
+    """Return a parameter, traced or as an array; raise an error if it holds no numbers or if one is not finite."""
+    check_kind(name, as_field(sample(parameter)).dtype, "numbers", f"; write np.asarray({name}, float)")
+    if not isbox(parameter):
+        parameter = as_field(parameter)
+    check_values(partial(check_finite, name), parameter)
+    return parameter
 
 
 def _checked_batch(name, parameter, space, advice="", other_space=None):
@@ -530,11 +533,7 @@ def _checked_batch(name, parameter, space, advice="", other_space=None):
     is_other_field = other_space is not None and shape == other_space.shape
     if len(shape) != 1 + len(space.shape) or not (of_numbers or shape[1:] == space.shape) or is_other_field:
         return _checked_parameter(name, parameter, space, advice, other_space), None
-    values = as_field(sample(parameter))
-    check_kind(name, values.dtype, "numbers", f"; write np.asarray({name}, float)")
-    if not isbox(parameter):
-        parameter = values
-    check_values(partial(check_finite, name), parameter)
+    parameter = _finite_numbers(name, parameter)
     if of_numbers:
         parameter = parameter * np.ones((1, *space.shape))
     return parameter, shape[0]
