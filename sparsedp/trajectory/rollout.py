@@ -215,8 +215,8 @@ def rollout(
     plan = _checkpoint_plan(step, memory, max(forms[0].nbytes, 1), n, memory_beside, outputs.holds_all_states)
     folder = None
     if disk is not None:
+        _check_disk(memory, outputs.holds_all_states, args)  # before the folder is created
         folder, limit = _folder_and_limit(disk)
-        _check_disk(memory, outputs.holds_all_states, args)
         plan = plan.with_files(limit // max(forms[0].nbytes, 1))
     outputs.is_exact = not plan.is_reversing
     specification = RolloutSpecification(step, forms, n, truncate, innermost(args))
