@@ -171,13 +171,16 @@ def files(shape, n, rows):
             seconds = perf_counter() - begin
             most = tracemalloc.get_traced_memory()[1]
             tracemalloc.stop()
-            left = len(os.listdir(folder))
+            n_files = len(os.listdir(folder))
         bits = b"".join(g.tobytes() for g in slopes)
         exact = exact or bits
         forward, back = runs
+        verdict = "same" if bits == exact else "OTHER"
+        if n_files:
+            verdict += f", {n_files} files remain"
         print(
             f"{budget:>10} {limit or '-':>8} {forward.kept:6} {forward.on_disk:8} {back.factor:10.4f} "
-            f"{most / 1e6:8.1f} {seconds:7.1f}  {'same' if bits == exact else 'OTHER'}{', files left' if left else ''}"
+            f"{most / 1e6:8.1f} {seconds:7.1f}  {verdict}"
         )
 
 

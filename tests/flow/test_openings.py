@@ -37,16 +37,22 @@ def wall_value(walls, axis, side, position):
     return walls[axis, side][position]
 
 
+def values_across(v, component, position):
+    """Return the function from a centre across the direction of a component to its value at a node along it."""
+
+    def value(centre):
+        return v[component][(position, centre) if component == 0 else (centre, position)]
+
+    return value
+
+
 def at_edge(v, walls, component, i, j):
     """Return the value of a component at the edge of cells, node (i, j), from both sides or from the wall."""
     across = 1 - component  # the component has its points on nodes along its own axis and on centres across it
     h = BOX.widths[across]
     node = (i, j)[across]
     position = (i, j)[component]
-
-    def value(centre):
-        return v[component][(position, centre) if component == 0 else (centre, position)]
-
+    value = values_across(v, component, position)
     if 0 < node < h.size:
         return (h[node] * value(node - 1) + h[node - 1] * value(node)) / (h[node] + h[node - 1])
     side = int(node == h.size)
@@ -61,10 +67,7 @@ def slope_at_edge(v, walls, component, i, j):
     h = BOX.widths[across]
     node = (i, j)[across]
     position = (i, j)[component]
-
-    def value(centre):
-        return v[component][(position, centre) if component == 0 else (centre, position)]
-
+    value = values_across(v, component, position)
     if 0 < node < h.size:
         return (value(node) - value(node - 1)) / ((h[node] + h[node - 1]) / 2)
     side = int(node == h.size)

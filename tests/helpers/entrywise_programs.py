@@ -43,6 +43,7 @@ def movements(rng, n):
     shape = halves[rng.integers(len(halves))]
     matrix = rng.normal(size=(n, n)) * (rng.random((n, n)) < 0.5) / n
     weights = rng.normal(size=n)
+    n_padded = min(n - 1, 1)
     ring = dp.laplacian(dp.Grid(n, periodic=True)) if n > 2 else None
     found = [
         lambda u: anp.roll(u, k),
@@ -61,7 +62,7 @@ def movements(rng, n):
         lambda u: anp.ravel(anp.outer(u, u)[:, 0]),
         lambda u: anp.stack([u, u * weights])[1],
         lambda u: anp.repeat(u, 2)[::2],
-        lambda u: anp.pad(u[1:] if n > 1 else u, (1 if n > 1 else 0, 0), "constant"),
+        lambda u: anp.pad(u[n_padded:], (n_padded, 0), "constant"),
     ]
     if ring is not None:
         found.append(lambda u: u + 0.05 * ring(u))
