@@ -22,7 +22,7 @@ import autograd.numpy as np
 import sparsedp as dp
 
 SHARE = 0.4
-POOR = 1e-3
+POOR_CONDUCTIVITY = 1e-3
 RADIUS = 0.05
 STEEPNESS = (1.0, 2.0, 4.0, 8.0, 16.0)
 LARGEST_FOR_SLSQP = 16
@@ -51,7 +51,7 @@ class Plate:
 
     def compliance(self, z, steepness):
         """Return the mean temperature."""
-        k = POOR + (1.0 - POOR) * self.density(z, steepness) ** 3
+        k = POOR_CONDUCTIVITY + (1.0 - POOR_CONDUCTIVITY) * self.density(z, steepness) ** 3
         return np.mean(self.heat * self.solve(self.to_faces(k), self.heat))
 
     def volume(self, z, steepness):
@@ -60,7 +60,7 @@ class Plate:
 
 
 def optimality_criteria(plate, z, steepness, gradients, move):
-    """Return the unknowns after so many updates, and this number."""
+    """Return the unknowns after the given number of updates, and this number."""
     slope_of_loss = dp.grad(lambda z: plate.compliance(z, steepness))
     slope_of_volume = dp.grad(lambda z: plate.volume(z, steepness))
     for _ in range(gradients):

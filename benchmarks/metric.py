@@ -6,7 +6,7 @@ The problem is the optimal control of Poisson's equation on the unit square, wit
 
     min  1/2 |y - w|^2 + a/2 (|u|^2 + |grad u|^2),    -lap y = u,  y = 0 at the walls,
 
-where the norms are those of L2. The metric is the inner product of H1, M = h^2 (1 - lap), which is that of the second
+where the norms are those of L2. The metric is the inner product of H1, M = h^2 (1 - lap), as in the second
 term. All runs end when the norm of the gradient has fallen by 1e-6; with * when steps change the loss by less than its
 rounding.
 """

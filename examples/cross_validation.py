@@ -5,7 +5,7 @@ Two weights by cross-validation
 Scattered, noisy data are smoothed with the two weights that predict omitted data best: five folds in one call.
 
 A field is measured at some cells, with noise, and a penalty on its slopes fills the gaps. Two weights say how smooth
-the field is along x and along y, and nobody knows them. Cross-validation finds them: one fifth of the data is omitted,
+the field is along x and along y, and both are unknown. Cross-validation finds them: one fifth of the data is omitted,
 predicted from the others, and compared; this is repeated for each fifth. The five solves are one batch, and the mean
 squared error is a differentiable function of the weights.
 
@@ -98,7 +98,8 @@ print(f"error of the estimate: {error(start):.3f} with equal weights, {error(bes
 # The picture
 # -----------
 # Left: the data. Middle: the estimate with the weights of the search. Right: the score over both weights, and the
-# points of the search. The score is close to the variance of the noise, 0.04, plus that of the error.
+# points of the search. The score is close to the variance of the noise, 0.04, plus the variance
+# of the error.
 #
 # Exercises
 # ---------

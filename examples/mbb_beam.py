@@ -164,7 +164,7 @@ def filtered_slope(density, slope):
 # %%
 # Optimality criteria
 # -------------------
-# At the optimum the slope of the compliance is :math:`-\lambda` times that of the volume, in each element that is
+# At the optimum the slope of the compliance is :math:`-\lambda` times the slope of the volume, in each element that is
 # neither full nor empty. The published loop multiplies each unknown by the square root of the ratio of both, and finds
 # :math:`\lambda` by bisection, such that the volume is right.
 

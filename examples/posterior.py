@@ -101,8 +101,8 @@ print(f"search: {best.message}")
 # The posterior
 # -------------
 # Near the mode, the residuals are nearly linear, and the posterior is nearly normal. `laplace` returns this normal
-# distribution. Its covariance is that of the prior minus a matrix of low rank: data reduce the variance along some
-# eigenvectors by the factors :math:`1 / (1 + \lambda_i)`, and leave the others as they were.
+# distribution. Its covariance is the covariance of the prior minus a matrix of low rank: data reduce the variance
+# along some eigenvectors by the factors :math:`1 / (1 + \lambda_i)`, and leave the others unchanged.
 
 posterior = dp.laplace(residuals, mode, prior)
 print(posterior)

@@ -98,8 +98,9 @@ with tempfile.TemporaryDirectory() as folder:
 # %%
 # Interrupted and continued
 # -------------------------
-# Somebody presses Ctrl-C at step 300. The files remain, and the same call continues from the last one of them. After
-# the gradient the folder is empty. The same holds if the process is killed, for instance by the end of a batch job.
+# The run is interrupted by Ctrl-C at step 300. The files remain, and the same call continues from the last one of them.
+# After the gradient the folder is empty. The same holds if the process is killed, for instance by the end of a batch
+# job.
 
 calls = 0
 

@@ -34,7 +34,7 @@ parser.add_argument("--out", type=Path, metavar="FOLDER", help="draw a picture i
 options = parser.parse_args()
 
 SHARE = 0.4  # of the area that may be filled with the good conductor
-POOR = 1e-3  # conductivity of the rest; that of the good conductor is 1
+POOR_CONDUCTIVITY = 1e-3  # of the remaining material; the good conductor has 1
 POWER = 3.0  # the penalty of intermediate densities
 RADIUS = 0.05  # of the filter, in a plate of size 1
 STEEPNESS = (1.0, 2.0, 4.0, 8.0, 16.0)  # of the projection, one stage of the search after the other
@@ -92,7 +92,7 @@ def project(s, steepness, threshold=0.5):
 
 def simp(density):
     """Return the conductivity of each cell."""
-    return POOR + (1.0 - POOR) * density**POWER
+    return POOR_CONDUCTIVITY + (1.0 - POOR_CONDUCTIVITY) * density**POWER
 
 
 def norm(field, exponent):
@@ -134,7 +134,7 @@ print(f"set-up {log.setup_seconds:.4f} s, {log.forward.seconds:.4f} s forward, {
 # A loop of our own
 # -----------------
 # **Optimality criteria** are the classical method for one volume constraint. Where a cell is neither full nor empty,
-# the slope of the loss must be :math:`-\lambda` times that of the volume. Each unknown is multiplied by the square
+# the slope of the loss must be :math:`-\lambda` times the slope of the volume. Each unknown is multiplied by the square
 # root of the ratio of both, and bisection finds the :math:`\lambda` for which the volume is right. The method needs a
 # loss that falls in every unknown, as the compliance does.
 

@@ -93,7 +93,7 @@ def face_laplacian(
     boundary : flow condition or dict
         no_slip, free_slip, inflow or outflow, for all bounded sides or as {"x": (lower, upper), ...}. Walls are at rest
         here; add the contribution of moving walls with `face_lift`. For an opening in part of a wall write a `patch`.
-        The tangential velocity at the end of a patch is that of the no_slip or inflow boundary, if there is one.
+        The tangential velocity at the end of a patch is the one of the no_slip or inflow boundary, if there is one.
     solid : bool array, shape `grid.shape`, optional
         Obstacles.
     solid_boundary : no_slip or free_slip

@@ -241,7 +241,7 @@ def _between(grid, axis):
 
 
 def _slope_of_cell(sign, a, b, half):
-    """Return the entry of the cell at a wall in the slope along the axis; `sign` is that of the outward normal."""
+    """Return the entry of the cell at a wall in the slope along the axis; `sign`: the sign of the outward normal."""
     return -sign * a / (a * half + b)
 
 
