@@ -9,10 +9,10 @@ import os
 import sys
 import warnings
 from difflib import get_close_matches
-from functools import wraps
+from functools import partial, wraps
 from inspect import Parameter, signature
 from pathlib import Path
-from types import FunctionType, ModuleType, TracebackType
+from types import FunctionType, MethodType, ModuleType, TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ __all__ = [
     "public_name",
     "shortened",
     "warn_deprecated",
+    "wrapped_functions",
 ]
 
 PACKAGE = Path(__file__).parent.parent
@@ -352,3 +353,22 @@ def deprecated_attribute(old: str, new: str, removal: str) -> property:
         return getattr(self, new)
 
     return property(read, doc=f"Deprecated name of `{new}`.")
+
+
+def wrapped_functions(function: Callable) -> list[Any]:
+    """Return a function and those that it wraps, the outermost first.
+
+    Attributes of a function are not copied by all wrappers. This finds them behind `jit`, `functools.wraps`,
+    `functools.lru_cache`, `functools.partial` and the method ``__call__`` of an object, in any nesting.
+    """
+    found: list[Any] = []
+    layer: Any = function
+    while layer is not None and not any(layer is outer for outer in found):
+        found.append(layer)
+        if isinstance(layer, partial):
+            layer = layer.func
+        elif isinstance(layer, MethodType) and layer.__name__ == "__call__":
+            layer = layer.__self__
+        else:
+            layer = getattr(layer, "__wrapped__", None)
+    return found

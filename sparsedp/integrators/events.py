@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sparsedp._utils.calls import wrapped_functions
 from sparsedp._utils.pytree import flatten, leaves
 from sparsedp._utils.validation import EPS, check_function, check_number, check_takes
 from sparsedp.autodiff.derivative import pullback
@@ -49,11 +50,11 @@ class Event:
         self.jump = jump
         self.takes_time = _takes_time(self.name, function)
         self.jump_takes_time = jump is not None and _takes_time(f"the jump of {self.name}", jump)
-        terminal = getattr(function, "terminal", False)
+        terminal = _attribute(function, "terminal", False)
         if np.ndim(terminal) or terminal not in (False, True):
             raise ValueError(f"the attribute terminal of {self.name} must be True or False, got {terminal!r}")
         self.terminal = bool(terminal)
-        self.direction = check_number(f"the direction of {self.name}", getattr(function, "direction", 0))
+        self.direction = check_number(f"the direction of {self.name}", _attribute(function, "direction", 0))
 
     def value(self, u: Any, params: Any, t: Any) -> Any:
         """Return the value of the event function, traced or not."""
@@ -162,6 +163,14 @@ def times_of(breaks: Any) -> list:
         if not np.isfinite(plain(time)):
             raise NonFiniteError(f"breaks must be finite, got {float(plain(time))} at place {place}")
     return times
+
+
+def _attribute(function, name, default):
+    """Return an attribute of a function, or of the function inside `jit`, functools.partial or another wrapper."""
+    for layer in wrapped_functions(function):
+        if hasattr(layer, name):
+            return getattr(layer, name)
+    return default
 
 
 class Surface:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cached_property
 from numbers import Number
 from typing import TYPE_CHECKING, Any
@@ -10,6 +12,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from sparsedp._utils.base_classes import Frozen
+from sparsedp._utils.calls import wrapped_functions
 from sparsedp._utils.pytree import flatten, labels, leaves, norm, power_of_two
 from sparsedp._utils.validation import check_finite, check_function
 from sparsedp.autodiff.derivative import pullback, push
@@ -18,7 +21,7 @@ from sparsedp.autodiff.tape import is_variable, isbox, sample
 from sparsedp.errors import DerivativeError, ShapeError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from numpy.typing import NDArray
 
@@ -28,6 +31,7 @@ __all__ = ["ConstraintValues", "Constraints", "Equality", "equal"]
 
 FINITE = "must be finite; start where every constraint is"
 FINITE_DERIVATIVE = "must be finite; start where every constraint has derivatives"
+EQUALITY_CALLS: ContextVar[list[Equality] | None] = ContextVar("equality_calls", default=None)  # of one constraint
 SCIPY_DICT = {"type", "fun"}  # keys of a constraint of scipy.optimize.minimize that is a dict
 
 
@@ -43,6 +47,9 @@ class Equality(Frozen):
 
     def __call__(self, x: Any) -> Any:
         """Return f(x)."""
+        calls = EQUALITY_CALLS.get()
+        if calls is not None:
+            calls.append(self)
         return self.function(x)
 
 
@@ -57,7 +64,8 @@ def equal(function: Callable[[Any], Any]) -> Equality:
     Returns
     -------
     Equality
-        An object that `minimize` takes as a constraint. Calling it calls the function.
+        An object that `minimize` takes as a constraint, also behind `jit` and functools.partial. Calling it calls the
+        function.
 
     Raises
     ------
@@ -135,9 +143,15 @@ class ConstraintFunction:
 
     def at(self, vector: NDArray[np.float64]) -> LinearizedOutputs:
         """Return y at a point, with its derivatives. The first call determines the shape and the rows."""
-        linearized = LinearizedOutputs(self._outputs, self._packing, vector, self._name, self._user_jacobian)
+        with _equality_calls() as calls:
+            linearized = LinearizedOutputs(self._outputs, self._packing, vector, self._name, self._user_jacobian)
         if self.shape is None:
             self._set_rows(linearized.value.shape)
+            if calls and not np.all(self.equality):
+                raise ValueError(
+                    f"{self._name} calls dp.equal(function) inside another function, which does not require == 0; "
+                    "write dp.equal(lambda x: ...) around the whole function, or call the inner function itself"
+                )
         if linearized.value.shape != self.shape:
             raise ShapeError(
                 f"{self._name} must return the same shape in each call, got {self.shape} and {linearized.value.shape}"
@@ -441,6 +455,17 @@ def _check_no_dict_of_scipy(given):
             )
 
 
+@contextmanager
+def _equality_calls() -> Iterator[list[Equality]]:
+    """Collect the equalities that a constraint calls."""
+    calls: list[Equality] = []
+    token = EQUALITY_CALLS.set(calls)
+    try:
+        yield calls
+    finally:
+        EQUALITY_CALLS.reset(token)
+
+
 def _constraint_function(entry, packing, name):
     """Return the ConstraintFunction of one entry of the argument `constraints`."""
     if isinstance(entry, Equality):
@@ -452,6 +477,8 @@ def _constraint_function(entry, packing, name):
             f"{name} must be a function, dp.equal(function) or a NonlinearConstraint, got {type(entry).__name__}; "
             "write lambda x: np.sum(x) - 1.0"
         )
+    if any(isinstance(function, Equality) for function in wrapped_functions(entry)):
+        return ConstraintFunction(entry, packing, name, 0.0, 0.0)
     return ConstraintFunction(entry, packing, name)
 
 

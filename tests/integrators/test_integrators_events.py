@@ -1,5 +1,6 @@
 """Located events: value, gradient, tangent and Hessian product beside closed forms, and what is refused."""
 
+import functools
 import pickle
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ from scipy.optimize import brentq
 
 import sparsedp as dp
 from sparsedp.autodiff.derivative import pushforward, value_and_grad
+from sparsedp.integrators.events import Event
 
 
 def event(function, terminal=False, direction=0):
@@ -123,6 +125,12 @@ def test_the_landing_time_of_a_cannonball(method, tolerance, near):
     if method in ("heun", "tr_bdf2"):
         bend = (landing_time(0.1001)[1] - landing_time(0.0999)[1]) / 2e-4
         assert dp.hvp(loss, 0.1, 1.0) == pytest.approx(bend, rel=10 * near)
+
+
+@pytest.mark.parametrize("wrap", [dp.jit, functools.partial])
+def test_a_wrapped_event_keeps_its_attributes(wrap):
+    wrapped = Event(wrap(landing), None, 0)
+    assert wrapped.terminal and wrapped.direction == -1
 
 
 def switching(u, p, t):

@@ -76,6 +76,12 @@ WRONG = [
         "constraints does not depend on x; leave it out, or compute it from x with autograd.numpy",
     ),
     (
+        run(lambda x: dp.equal(above)(x)),
+        ValueError,
+        "constraints calls dp.equal(function) inside another function, which does not require == 0; write "
+        "dp.equal(lambda x: ...) around the whole function, or call the inner function itself",
+    ),
+    (
         run(lambda x: x * np.nan),
         NonFiniteError,
         "constraints must be finite; start where every constraint is, got 2 that are NaN or infinite",

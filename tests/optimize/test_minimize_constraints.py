@@ -1,5 +1,6 @@
 """Constraints of minimize: published optima, multipliers, and what wrong constraints get."""
 
+import functools
 import importlib.util
 import sys
 from types import ModuleType
@@ -245,6 +246,27 @@ def test_constraints_of_scipy(method):
     assert called and best.converged and np.allclose(best.x, [1 - t, t, t - 0.25], atol=1e-6)
     assert np.allclose(best.multipliers[0], [multiplier, 4 - 2 * t - multiplier, 0.0], atol=1e-5)
     assert np.allclose(best.multipliers[1], 0.0)
+
+
+SUM_IS_TWO = dp.equal(lambda x: anp.sum(x) - 2.0)
+
+
+@pytest.mark.parametrize(
+    "constraint",
+    [
+        dp.jit(SUM_IS_TWO),
+        functools.partial(SUM_IS_TWO),
+        dp.jit(functools.partial(functools.partial(SUM_IS_TWO))),
+        functools.lru_cache(SUM_IS_TWO),
+        functools.wraps(SUM_IS_TWO)(lambda x: SUM_IS_TWO(x)),
+        SUM_IS_TWO.__call__,
+    ],
+    ids=["jit", "partial", "nested", "cache", "wraps", "method"],
+)
+def test_a_wrapped_equality_remains_an_equality(constraint):
+    loss = lambda x: anp.sum((x - 0.1) ** 2)
+    best = dp.minimize(loss, np.array([0.5, 0.5]), "slsqp", constraints=constraint)
+    assert best.converged and best.x == pytest.approx(np.ones(2), abs=1e-9)
 
 
 @pytest.mark.parametrize("method", [pytest.param(one, marks=[WHOLE] * (one == "trust_constr")) for one in METHODS])
