@@ -52,6 +52,7 @@ LARGE_SHARE = 4  # "auto" takes LAPACK too where more than one eigenvalue in 4 i
 SHIFT = 1e-10
 SHIFT_OF_SINGULAR = 1e-6
 NEAR = 1e-4  # the same for operators with negative eigenvalues
+CLEARANCE = 1e-3  # least distance of the first shift below negative eigenvalues from them, relative to the shift
 NUDGE = 1e-11  # the same for a shift of the user, which may be an eigenvalue
 SYMMETRIC = 1e-12  # two products that should be equal may differ by this share of their sizes
 LARGEST_EXPONENT = 200  # an operator or a mass beyond this power of two is scaled
@@ -343,7 +344,7 @@ class Pencil:
             )
         if not self.count_below(sigma):
             return sigma
-        while self.count_below(sigma):
+        while self.count_below((1.0 - CLEARANCE) * sigma):  # a shift that is an eigenvalue has no inverse
             sigma *= 1000.0
         return self._nearer(sigma)
 

@@ -268,6 +268,13 @@ def test_the_largest_eigenvalues_of_a_plane():
     assert np.allclose(pairs.values, [last + before, 2 * last], rtol=1e-12) and pairs.cut == (True, False)
 
 
+def test_the_largest_eigenvalue_where_it_is_the_sum_of_magnitudes_in_a_row():
+    """The shifts that are tried are multiples of this sum; one of them would be the eigenvalue itself."""
+    ring = -dp.laplacian(dp.Grid((6, 6), size=1.0, periodic=True))
+    pairs = dp.eigenpairs(ring, 1, "largest", method="arpack")
+    assert np.allclose(pairs.values, 8 * 6**2, rtol=1e-12)
+
+
 @pytest.mark.whole
 def test_coefficients_that_jump():
     grid = dp.Grid((14, 14), size=1.0)
