@@ -67,8 +67,8 @@ BUGS = {
     ),
     "eigenpairs: missing copies of a multiple eigenvalue": Bug(
         "solvers/eigensolver.py",
-        "    for _ in range(MOST_RESTARTS):\n        tolerance",
-        "    for _ in range(1):\n        tolerance",
+        "    for _ in range(MOST_RESTARTS):\n        new_values",
+        "    for _ in range(1):\n        new_values",
         "tests/solvers/test_eigenpairs.py",
     ),
     "eigenpairs: the largest in the order of their distances": Bug(

@@ -4,30 +4,35 @@ Notes
 -----
 Let A v = lambda M v with symmetric A and M, M positive definite, and v_i . M v_j = delta_ij. The fields of one cluster
 of m equal eigenvalues are the rows of V, and L = V A V^T is the m by m matrix of the cluster, here diag(lambda). Under
-changes dA and dM, with N = V dM V^T, the pair (V, L) changes by the solution of the bordered system
+changes dA and dM, with N = V dM V^T, the derivative of A V = L M V and of V M V^T = 1 is the bordered system
 
     A dV - L M dV - dL M V = -(dA V - L dM V)
     -dV M V^T              = N / 2
 
-whose operator K is symmetric. (The second row says that vectors do not rotate within their cluster; no function that
-has a derivative depends on such rotations.) For a simple eigenvalue this is
+for (dV, dL), whose operator K is symmetric. (The second row says that vectors do not rotate within their cluster; no
+function that has a derivative depends on such rotations.) For a simple eigenvalue this is
 
     [ A - lambda M   -M v ] [ dv      ]     [ (dA - lambda dM) v ]
     [ -(M v)^T          0 ] [ dlambda ] = - [ -v . dM v / 2      ]
 
 The product of the first row with V gives dL = V dA V^T - (L N + N L) / 2, for m = 1 dlambda = v . (dA - lambda dM) v
-(Hellmann and Feynman): eigenvalues need no solve. For a cotangent G of L and a cotangent g of V the coefficients get
+(Hellmann-Feynman theorem): eigenvalues need no solve. With a cotangent G of L and a cotangent g of V, the change of the
+loss is
 
-    G : (V dA V^T) - (G L + L G) : N / 2        and, with K (Y, C) = (g, 0),
-    -Y . dA V + (L Y) . dM V + (C : N) / 2
+    G : dL = G : (V dA V^T) - (G L + L G) : N / 2
+    g . dV = (g, 0) . (dV, dL) = K (Y, C) . (dV, dL) = (Y, C) . K (dV, dL) = -Y . dA V + (L Y) . dM V + (C : N) / 2
 
-one adjoint solve for each vector. V, L and the solution of the bordered system are differentiable rules themselves,
-and all of the formulas above are differentiable functions of them: derivatives of every order follow.
+where (Y, C) is the solution of the adjoint system K (Y, C) = (g, 0), one solve for each vector. The cotangents of the
+coefficients are the factors of their changes in dA and dM. V, L and the solution of the bordered system are
+differentiable rules, and the formulas above are differentiable functions of them, so that derivatives of every order
+follow.
 
 References
 ----------
 R. B. Nelson, Simplified calculation of eigenvector derivatives, AIAA J. 14 (1976) 1201-1205.
 J. R. Magnus, On differentiating eigenvalues and eigenvectors, Econometric Theory 1 (1985) 179-191.
+A. L. Andrew, R. C. E. Tan, Computation of derivatives of repeated eigenvalues and the corresponding eigenvectors of
+symmetric matrix pencils, SIAM J. Matrix Anal. Appl. 20 (1998) 78-100.
 """
 
 from __future__ import annotations
@@ -58,10 +63,18 @@ if TYPE_CHECKING:
 
     from sparsedp.errors import DerivativeError
     from sparsedp.operators.operator import Operator
-    from sparsedp.solvers.eigensolver import Spectrum
+    from sparsedp.solvers.eigensolver import EigenSettings, Spectrum
     from sparsedp.solvers.parametric import ParametricSolver
 
-__all__ = ["Constant", "Multiplication", "OfCoefficients", "Problem", "Unit"]
+__all__ = [
+    "CoefficientOperator",
+    "ConstantOperator",
+    "DiagonalMass",
+    "EigenProblem",
+    "IdentityMass",
+    "member_values",
+    "member_vectors",
+]
 
 # Unknowns beyond which bordered systems of pairs at an end of the spectrum are solved by iterations in the complement
 # of V. Measured at 256^2: LU 5.8 s, 13 iterations 0.5 s.
@@ -74,7 +87,7 @@ MOST_ITERATIONS = 1000  # of MINRES; shift-invert as preconditioner takes 10 to 
 # ---- operators with coefficients -------------------------------------------------------------------------------------
 
 
-class Side(ABC):
+class PencilMember(ABC):
     """A or M of A v = lambda M v, a linear function of its coefficients.
 
     Attributes
@@ -86,25 +99,25 @@ class Side(ABC):
     coefficients: tuple = ()
 
     @abstractmethod
-    def plain(self, values: Sequence) -> Any:
-        """Return what `Pencil` takes, for plain coefficients."""
+    def argument(self, values: Sequence) -> Any:
+        """Return the argument of `Pencil` for plain coefficients: an Operator, or for M also an array or None."""
 
     @abstractmethod
     def product(self, x: Any, values: Sequence) -> Any:
         """Return the products with a batch of fields; linear in x and in the coefficients."""
 
-    def form(self, y: Any, x: Any, values: Sequence, places: Sequence[int]) -> list:
+    def gradients(self, y: Any, x: Any, values: Sequence, places: Sequence[int]) -> list:
         """Return the gradients of sum(y * product(x, values)) in the coefficients at `places`."""
         return []
 
 
-class Constant(Side):
+class ConstantOperator(PencilMember):
     """A constant Operator."""
 
     def __init__(self, op: Operator) -> None:
         self.op = op
 
-    def plain(self, values: Sequence) -> Any:
+    def argument(self, values: Sequence) -> Any:
         """Return the Operator."""
         return self.op
 
@@ -113,10 +126,10 @@ class Constant(Side):
         return self.op(x)
 
 
-class Unit(Side):
-    """The mass None."""
+class IdentityMass(PencilMember):
+    """The mass M = 1, for the argument None."""
 
-    def plain(self, values: Sequence) -> Any:
+    def argument(self, values: Sequence) -> Any:
         """Return None."""
         return None
 
@@ -125,13 +138,13 @@ class Unit(Side):
         return x
 
 
-class Multiplication(Side):
-    """The multiplication by a number or a field, which is the only coefficient."""
+class DiagonalMass(PencilMember):
+    """A diagonal mass matrix: a number or a field, which is the only coefficient."""
 
     def __init__(self, values: Any) -> None:
         self.coefficients = (values,)
 
-    def plain(self, values: Sequence) -> Any:
+    def argument(self, values: Sequence) -> Any:
         """Return the values."""
         return values[0]
 
@@ -139,12 +152,12 @@ class Multiplication(Side):
         """Return the product of the values with each field."""
         return values[0] * x
 
-    def form(self, y: Any, x: Any, values: Sequence, places: Sequence[int]) -> list:
+    def gradients(self, y: Any, x: Any, values: Sequence, places: Sequence[int]) -> list:
         """Return the gradient in the values."""
         return [of_argument(y * x, values[place]) for place in places]
 
 
-class OfCoefficients(Side):
+class CoefficientOperator(PencilMember):
     """The operator that a solver such as `elliptic_solver` inverts.
 
     Parameters
@@ -157,7 +170,7 @@ class OfCoefficients(Side):
         self.solver = solver
         self.coefficients = coefficients
 
-    def plain(self, values: Sequence) -> Any:
+    def argument(self, values: Sequence) -> Any:
         """Return the Operator of the coefficients."""
         k, shift = (np.array(value, np.result_type(value, float)) for value in values)
         return self.solver._operator(k, shift)
@@ -166,7 +179,7 @@ class OfCoefficients(Side):
         """Return the product of (shift - D diag(k) G) with each field."""
         return self.solver._product(False, x, *values)
 
-    def form(self, y: Any, x: Any, values: Sequence, places: Sequence[int]) -> list:
+    def gradients(self, y: Any, x: Any, values: Sequence, places: Sequence[int]) -> list:
         """Return the gradients in k and shift."""
         return [-gradient for gradient in self.solver._negative_gradient(tuple(values), places, y, x)]
 
@@ -174,26 +187,26 @@ class OfCoefficients(Side):
 # ---- the problem -----------------------------------------------------------------------------------------------------
 
 
-class Problem:
+class EigenProblem:
     """The eigenvalue problem of `eigenpairs` as differentiable rules of its coefficients.
 
     Parameters
     ----------
-    stiffness, mass : Side
-    k, which, method, maxiter
-        Of `eigenpairs`.
-    rtol : float
+    stiffness, mass : PencilMember
+    settings : EigenSettings
+
+    Attributes
+    ----------
+    coefficients : tuple
+        Those of A, then those of M.
     """
 
-    def __init__(
-        self, stiffness: Side, mass: Side, k: int, which: Any, method: str, rtol: float, maxiter: int | None
-    ) -> None:
+    def __init__(self, stiffness: PencilMember, mass: PencilMember, settings: EigenSettings) -> None:
         self.stiffness = stiffness
         self.mass = mass
-        self.rtol = rtol
+        self.settings = settings
         # Copies: the caller may write into the arrays before `values` is read.
-        self.coefficients = tuple(map(_own, (*stiffness.coefficients, *mass.coefficients)))
-        self._options = k, which, method, maxiter
+        self.coefficients = tuple(map(_read_only_copy, (*stiffness.coefficients, *mass.coefficients)))
         self._count = len(stiffness.coefficients)
         self._solutions = Cache()
 
@@ -204,19 +217,20 @@ class Problem:
     def pencil(self, values: Sequence) -> Pencil:
         """Return the operators of plain coefficients."""
         of_stiffness, of_mass = self.parts(values)
-        return Pencil(self.stiffness.plain(of_stiffness), self.mass.plain(of_mass), self.rtol)
+        stiffness = self.stiffness.argument(of_stiffness)
+        return Pencil(stiffness, self.mass.argument(of_mass), self.settings.rtol, self.settings.symmetric)
 
-    def solution(self, values: Sequence) -> Solution:
+    def solution(self, values: Sequence) -> EigenSolution:
         """Return the solution for plain coefficients, from the cache or new."""
         key = tuple(np.asarray(value, np.result_type(value, float)) for value in values)
         solution = self._solutions.find(key)
         if solution is None:
-            solution = self._solutions.put(key, Solution(self.pencil(key), *self._options))
+            solution = self._solutions.put(key, EigenSolution(self.pencil(key), self.settings))
         return solution
 
     @cached_property
-    def first(self) -> Solution:
-        """The solution for the values of the coefficients."""
+    def plain_solution(self) -> EigenSolution:
+        """The solution for the plain values of the coefficients."""
         return self.solution([plain(value) for value in self.coefficients])
 
     # ------------------------------------------------------------ rules
@@ -271,8 +285,8 @@ class Problem:
         def jvp(nums, tangents, ans, *values):
             v = self._vectors_rule(cluster)(*values)
             by_stiffness, by_mass = self._changes(nums, tangents, v)
-            change = _products(v, by_stiffness, (len(v), len(v)))
-            n = _products(v, by_mass, (len(v), len(v)))
+            change = _inner_products(v, by_stiffness, (len(v), len(v)))
+            n = _inner_products(v, by_mass, (len(v), len(v)))
             return change - 0.5 * (anp.dot(ans, n) + anp.dot(n, ans))
 
         return Rule("eigenpairs", forward, vjp, jvp)
@@ -295,12 +309,12 @@ class Problem:
             m = len(ans)
             block = self._block_rule(cluster)(*values)
             by_stiffness, by_mass = self._changes(nums, tangents, ans)
-            data = np.zeros((m, self.first.pencil.size))
+            data = np.zeros((m, self.plain_solution.pencil.size))
             if by_stiffness is not None:
                 data = data - anp.reshape(by_stiffness, (m, -1))
             if by_mass is not None:
                 data = data + anp.reshape(_combined(block, by_mass), (m, -1))
-            products = 0.5 * _products(ans, by_mass, (m, m))
+            products = 0.5 * _inner_products(ans, by_mass, (m, m))
             solution = self._bordered(cluster)(anp.concatenate([data, products], axis=1), block, ans, *values)
             return self._split(solution)[0]
 
@@ -312,7 +326,7 @@ class Problem:
         A row of `data` and of the solution holds a field and m numbers.
         """
         name = "eigenpairs, adjoint,"
-        weights = self.first.weights
+        weights = self.plain_solution.weights
 
         def solve(transposed, checked, data, block, v, *values):
             return self.solution(values).bordered_solve(cluster, data)
@@ -322,7 +336,7 @@ class Problem:
             x, b = self._split(s)
             masses = weights * self.mass.product(_combined(block, x) + _combined(b, v), of_mass)
             fields = weights * self.stiffness.product(x, of_stiffness) - masses
-            numbers = -_products(x, weights * self.mass.product(v, of_mass), (len(v), len(v)))
+            numbers = -_inner_products(x, weights * self.mass.product(v, of_mass), (len(v), len(v)))
             return anp.concatenate([anp.reshape(fields, (len(v), -1)), numbers], axis=1)
 
         def back(params, places, adjoint, s):
@@ -333,7 +347,7 @@ class Problem:
             crossed = _combined(b.T, y) + _combined(c.T, x)
             gradients: dict[int, Any] = {}
             if 0 in places:
-                gradients[0] = _products(y, weights * self.mass.product(x, of_mass), (len(v), len(v)))
+                gradients[0] = _inner_products(y, weights * self.mass.product(x, of_mass), (len(v), len(v)))
             if 1 in places:
                 gradients[1] = weights * self.mass.product(crossed, of_mass)
             numbers = [place - 2 for place in places if place > 1]
@@ -348,40 +362,40 @@ class Problem:
 
     def _split(self, s):
         """Return the fields and the numbers of each row of a solution of the bordered system."""
-        size = self.first.pencil.size
-        return anp.reshape(s[:, :size], (len(s), *self.first.shape)), s[:, size:]
+        size = self.plain_solution.pencil.size
+        return anp.reshape(s[:, :size], (len(s), *self.plain_solution.shape)), s[:, size:]
 
     def _gradients(self, nums, values, for_stiffness, for_mass, x):
         """Return the gradients of sum(for_stiffness * A x) + sum(for_mass * M x) in the coefficients at `nums`."""
         of_stiffness, of_mass = self.parts(values)
-        weights = self.first.weights
+        weights = self.plain_solution.weights
         gradients: dict[int, Any] = {}
         places = [num for num in nums if num < self._count]
         if places and for_stiffness is None:
             gradients.update({place: np.zeros(np.shape(plain(of_stiffness[place]))) for place in places})
         elif places:
-            parts = self.stiffness.form(weights * for_stiffness, x, of_stiffness, places)
+            parts = self.stiffness.gradients(weights * for_stiffness, x, of_stiffness, places)
             gradients.update(zip(places, parts, strict=True))
         places = [num - self._count for num in nums if num >= self._count]
-        parts = self.mass.form(weights * for_mass, x, of_mass, places)
+        parts = self.mass.gradients(weights * for_mass, x, of_mass, places)
         gradients.update({place + self._count: part for place, part in zip(places, parts, strict=True)})
         return tuple(gradients[num] for num in nums)
 
     def _changes(self, nums, tangents, x):
         """Return dA x and dM x for tangents of the coefficients at `nums`; None for no change."""
-        given = dict(zip(nums, tangents, strict=True))
+        tangent_of = dict(zip(nums, tangents, strict=True))
         changes = []
-        for side, first in ((self.stiffness, 0), (self.mass, self._count)):
-            numbers = range(first, first + len(side.coefficients))
-            if any(number in given for number in numbers):
-                directions = [given.get(number, 0.0) for number in numbers]
-                changes.append(self.first.weights * side.product(x, directions))
+        for member, first in ((self.stiffness, 0), (self.mass, self._count)):
+            numbers = range(first, first + len(member.coefficients))
+            if any(number in tangent_of for number in numbers):
+                directions = [tangent_of.get(number, 0.0) for number in numbers]
+                changes.append(self.plain_solution.weights * member.product(x, directions))
             else:
                 changes.append(None)
         return changes
 
 
-def _own(value):
+def _read_only_copy(value):
     """Return a read-only copy of a plain value in double precision, and traced values as they are."""
     if isbox(value):
         return value
@@ -395,7 +409,7 @@ def _combined(matrix, fields):
     return anp.tensordot(matrix, fields, axes=1)
 
 
-def _products(one, other, shape):
+def _inner_products(one, other, shape):
     """Return the matrix of the inner products of two lists of fields; zeros if one of them is None."""
     if one is None or other is None:
         return np.zeros(shape)
@@ -406,21 +420,20 @@ def _products(one, other, shape):
 # ---- the solution for plain coefficients -----------------------------------------------------------------------------
 
 
-class Solution:
+class EigenSolution:
     """The pairs of plain operators, and the solves of the bordered systems of their derivatives.
 
     Parameters
     ----------
     pencil : Pencil
-    k, which, method, maxiter
-        Of `eigenpairs`.
+    settings : EigenSettings
     """
 
-    def __init__(self, pencil: Pencil, k: int, which: Any, method: str, maxiter: int | None) -> None:
+    def __init__(self, pencil: Pencil, settings: EigenSettings) -> None:
         self.pencil = pencil
-        self.which = which
+        self.which = settings.which
         self.shape = pencil.op.domain.shape
-        self.spectrum: Spectrum = symmetric_pairs(pencil, k, which, method, maxiter)
+        self.spectrum: Spectrum = symmetric_pairs(pencil, settings)
         self._solves: dict[tuple, Callable] = {}
 
     @cached_property
@@ -443,7 +456,7 @@ class Solution:
         result = np.zeros_like(data)
         for row, number in enumerate(cluster):
             field = np.ldexp(data[row, :size], half - stiffness_exponent)
-            x, numbers = self._solve_row(cluster, number, pencil._masked(field), data[row, size:])
+            x, numbers = self._solve_row(cluster, number, pencil.masked(field), data[row, size:])
             result[row, :size] = np.ldexp(x, -half)
             result[row, size:] = np.ldexp(numbers, pencil.exponent)
         return result

@@ -31,15 +31,15 @@ from sparsedp.grid.space import fits
 from sparsedp.operators.given import check_operator
 from sparsedp.operators.operator import Operator
 from sparsedp.solvers.eigen_rules import (
-    Constant,
-    Multiplication,
-    OfCoefficients,
-    Problem,
-    Unit,
+    CoefficientOperator,
+    ConstantOperator,
+    DiagonalMass,
+    EigenProblem,
+    IdentityMass,
     member_values,
     member_vectors,
 )
-from sparsedp.solvers.eigensolver import METHODS, general_values
+from sparsedp.solvers.eigensolver import METHODS, EigenSettings, general_values
 from sparsedp.solvers.parametric import ParametricSolver
 
 if TYPE_CHECKING:
@@ -63,30 +63,33 @@ def eigenpairs(
     rtol: float = 1e-10,
     maxiter: int | None = None,
 ) -> Eigenpairs:
-    """Return k eigenvalues and eigenvectors of a symmetric operator, A v = lambda v or A v = lambda M v.
+    """Return k eigenvalues and eigenvectors of A v = lambda v or A v = lambda M v (generalized eigenvalue problem).
 
     Parameters
     ----------
     op : Operator, or a solver of `elliptic_solver` or `matrix_solver`
-        A. A solver stands for the operator that it inverts, with the given `coefficients`.
+        A, of shape (n, n). A solver stands for the operator that it inverts, with these `coefficients`.
     k : int
         Number of pairs, 1 <= k <= n.
     which : "smallest", "largest" or float
-        The k smallest eigenvalues with their signs, the k largest, or those nearest to a number.
+        The k smallest eigenvalues with their signs, the k largest, or those nearest to a number, in the units of the
+        eigenvalues.
     mass : None, number, array, Operator or a solver of `matrix_solver`, optional
-        M: None stands for the identity, a number or an array like a field for a multiplication. Positive (definite).
-    coefficients : Any
-        Of a solver `op`: k or (k, shift) of `elliptic_solver`, the entries of `matrix_solver`.
-    mass_coefficients : Any
-        Of a solver `mass`.
+        M, symmetric and positive definite. None is the identity. A number or an array of the shape of the domain is a
+        diagonal matrix, such as a density. An Operator or a solver is any mass matrix of shape (n, n).
+    coefficients : array, number, or tuple of them
+        The coefficients of the solver `op`: k or (k, shift) of `elliptic_solver`, the entries of `matrix_solver`.
+    mass_coefficients : array
+        The coefficients of the solver `mass`.
     symmetric : bool
-        If False, the operator may be any one, and the result has values only, which may be complex and have no
-        derivatives. If True, an operator that is not symmetric is refused.
+        If True, an operator that is not symmetric is refused. If False, the result has values only, which are complex
+        in general and have no derivatives.
     cluster : float
         Neighbouring eigenvalues whose relative difference is smaller form a cluster; see Notes.
     method : "auto", "dense", "arpack" or "lobpcg"
-        LAPACK for the full matrix; Lanczos iterations of ARPACK with the inverse of A - sigma M; LOBPCG with an
-        approximate solve as preconditioner, for "smallest". "auto": "dense" up to 512 unknowns, else "arpack".
+        "dense" is LAPACK on the full matrix. "arpack" is the implicitly restarted Lanczos method of ARPACK in
+        shift-invert mode: with the inverse of A - sigma M. "lobpcg" has an approximate solve as preconditioner, and
+        takes which="smallest" only. "auto" is "dense" up to 512 unknowns, else "arpack".
     rtol : float
         Largest relative residual |A v - lambda M v| / |lambda M v| of a pair, unless the residual is at the level of
         rounding errors.
@@ -96,9 +99,9 @@ def eigenpairs(
     Returns
     -------
     Eigenpairs
-        `.values`, shape (k,), ascending; `.vectors`, shape (k, *domain.shape): ``vectors[i]`` is a field, in contrast
-        to the columns of SciPy. ``value, vector = pairs[i]``. `.clusters` lists the equal eigenvalues, of which
-        ``.sum(start, stop)`` and ``.project(u, start, stop)`` are differentiable functions. Differentiable in
+        `.values`, shape (k,), ascending; `.vectors`, shape (k, *domain.shape): ``vectors[i]`` is a field, whereas SciPy
+        returns columns. ``value, vector = pairs[i]``. `.clusters` lists the ranges of equal eigenvalues;
+        ``.sum(start, stop)`` and ``.project(u, start, stop)`` are their differentiable functions. Differentiable in
         `coefficients`, `mass` and `mass_coefficients`, to every order.
 
     Raises
@@ -129,22 +132,41 @@ def eigenpairs(
     respect to the cell volumes w; then the sum of w * v_i * M v_j is 1 or 0. Solid cells are not unknowns; vectors
     are 0 there.
 
-    **Derivatives.** d lambda = v . (dA - lambda dM) v needs no solve. A cotangent of a vector takes one solve of the
-    bordered system [[A - lambda M, -M v], [-(M v)^T, 0]], by sparse LU up to 20 000 unknowns and for a shift, else
-    by MINRES with the inverse of A - sigma M as preconditioner. See solvers/eigen_rules.py.
+    **Derivatives.** Changes dA and dM change a simple eigenvalue by ::
 
-    **Clusters.** At a multiple eigenvalue the single values have kinks, and the single vectors are arbitrary. What has
-    a derivative are functions that treat the members of a cluster alike: ``pairs.sum(start, stop)`` and
-    ``pairs.project(u, start, stop)`` of whole clusters, in forward and reverse mode and to every order, and in reverse
-    mode to first order every symmetric function of `values` and every function of `vectors` that no rotation changes.
-    Other derivatives are refused, also if the cluster continues behind the last of the k pairs: one more eigenvalue is
-    computed to know that. Other pairs are not affected: ``pairs.values[0]`` and ``pairs[0]`` are differentiable if
-    pair 0 is simple.
+        dlambda = v . (dA - lambda dM) v
+
+    (Hellmann-Feynman theorem), which needs no solve. The cotangent g of its vector takes one adjoint solve ::
+
+        [ A - lambda M   -M v ] [ y ]   [ g ]
+        [ -(M v)^T          0 ] [ c ] = [ 0 ]
+
+    whose symmetric matrix is that of the linearized problem (Nelson's method), and dv changes the loss by ::
+
+        g . dv = -y . (dA - lambda dM) v + c (v . dM v) / 2 .
+
+    The bordered system is solved by sparse LU up to 20 000 unknowns and for a shift, else by MINRES with the inverse of
+    A - sigma M as preconditioner.
+
+    **Clusters.** At a multiple (degenerate) eigenvalue the single values have kinks, and the single vectors are an
+    arbitrary basis of the eigenspace. Functions that treat the members of a cluster alike have derivatives:
+    ``pairs.sum(start, stop)`` and ``pairs.project(u, start, stop)`` of whole clusters to every order, in forward and
+    reverse mode; every symmetric function of `values` and every function of `vectors` that no rotation changes to first
+    order, in reverse mode. Other derivatives are refused. So are those of a cluster that continues behind the last of
+    the k pairs; one more eigenvalue is computed to detect that. Other pairs are not affected: ``pairs.values[0]`` and
+    ``pairs[0]`` are differentiable if pair 0 is simple.
 
     **Multiple eigenvalues** are complete: iterations are repeated in the complement of the pairs that are known.
 
+    References
+    ----------
+    R. B. Nelson, Simplified calculation of eigenvector derivatives, AIAA J. 14, 1976; J. R. Magnus, On differentiating
+    eigenvalues and eigenvectors, Econometric Theory 1, 1985; R. B. Lehoucq, D. C. Sorensen, C. Yang, ARPACK Users'
+    Guide, SIAM, 1998; A. V. Knyazev, Toward the optimal preconditioned eigensolver, SIAM J. Sci. Comput. 23, 2001.
+
     Examples
     --------
+    >>> import numpy as np
     >>> from sparsedp import Grid, dirichlet, divergence, elliptic_solver, from_matrix, gradient, value_and_grad
     >>> pairs = eigenpairs(from_matrix([[2.0, 1.0], [1.0, 2.0]]), 2)
     >>> print(np.round(pairs.values, 12))
@@ -155,25 +177,22 @@ def eigenpairs(
     >>> print(np.round(value, 12), np.round(slope, 12) + 0.0)
     2.0 [1. 0. 1.]
     """
-    given = leaves((mass, coefficients, mass_coefficients))
-    if recording_trace(given) is not None:
+    differentiable = leaves((mass, coefficients, mass_coefficients))
+    if recording_trace(differentiable) is not None:
         raise JitError("dp.jit cannot record eigenpairs, which decides by values; call the function without dp.jit")
-    require_arrays("eigenpairs", map(plain, given))
+    require_arrays("eigenpairs", map(plain, differentiable))
     settings = _checked_settings(k, which, symmetric, cluster, method, rtol, maxiter)
-    stiffness = _side("op", op, coefficients, "coefficients")
+    stiffness = _pencil_member("op", op, coefficients, "coefficients")
     domain, codomain = _spaces(op)
     if not fits(domain, codomain):
         raise ShapeError(f"eigenpairs takes a square operator, got one from {domain} to {codomain}; write op.T @ op")
-    masses = _mass_side(mass, mass_coefficients, domain)
-    count, which, symmetric, cluster, method, rtol, maxiter = settings
-    problem = Problem(stiffness, masses, count, which, method, rtol, maxiter)
-    coefficients = [plain(value) for value in problem.coefficients]
-    pencil = problem.pencil(coefficients)
-    _check_count(count, pencil)
-    if not symmetric:
-        return _general(problem, pencil, settings)
+    problem = EigenProblem(stiffness, _mass_member(mass, mass_coefficients, domain), settings)
+    pencil = problem.pencil([plain(value) for value in problem.coefficients])
+    _check_count(settings.k, pencil)
+    if not settings.symmetric:
+        return _general(problem, pencil)
     if pencil.weights is None or not pencil.mass_is_symmetric:
-        name = pencil.given.name if pencil.weights is None else "the mass"
+        name = pencil.name if pencil.weights is None else "the mass"
         raise TypeError(
             f"eigenpairs takes a symmetric operator, and {name} is not; write symmetric=False for its eigenvalues, or "
             "0.5 * (A + A.T) for its symmetric part"
@@ -183,7 +202,7 @@ def eigenpairs(
             "eigenpairs of complex operators have no derivatives; write the real symmetric operator of real and "
             "imaginary parts"
         )
-    return Eigenpairs(problem, domain, cluster)
+    return Eigenpairs(problem, domain)
 
 
 def _checked_settings(k, which, symmetric, cluster, method, rtol, maxiter):
@@ -201,7 +220,7 @@ def _checked_settings(k, which, symmetric, cluster, method, rtol, maxiter):
     rtol = check_number("rtol", rtol, "between 0 and 1")
     if maxiter is not None:
         maxiter = check_whole("maxiter", maxiter, 1)
-    return k, which, symmetric, cluster, method, rtol, maxiter
+    return EigenSettings(k, which, symmetric, cluster, method, rtol, maxiter)
 
 
 def _spaces(op):
@@ -211,37 +230,43 @@ def _spaces(op):
     return op.domain, op.codomain
 
 
-def _side(name, op, coefficients, of):
-    """Return an operator of the problem with its coefficients."""
+def _pencil_member(name, op, coefficients, coefficients_name):
+    """Return A or M with its coefficients; the names are those of the arguments."""
     if isinstance(op, ParametricSolver):
         op.D.backend.check("eigenpairs")
         op.D.codomain.backend.check("eigenpairs")
-        given = coefficients if isinstance(coefficients, tuple) else (coefficients,)
-        if not given:
-            raise TypeError(f"eigenpairs needs the coefficients of {op!r}, got none; write {of}=...")
+        if not isinstance(coefficients, tuple):
+            coefficients = (coefficients,)
+        if not coefficients:
+            raise TypeError(f"eigenpairs needs the coefficients of {op!r}, got none; write {coefficients_name}=...")
         most = len(signature(op.of_coefficients).parameters)
-        if len(given) > most:
-            raise TypeError(f"{op!r} has up to {most} coefficients, got {len(given)}; write {of}=...")
-        return OfCoefficients(*op.of_coefficients(*given))
+        if len(coefficients) > most:
+            raise TypeError(
+                f"{op!r} has up to {most} coefficients, got {len(coefficients)}; write {coefficients_name}=..."
+            )
+        return CoefficientOperator(*op.of_coefficients(*coefficients))
     if callable(op) and not isinstance(op, Operator):
         example = "dp.from_functions(f, f, n, n), or the solver of dp.elliptic_solver with coefficients="
         check_type(f"eigenpairs, as {name},", op, Operator, "an Operator", example)
     check_operator("eigenpairs", op)
     if not (isinstance(coefficients, tuple) and not coefficients):
-        raise TypeError(f"{of} belong to a solver, got an Operator {op}; write eigenpairs(solve, {of}=...)")
-    return Constant(op)
+        raise TypeError(
+            f"{coefficients_name} belong to a solver, got an Operator {op}; write "
+            f"eigenpairs(solve, {coefficients_name}=...)"
+        )
+    return ConstantOperator(op)
 
 
-def _mass_side(mass, coefficients, domain):
-    """Return the mass of the problem."""
+def _mass_member(mass, coefficients, domain):
+    """Return M with its coefficients."""
     if mass is None:
-        return Unit()
+        return IdentityMass()
     if isinstance(mass, (Operator, ParametricSolver)):
-        side = _side("mass", mass, coefficients, "mass_coefficients")
+        member = _pencil_member("mass", mass, coefficients, "mass_coefficients")
         for space in _spaces(mass):
             if not fits(space, domain):
                 raise ShapeError(f"the mass of eigenpairs acts on {space}, but the operator on {domain}")
-        return side
+        return member
     check_plain("eigenpairs", mass)
     values = np.asarray(plain(mass))
     check_kind("the mass of eigenpairs", values.dtype, "real numbers")
@@ -252,21 +277,18 @@ def _mass_side(mass, coefficients, domain):
     check_finite("the mass of eigenpairs", values)
     if np.any(values <= 0):
         raise ValueError(f"the mass of eigenpairs must be > 0, got {np.min(values):g} at {np.argmin(values)}")
-    return Multiplication(mass if isbox(mass) else values.astype(np.result_type(values, float)))
+    return DiagonalMass(mass if isbox(mass) else values.astype(np.result_type(values, float)))
 
 
 def _check_count(k, pencil):
     """Raise ValueError if there are fewer than k eigenvalues."""
     if k > pencil.unknowns:
-        raise ValueError(
-            f"eigenpairs got k={k}, but {pencil.given.name} has {pencil.unknowns} unknowns; write a smaller k"
-        )
+        raise ValueError(f"eigenpairs got k={k}, but {pencil.name} has {pencil.unknowns} unknowns; write a smaller k")
 
 
-def _general(problem, pencil, settings):
+def _general(problem, pencil):
     """Return the eigenvalues of an operator that need not be symmetric."""
-    k, which, _, _, method, _, maxiter = settings
-    values = general_values(pencil, k, which, method, maxiter)
+    values = general_values(pencil, problem.settings)
 
     def forward(*coefficients):
         return values
@@ -303,10 +325,8 @@ class Eigenpairs:
 
     Parameters
     ----------
-    problem : Problem
+    problem : EigenProblem
     domain : Space
-    cluster : float
-        Relative difference of the eigenvalues of a cluster.
 
     Attributes
     ----------
@@ -316,12 +336,12 @@ class Eigenpairs:
         Whether a cluster has members that are not among the k pairs.
     """
 
-    def __init__(self, problem: Problem, domain: Any, cluster: float) -> None:
+    def __init__(self, problem: EigenProblem, domain: Any) -> None:
         self._problem = problem
         self._domain = domain
-        self._tolerance = cluster
-        spectrum = problem.first.spectrum
-        pencil = problem.first.pencil
+        self._tolerance = problem.settings.cluster  # relative difference of the eigenvalues of a cluster
+        spectrum = problem.plain_solution.spectrum
+        pencil = problem.plain_solution.pencil
         self._floor = ROUNDING * float(np.ldexp(pencil.scale, pencil.exponent))
         self.clusters: tuple[range, ...] = _clusters(spectrum.values, self._are_equal)
         self._beyond = spectrum.beyond
@@ -349,12 +369,12 @@ class Eigenpairs:
     def vectors(self) -> Any:
         """The eigenvectors as fields, shape (k, *domain.shape)."""
         if not any(map(isbox, self._problem.coefficients)):
-            return self._problem.first.fields(range(len(self))).copy()
+            return self._problem.plain_solution.fields(range(len(self))).copy()
         return anp.concatenate([self._vectors_of(number) for number in range(len(self.clusters))])
 
     def __getitem__(self, index: int) -> tuple[Any, Any]:
         """Return the eigenvalue and the eigenvector of one pair; only its own cluster is differentiated."""
-        number, place = self._place(index)
+        number, place = self._cluster_and_member(index)
         return self._values_of(number)[place], self._vectors_of(number)[place]
 
     def __len__(self) -> int:
@@ -373,14 +393,14 @@ class Eigenpairs:
         float
             Differentiable in forward and reverse mode, to every order, unless `start` or `stop` cuts a cluster.
         """
-        chosen = self._chosen(start, stop)
+        chosen = self._range_of(start, stop)
         total = 0.0
-        for number in self._touched(chosen):
+        for number in self._clusters_in(chosen):
             if self._is_whole(number, chosen):
                 block = self._problem.block(self.clusters[number])
                 total = total + anp.sum(block * np.eye(len(block)))
             else:
-                total = total + anp.sum(self._values_of(number)[self._part(number, chosen)])
+                total = total + anp.sum(self._values_of(number)[self._members_in(number, chosen)])
         return total
 
     def project(self, u: Any, start: int = 0, stop: int | None = None) -> Any:
@@ -398,30 +418,30 @@ class Eigenpairs:
             The sum of v (v . M u) over these vectors. Differentiable in u and in the coefficients, in forward and
             reverse mode, to every order, unless `start` or `stop` cuts a cluster.
         """
-        chosen = self._chosen(start, stop)
+        chosen = self._range_of(start, stop)
         check_plain("project", u)
         check_on("project", u, self._domain)
         problem = self._problem
         _, of_mass = problem.parts(problem.coefficients)
-        image = anp.reshape(problem.first.weights * problem.mass.product(u, of_mass), (-1,))
+        image = anp.reshape(problem.plain_solution.weights * problem.mass.product(u, of_mass), (-1,))
         total = np.zeros(self._domain.shape)
-        for number in self._touched(chosen):
+        for number in self._clusters_in(chosen):
             if self._is_whole(number, chosen):
                 vectors = problem.vectors(self.clusters[number])
             else:
-                vectors = self._vectors_of(number)[self._part(number, chosen)]
+                vectors = self._vectors_of(number)[self._members_in(number, chosen)]
             shares = anp.dot(anp.conj(anp.reshape(vectors, (len(vectors), -1))), image)
             total = total + anp.tensordot(shares, vectors, axes=1)
         return total
 
-    def _chosen(self, start, stop):
+    def _range_of(self, start, stop):
         """Return the range of pairs of two indices, as for a list."""
         chosen = range(len(self))[start:stop]
         if not chosen:
             raise ValueError(f"pairs {start} to {stop} of {len(self)} eigenpairs are none; write start < stop")
         return chosen
 
-    def _touched(self, chosen):
+    def _clusters_in(self, chosen):
         """Return the numbers of the clusters with members in a range of pairs."""
         return [
             number
@@ -433,12 +453,12 @@ class Eigenpairs:
         members = self.clusters[number]
         return not self.cut[number] and chosen.start <= members.start and members.stop <= chosen.stop
 
-    def _part(self, number, chosen):
+    def _members_in(self, number, chosen):
         """Return the places of the members of a cluster that belong to a range of pairs."""
         first = self.clusters[number].start
         return slice(max(chosen.start - first, 0), chosen.stop - first)
 
-    def _place(self, index):
+    def _cluster_and_member(self, index):
         """Return the number of the cluster of a pair, and the place of the pair in it."""
         if not -len(self) <= index < len(self):
             raise IndexError(f"there is no pair {index} among {len(self)} eigenpairs; write 0 to {len(self) - 1}")

@@ -16,9 +16,11 @@ reproducible. Four things happen after each of them:
 
 from __future__ import annotations
 
+from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import scipy.linalg as la
@@ -36,11 +38,11 @@ from sparsedp.solvers.scaling import exponent_of
 from sparsedp.solvers.system import System
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from numpy.typing import NDArray
 
-__all__ = ["DENSE_UP_TO", "METHODS", "Pencil", "Spectrum", "general_values", "symmetric_pairs"]
+__all__ = ["DENSE_UP_TO", "METHODS", "EigenSettings", "Pencil", "Spectrum", "general_values", "symmetric_pairs"]
 
 METHODS = ("auto", "dense", "arpack", "lobpcg")
 DENSE_UP_TO = 512  # unknowns for which "auto" takes LAPACK: 0.1 s
@@ -62,8 +64,33 @@ INNER = 1e-11  # relative tolerance of the solves inside of ARPACK
 TIGHT = 1e-11  # tolerance of ARPACK; a step of inverse iteration follows
 LOOSE = 1e-6  # tolerance of the search for missing copies
 MOST_RESTARTS = 64  # for missing copies
+TIE = 1e-9  # eigenvalues that are nearer by less than this share count as equally near in that search
 MOST_STEPS = 20  # of inverse iteration after ARPACK or LOBPCG
 INERTIA_UP_TO = 300_000  # unknowns for which a factorisation counts the eigenvalues below a shift
+
+
+@dataclass(frozen=True)
+class EigenSettings:
+    """The options of `eigenpairs`, after their checks.
+
+    Attributes
+    ----------
+    k : int
+    which : "smallest", "largest" or number
+    symmetric : bool
+    cluster : float
+    method : one of METHODS
+    rtol : float
+    maxiter : int or None
+    """
+
+    k: int
+    which: Any
+    symmetric: bool
+    cluster: float
+    method: str
+    rtol: float
+    maxiter: int | None
 
 
 @dataclass(frozen=True)
@@ -92,19 +119,25 @@ class Pencil:
     ----------
     op : Operator
     mass : None, number, array of the shape of a field, or Operator
-        M: one for None, and its diagonal for a number or an array.
+        M: the identity for None, and a diagonal matrix for a number or an array.
     rtol : float
+        Largest relative residual of a pair.
+    symmetric : bool
+        Whether A and M are made symmetric by `weights`.
 
     Attributes
     ----------
+    name : str
+        Name of A in messages.
     exponent : int
         Eigenvalues are those of the pencil times 2^exponent.
     mass_exponent : int
         Eigenvectors are those of the pencil times 2^(-mass_exponent / 2); it is even.
     """
 
-    def __init__(self, op: Operator, mass: Any, rtol: float) -> None:
-        self.given = op
+    def __init__(self, op: Operator, mass: Any, rtol: float, symmetric: bool = True) -> None:
+        self.name = op.name
+        self._symmetric = symmetric
         self.system = System(op)
         self.op = self.system.op
         self.rtol = rtol
@@ -148,7 +181,12 @@ class Pencil:
 
     @cached_property
     def weights(self) -> Any:
-        """Positive w such that diag(w) A and diag(w) M are symmetric: 1.0, an array, or None when none is known."""
+        """Positive w such that diag(w) A and diag(w) M are symmetric: 1.0, an array, or None when none is known.
+
+        It is 1.0 if they need not be symmetric.
+        """
+        if not self._symmetric:
+            return 1.0
         candidates: list[Any] = [1.0]
         if not self.complex and not self.system.uniform:
             space = self.op.domain if self.op.domain.grid is not None else self.op.codomain
@@ -168,26 +206,27 @@ class Pencil:
 
     def _is_symmetric(self, product, weights, magnitude):
         x, y = np.random.default_rng(0).standard_normal((2, self.size))
-        x = self._masked(x)
-        y = self._masked(y)
+        x = self.masked(x)
+        y = self.masked(y)
         one = y @ (weights * product(x))
         other = np.conj(x @ (weights * product(y)))
         size = np.abs(y) @ (weights * magnitude(np.abs(x)))
         return bool(abs(one - other) <= SYMMETRIC * size)
 
-    def _masked(self, x):
+    def masked(self, x: NDArray[Any]) -> NDArray[Any]:
+        """Return a vector with 0 in the entries that are not unknowns."""
         return x if self.active is None else np.where(self.active, x, 0.0)
 
     # ------------------------------------------------------------ products
 
     def _stiffness(self, x):
-        return self._masked(self.op._acting.product(x))
+        return self.masked(self.op._acting.product(x))
 
     def _plain_mass(self, x):
         if self.mass is None:
             return x
         if isinstance(self.mass, Operator):
-            return self._masked(self.mass._acting.product(x))
+            return self.masked(self.mass._acting.product(x))
         return self.mass.reshape(-1) * x
 
     def apply_stiffness(self, x: NDArray[Any]) -> NDArray[Any]:
@@ -206,7 +245,7 @@ class Pencil:
     @property
     def _row_sums(self):
         """Sums of magnitudes in the rows of the unknowns of A, divided by the mean of M."""
-        sums = self.weights * self._masked(self.system.magnitude(self._masked(np.ones(self.size))))
+        sums = self.weights * self.masked(self.system.magnitude(self.masked(np.ones(self.size))))
         signs = self.start
         mass = float(np.real(np.vdot(signs, self.apply_mass(signs)))) / float(np.real(np.vdot(signs, signs)))
         if self.active is not None:
@@ -216,7 +255,7 @@ class Pencil:
     @cached_property
     def start(self) -> NDArray[Any]:
         """The vector with which iterations start: random numbers from a fixed seed."""
-        return self._masked(np.random.default_rng(1).standard_normal(self.size)).astype(self.dtype)
+        return self.masked(np.random.default_rng(1).standard_normal(self.size)).astype(self.dtype)
 
     @property
     def dtype(self) -> Any:
@@ -260,7 +299,7 @@ class Pencil:
         else:
             mass = diagonal(self.op.domain, self.mass)
         shifted = self.op + (-sigma) * mass
-        return Operator(shifted.structure, self.op.domain, self.op.domain, f"shift of {self.given.name}")
+        return Operator(shifted.structure, self.op.domain, self.op.domain, f"shift of {self.name}")
 
     def shifted_inverse(self, sigma: float, rtol: float, definite: bool) -> Callable:
         """Return the function b -> x with diag(w) (A - sigma M) x = b.
@@ -278,12 +317,12 @@ class Pencil:
         if not definite and op.structure.has_entries and not op.separable:
             method = "direct"
         settings = SolveSettings(method, rtol, None, "project", {})
-        name = f"eigenpairs({self.given.name})"
+        name = f"eigenpairs({self.name})"
         solve = build(op, settings, name, all_rows=False).apply
         shape = self.op.domain.shape
 
         def solved(b: NDArray[Any]) -> NDArray[Any]:
-            return self._masked(solve((b / self.weights).reshape(shape)).reshape(-1))
+            return self.masked(solve((b / self.weights).reshape(shape)).reshape(-1))
 
         return solved
 
@@ -313,12 +352,11 @@ class Pencil:
 
     def negative(self) -> Pencil:
         """Return the pencil of -A and M."""
-        negative = Pencil.__new__(Pencil)
-        negative.__dict__.update(self.__dict__)
+        negative = copy(self)
         negative.op = -1.0 * self.op
         negative.system = System(negative.op)
-        for name in ("is_positive", "matrices"):
-            negative.__dict__.pop(name, None)
+        for name in ("is_positive", "matrices"):  # cached properties that depend on the sign of A
+            vars(negative).pop(name, None)
         return negative
 
     def _is_singular(self):
@@ -338,7 +376,7 @@ class Pencil:
             return sigma
         if self.unknowns > INERTIA_UP_TO:
             raise ConvergenceError(
-                f"eigenpairs cannot find the end of the spectrum of {self.given.name}, whose rows do not show that it "
+                f"eigenpairs cannot find the end of the spectrum of {self.name}, whose rows do not show that it "
                 "has no negative eigenvalue; give the shift: which=-1.0, below or near to the wanted eigenvalues",
                 info=failure("setup_failed"),
             )
@@ -372,26 +410,27 @@ def _matrix(op: Operator) -> sp.csr_array:
 # ---- symmetric pencils -----------------------------------------------------------------------------------------------
 
 
-def symmetric_pairs(pencil: Pencil, k: int, which: Any, method: str, maxiter: int | None) -> Spectrum:
+def symmetric_pairs(pencil: Pencil, settings: EigenSettings) -> Spectrum:
     """Return k pairs of a symmetric (or Hermitian) pencil.
 
     Parameters
     ----------
     pencil : Pencil
-    k : int
-    which : "smallest", "largest" or float
-    method : one of METHODS
-    maxiter : int or None
+    settings : EigenSettings
 
     Raises
     ------
+    ValueError
+        If the method does not fit the number of unknowns, k or `which`, or if the mass is not positive definite.
     ConvergenceError
         If the iteration does not converge, or the residual of a pair is too large.
     """
-    scaled_which = which
-    if not isinstance(which, str):
-        scaled_which = float(np.ldexp(which, -pencil.exponent))
-    method = _chosen(pencil, k, which, method)
+    k = settings.k
+    maxiter = settings.maxiter
+    scaled_which = settings.which
+    if not isinstance(settings.which, str):
+        scaled_which = float(np.ldexp(settings.which, -pencil.exponent))
+    method = _chosen_method(pencil, settings)
     if method == "dense":
         values, vectors = _dense(pencil)
     elif method == "lobpcg":
@@ -402,16 +441,21 @@ def symmetric_pairs(pencil: Pencil, k: int, which: Any, method: str, maxiter: in
     chosen = order[:k][np.argsort(values[order[:k]], kind="stable")]
     beyond = values[order[k : k + 1]]
     vectors = np.array([_with_fixed_sign(vector) for vector in vectors[chosen]])
-    chosen_values = _check_residuals(pencil, values[chosen], vectors)
+    residuals = [PairResidual.of(pencil, *pair) for pair in zip(values[chosen], vectors, strict=True)]
+    _check_residuals(residuals, pencil.rtol)
+    is_zero = np.array([residual.is_zero for residual in residuals], bool)
     return Spectrum(
-        np.ldexp(chosen_values, pencil.exponent),
+        np.ldexp(np.where(is_zero, 0.0, values[chosen]), pencil.exponent),
         vectors * 2.0 ** -(pencil.mass_exponent // 2),
         np.ldexp(beyond, pencil.exponent),
     )
 
 
-def _chosen(pencil, k, which, method):
-    """Return the method in place of "auto"; refuse one that does not fit."""
+def _chosen_method(pencil, settings):
+    """Return the method, chosen by size for "auto"; raise ValueError for a method that does not fit."""
+    k = settings.k
+    which = settings.which
+    method = settings.method
     n = pencil.unknowns
     if method == "dense" and n > DENSE_AT_MOST:
         raise _too_large(n)
@@ -474,28 +518,73 @@ def _by_arpack(pencil, k, which, maxiter):
     else:
         sigma = which - NUDGE * pencil.scale
     solve = pencil.shifted_inverse(sigma, INNER, isinstance(which, str) and pencil.is_positive)
-    known = np.zeros((0, pencil.size), pencil.dtype)
-    count = k + 1
-    values = np.zeros(0)
-    for _ in range(MOST_RESTARTS):
+
+    def search(known, count):
         tolerance = LOOSE if len(known) else TIGHT
-        new_values, new_vectors = _shift_invert(pencil, sigma, solve, known, count, maxiter, tolerance)
-        if len(known):
-            farthest = np.sort(np.abs(values - sigma))[k]
-            if not np.min(np.abs(new_values - sigma)) < farthest * (1.0 - 1e-9):
+        return _shift_invert(pencil, sigma, solve, known, count, maxiter, tolerance)
+
+    def is_nearer(value, last):
+        return abs(value - sigma) < abs(last - sigma) * (1.0 - TIE)
+
+    _, vectors = _with_missing_copies(
+        search, is_nearer, lambda values: np.abs(values - sigma), pencil, k, most=pencil.unknowns - 2
+    )
+    values, vectors = _polished(pencil, solve, vectors, k)
+    return sign * values, vectors
+
+
+def _with_missing_copies(search, is_nearer, distances, pencil, k, most):
+    """Return k + 1 pairs or more, after searches in the complement of the known vectors that find no nearer pair.
+
+    Parameters
+    ----------
+    search : callable
+        ``search(known, count)`` returns the values and vectors of `count` pairs in the complement of the known vectors.
+    is_nearer : callable
+        ``is_nearer(value, last)`` returns whether a new eigenvalue belongs before the last one of the k + 1 pairs.
+    distances : callable
+        ``distances(values)`` returns numbers that are smaller for eigenvalues that are selected first.
+    pencil : Pencil
+    k : int
+    most : int
+        Number of vectors beyond which the complement is too small for another search.
+    """
+    values = np.zeros(0)
+    vectors = np.zeros((0, pencil.size), pencil.dtype)
+    count = k + 1
+    for _ in range(MOST_RESTARTS):
+        new_values, new_vectors = search(vectors, count)
+        if len(vectors):
+            nearest = new_values[np.argmin(distances(new_values))]
+            last = values[np.argsort(distances(values))[k]]
+            if not is_nearer(nearest, last):
                 break
-        known = np.concatenate([known, new_vectors])
         values = np.concatenate([values, new_values])
-        if len(known) + 2 > pencil.unknowns:
+        vectors = np.concatenate([vectors, new_vectors])
+        if len(vectors) > most:
             break
         count = 1
-    values, vectors = _polished(pencil, solve, known, k)
-    return sign * values, vectors
+    return values, vectors
+
+
+@contextmanager
+def _arpack_errors(count: int) -> Iterator[None]:
+    """Raise ConvergenceError in place of the exception of ARPACK for fewer than `count` eigenvalues."""
+    from scipy.sparse.linalg import ArpackNoConvergence
+
+    try:
+        yield
+    except ArpackNoConvergence as error:
+        raise ConvergenceError(
+            f"eigenpairs found {len(error.eigenvalues)} of {count} pairs; increase maxiter, or give a shift near to "
+            "them by which",
+            info=failure("max_iterations"),
+        ) from None
 
 
 def _shift_invert(pencil, sigma, solve, known, count, maxiter, tolerance):
     """Return pairs near a shift, in the complement of the known vectors."""
-    from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
+    from scipy.sparse.linalg import LinearOperator, eigsh
 
     shape = pencil.size, pencil.size
     images = np.array([pencil.apply_mass(vector) for vector in known]).reshape(known.shape)
@@ -508,7 +597,7 @@ def _shift_invert(pencil, sigma, solve, known, count, maxiter, tolerance):
         return complement(solve(b - images.T @ (known.conj() @ b)))
 
     dtype = pencil.dtype
-    try:
+    with _arpack_errors(count):
         values, vectors = eigsh(
             LinearOperator(shape, pencil.apply_stiffness, dtype=dtype),
             count,
@@ -520,54 +609,45 @@ def _shift_invert(pencil, sigma, solve, known, count, maxiter, tolerance):
             tol=tolerance,
             OPinv=LinearOperator(shape, solved, dtype=dtype),
         )
-    except ArpackNoConvergence as error:
-        raise _not_converged(len(error.eigenvalues), count) from None
     return values, vectors.T
-
-
-def _not_converged(found, wanted):
-    message = f"eigenpairs found {found} of {wanted} pairs; increase maxiter, or give a shift near to them by which"
-    return ConvergenceError(message, info=failure("max_iterations"))
 
 
 def _by_products(pencil, k, which, maxiter):
     """Return the pairs of an operator without entries at an end of its spectrum, by products only."""
-    from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
+    from scipy.sparse.linalg import LinearOperator, eigsh
 
     if not isinstance(which, str) or isinstance(pencil.mass, Operator):
         raise ValueError(
-            f"{pencil.given.name} has no entries, so that eigenpairs takes which='smallest' or 'largest' and a mass "
-            "that is a number or a field; write dp.from_matrix(A) of its matrix for the others"
+            f"{pencil.name} has no entries, so that eigenpairs takes which='smallest' or 'largest' and a mass that is "
+            "a number or a field; write dp.from_matrix(A) of its matrix for the others"
         )
     masses = pencil.apply_mass(np.ones(pencil.size))
     roots = np.sqrt(masses)
-    known = np.zeros((0, pencil.size), pencil.dtype)
-    values = np.zeros(0)
-    count = k + 1
     direction = {"smallest": 1.0, "largest": -1.0}[which]
-    far = direction * 4.0 * pencil.scale * max(1.0, float(np.max(masses) / np.min(masses))) * pencil.size
-
-    def product(x):
-        x = np.asarray(x).reshape(-1)
-        y = pencil.apply_stiffness(x / roots) / roots
-        return y + far * (known.T @ (known.conj() @ x))  # moves the known vectors to the other end
-
     ends = {"smallest": "SA", "largest": "LA"}
-    for _ in range(MOST_RESTARTS):
+    # A bound of the width of the spectrum: known vectors are moved by it to the other end.
+    width = direction * 4.0 * pencil.scale * max(1.0, float(np.max(masses) / np.min(masses))) * pencil.size
+
+    def search(known, count):
+        def product(x):
+            x = np.asarray(x).reshape(-1)
+            y = pencil.apply_stiffness(x / roots) / roots
+            return y + width * (known.T @ (known.conj() @ x))
+
         op = LinearOperator((pencil.size, pencil.size), product, dtype=pencil.dtype)
         ncv = min(pencil.size, max(2 * count + 1, 20))
         limit = maxiter or 100 * pencil.size
-        try:
-            new_values, new = eigsh(op, count, which=ends[which], v0=pencil.start, ncv=ncv, maxiter=limit)
-        except ArpackNoConvergence as error:
-            raise _not_converged(len(error.eigenvalues), count) from None
-        new_values = new_values.real
-        if len(known) and not direction * new_values[0] < np.sort(direction * values)[k] - 1e-9 * abs(far):
-            break
-        known = np.concatenate([known, new.T])
-        values = np.concatenate([values, new_values])
-        count = 1
-    return values, known / roots
+        with _arpack_errors(count):
+            values, vectors = eigsh(op, count, which=ends[which], v0=pencil.start, ncv=ncv, maxiter=limit)
+        return values.real, vectors.T
+
+    def is_nearer(value, last):
+        return direction * value < direction * last - TIE * abs(width)
+
+    values, vectors = _with_missing_copies(
+        search, is_nearer, lambda values: direction * values, pencil, k, most=pencil.size
+    )
+    return values, vectors / roots
 
 
 def _polished(pencil, solve, vectors, count):
@@ -579,7 +659,7 @@ def _polished(pencil, solve, vectors, count):
         vectors = np.array([solve(pencil.apply_mass(vector)) for vector in vectors])
         values, vectors = _rayleigh_ritz(pencil, vectors)
         tested = zip(values[:count], vectors[:count], strict=True)
-        if all(_residual(pencil, value, vector)[1] for value, vector in tested):
+        if all(PairResidual.of(pencil, value, vector).is_small for value, vector in tested):
             break
     return values, vectors
 
@@ -617,7 +697,7 @@ def _by_lobpcg(pencil, k, maxiter):
         return LinearOperator(shape, matvec=lambda x: product(x.reshape(-1)), matmat=act, dtype=pencil.dtype)
 
     block = np.random.default_rng(1).standard_normal((count, pencil.size))
-    block = np.array([pencil._masked(line) for line in block])
+    block = np.array([pencil.masked(line) for line in block])
     for _ in range(2):
         block = np.array([solve(pencil.apply_mass(line)) for line in block])
         bounds, block = _rayleigh_ritz(pencil, block)  # upper bounds of the eigenvalues
@@ -640,31 +720,44 @@ def _by_lobpcg(pencil, k, maxiter):
     return _polished(pencil, solve, vectors.T, k)
 
 
-def _residual(pencil, value, vector):
-    """Return the relative residual of a pair, whether it is small, and whether the eigenvalue is 0 up to rounding."""
-    image = pencil.apply_stiffness(vector)
-    mass = value * pencil.apply_mass(vector)
-    residual = np.linalg.norm(image - mass)
-    size = np.linalg.norm(mass)
-    terms = np.linalg.norm(pencil.weights * pencil.system.magnitude(np.abs(vector)))
-    is_small = residual <= max(pencil.rtol * size, AT_ROUNDOFF * (terms + size))
-    return residual / (size or 1.0), is_small, size <= ZERO * terms
+class PairResidual(NamedTuple):
+    """The residual A v - lambda M v of a pair.
+
+    Attributes
+    ----------
+    relative : float
+        Its norm, divided by that of lambda M v.
+    is_small : bool
+        Whether it is within the tolerance, or at the level of rounding errors.
+    is_zero : bool
+        Whether the eigenvalue is 0 up to rounding errors.
+    """
+
+    relative: float
+    is_small: bool
+    is_zero: bool
+
+    @classmethod
+    def of(cls, pencil: Pencil, value: float, vector: NDArray[Any]) -> PairResidual:
+        """Return the residual of one pair."""
+        image = pencil.apply_stiffness(vector)
+        mass = value * pencil.apply_mass(vector)
+        residual = np.linalg.norm(image - mass)
+        size = np.linalg.norm(mass)
+        terms = np.linalg.norm(pencil.weights * pencil.system.magnitude(np.abs(vector)))
+        is_small = residual <= max(pencil.rtol * size, AT_ROUNDOFF * (terms + size))
+        return cls(float(residual / (size or 1.0)), bool(is_small), bool(size <= ZERO * terms))
 
 
-def _check_residuals(pencil, values, vectors):
-    """Raise ConvergenceError if a pair does not satisfy A v = lambda M v; return the values, 0 for rounding errors."""
-    checked = values.copy()
-    for number, (value, vector) in enumerate(zip(values, vectors, strict=True)):
-        residual, is_small, is_zero = _residual(pencil, value, vector)
-        if is_zero:
-            checked[number] = 0.0
-        if not is_small:
+def _check_residuals(residuals, rtol):
+    """Raise ConvergenceError if a pair does not satisfy A v = lambda M v."""
+    for number, residual in enumerate(residuals):
+        if not residual.is_small:
             raise ConvergenceError(
-                f"pair {number} of eigenpairs has a relative residual of {residual:.1e}, more than {pencil.rtol:g}; "
+                f"pair {number} of eigenpairs has a relative residual of {residual.relative:.1e}, more than {rtol:g}; "
                 "give a shift near to it by which, or increase maxiter",
                 info=failure("stagnated"),
             )
-    return checked
 
 
 def _with_fixed_sign(vector):
@@ -679,58 +772,74 @@ def _with_fixed_sign(vector):
 # ---- operators that are not symmetric --------------------------------------------------------------------------------
 
 
-def general_values(pencil: Pencil, k: int, which: Any, method: str, maxiter: int | None) -> NDArray[Any]:
-    """Return k eigenvalues of any pencil, complex in general, in ascending order of their real parts."""
-    from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs
+def general_values(pencil: Pencil, settings: EigenSettings) -> NDArray[Any]:
+    """Return k eigenvalues of a pencil that need not be symmetric, in ascending order of their real parts.
 
-    pencil.__dict__["weights"] = 1.0
-    scaled_which = which
+    Parameters
+    ----------
+    pencil : Pencil
+    settings : EigenSettings
+
+    Raises
+    ------
+    ValueError
+        If the method does not fit the number of unknowns or `which`.
+    ConvergenceError
+        If the iteration does not converge.
+    """
+    k = settings.k
+    which = settings.which
     if not isinstance(which, str):
-        scaled_which = complex(which) * 2.0**-pencil.exponent
-    if method == "lobpcg":
+        which = complex(which) * 2.0**-pencil.exponent
+    if settings.method == "lobpcg":
         raise ValueError("method lobpcg takes symmetric operators; write method='arpack'")
     n = pencil.unknowns
-    if method == "dense" or (method == "auto" and (n <= GENERAL_DENSE_UP_TO or LARGE_SHARE * (k + 2) > n)):
-        if n > DENSE_AT_MOST:
-            raise _too_large(n)
-        stiffness, mass = (matrix.toarray() for matrix in pencil.matrices)
-        if pencil.mass is None:
-            values = la.eigvals(stiffness)
-        else:
-            values = la.eigvals(stiffness, mass)
+    is_small = n <= GENERAL_DENSE_UP_TO or LARGE_SHARE * (k + 2) > n
+    if settings.method == "dense" or (settings.method == "auto" and is_small):
+        values = _general_dense(pencil)
     else:
-        shape = pencil.size, pencil.size
-        options: dict[str, Any] = {"which": {"smallest": "SR", "largest": "LR"}.get(str(which), "LM")}
-        if not isinstance(which, str):
-            sigma = scaled_which.real if scaled_which.imag == 0 else scaled_which
-            sigma = sigma - NUDGE * pencil.scale
-            solve = pencil.shifted_inverse(sigma, INNER, False)
-            if isinstance(sigma, complex):
-                pencil.complex = True
-            options.update(sigma=sigma, OPinv=LinearOperator(shape, solve, dtype=pencil.dtype))
-        elif pencil.mass is not None:
-            raise ValueError(
-                "eigenpairs of a large operator that is not symmetric and a mass takes a shift, got "
-                f"which={which!r}; write a number"
-            )
-        mass_op = None if pencil.mass is None else LinearOperator(shape, pencil.apply_mass, dtype=pencil.dtype)
-        try:
-            values = eigs(
-                LinearOperator(shape, pencil.apply_stiffness, dtype=pencil.dtype),
-                k,
-                mass_op,
-                v0=pencil.start,
-                maxiter=maxiter,
-                return_eigenvectors=False,
-                **options,
-            )
-        except ArpackNoConvergence as error:
-            raise _not_converged(len(error.eigenvalues), k) from None
-    if which == "smallest":
-        distances = values.real
-    elif which == "largest":
-        distances = -values.real
-    else:
-        distances = np.abs(values - scaled_which)
-    values = np.sort_complex(values[distances.argsort(kind="stable")[:k]])
-    return values * 2.0**pencil.exponent
+        values = _general_by_arpack(pencil, k, which, settings.maxiter)
+    nearest = _distances(values.real if isinstance(which, str) else values, which).argsort(kind="stable")
+    return np.sort_complex(values[nearest[:k]]) * 2.0**pencil.exponent
+
+
+def _general_dense(pencil):
+    """Return all eigenvalues, by LAPACK."""
+    if pencil.unknowns > DENSE_AT_MOST:
+        raise _too_large(pencil.unknowns)
+    stiffness, mass = (matrix.toarray() for matrix in pencil.matrices)
+    if pencil.mass is None:
+        return la.eigvals(stiffness)
+    return la.eigvals(stiffness, mass)
+
+
+def _general_by_arpack(pencil, k, which, maxiter):
+    """Return k eigenvalues at an end of the spectrum, or near a number by shift-invert."""
+    from scipy.sparse.linalg import LinearOperator, eigs
+
+    shape = pencil.size, pencil.size
+    dtype = pencil.dtype
+    options: dict[str, Any] = {"which": {"smallest": "SR", "largest": "LR"}.get(str(which), "LM")}
+    if not isinstance(which, str):
+        sigma = which.real if which.imag == 0 else which
+        sigma = sigma - NUDGE * pencil.scale
+        solve = pencil.shifted_inverse(sigma, INNER, False)
+        if isinstance(sigma, complex):
+            dtype = complex
+        options.update(sigma=sigma, OPinv=LinearOperator(shape, solve, dtype=dtype))
+    elif pencil.mass is not None:
+        raise ValueError(
+            "eigenpairs of a large operator that is not symmetric and a mass takes a shift, got "
+            f"which={which!r}; write a number"
+        )
+    mass_op = None if pencil.mass is None else LinearOperator(shape, pencil.apply_mass, dtype=dtype)
+    with _arpack_errors(k):
+        return eigs(
+            LinearOperator(shape, pencil.apply_stiffness, dtype=dtype),
+            k,
+            mass_op,
+            v0=pencil.start,
+            maxiter=maxiter,
+            return_eigenvectors=False,
+            **options,
+        )

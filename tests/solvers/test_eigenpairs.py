@@ -128,9 +128,10 @@ def test_entries_of_matrices_as_coefficients():
     near(value_and_grad(of_elements)(x)[1], value_and_grad(of_matrices)(x)[1])
 
 
-def test_a_bordered_solve_by_iterations_is_that_by_factors(monkeypatch):
+@pytest.mark.parametrize("which", ["smallest", "largest"])
+def test_a_bordered_solve_by_iterations_is_that_by_factors(which, monkeypatch):
     def slope():
-        return grad(lambda x: anp.sum(WEIGHTS[0] * dp.eigenpairs(SOLVE, 2, coefficients=x).vectors[0] ** 3))(K)
+        return grad(lambda x: anp.sum(WEIGHTS[0] * dp.eigenpairs(SOLVE, 2, which, coefficients=x).vectors[0] ** 3))(K)
 
     expected = slope()
     monkeypatch.setattr(eigen_rules, "BORDERED_LU_UP_TO", 0)
