@@ -513,6 +513,12 @@ BUGS = {
         "np.random.default_rng(0), count",
         "tests/optimize/test_laplace.py",
     ),
+    "samples of a posterior by the prior in place of its root": Bug(
+        "optimize/prior_covariance.py",
+        "weights = vectors @ (np.sqrt(np.maximum(eigenvalues, 0.0)) * vectors[0])",
+        "weights = vectors @ (np.maximum(eigenvalues, 0.0) * vectors[0])",
+        "tests/optimize/test_laplace.py",
+    ),
     "eigenvectors that are not normalized in the metric of the prior": Bug(
         "optimize/misfit_eigenpairs.py",
         "scaled = (first / np.sqrt(squares[is_first])).T[::-1]",

@@ -143,8 +143,17 @@ def test_jacobian_and_products_agree(rng, monkeypatch):
     ratio = posterior.variance(30) / np.diag(covariance)  # as many probes as unknowns
     assert np.all(ratio >= 1 - 1e-4) and np.all(ratio <= 1 + posterior.error)
     assert np.all(posterior.variance_error(30) == 0)
+
+
+def test_samples_by_a_lanczos_iteration(monkeypatch):
+    """The square root of a prior without a root is the symmetric one of the dense matrix."""
+    monkeypatch.setattr(prior_covariance, "MOST_COLUMNS", 1)
+    functions = dp.from_functions(MATERN, MATERN, GRID.cells, GRID.cells)
+    posterior = dp.laplace(lambda x: np.zeros(0), np.zeros(GRID.shape), functions)
     [sample] = posterior.sample(1, seed=3)
-    assert np.all(np.isfinite(sample))
+    normal = np.random.default_rng(3).standard_normal((1, N))[0]
+    exact = scipy.linalg.sqrtm(dense(MATERN)) @ normal
+    assert np.linalg.norm(sample.ravel() - exact) <= 2e-4 * np.linalg.norm(exact)
 
 
 def test_stated_error_of_estimated_variances(rng, monkeypatch):
