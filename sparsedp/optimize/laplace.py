@@ -1,4 +1,4 @@
-"""laplace: the posterior near its mode as a normal distribution, from a misfit and a prior covariance."""
+"""laplace: the Laplace approximation of a posterior, a normal distribution, for a misfit and a prior covariance."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = ["laplace"]
 
-FAR = 0.1  # posterior standard deviations between x and the mode, above which a warning is issued
+LARGEST_SHIFT = 0.1  # distance of x from the mode, in posterior standard deviations, above which a warning is issued
 NOT_COMPLETE = (
     "eigenvalues of the misfit up to about {:.2g} are neglected, because {}: variances are too large, by a factor of "
     "up to {:.3g}; {}"
@@ -49,29 +49,31 @@ def laplace(
     tolerance: float = 0.01,
     seed: int = 0,
 ) -> Posterior:
-    """Approximate the posterior of unknowns by a normal distribution with mean x (Laplace approximation).
+    """Approximate the posterior of unknowns near its mode x by a normal distribution (Laplace approximation).
 
     Parameters
     ----------
     misfit : callable
         ``misfit(x)`` returns an array of residuals, (prediction - data) / standard deviation of the noise, so that
-        their variance is 1; or one number, the negative logarithm of the likelihood. It does not contain the prior.
+        their variance is 1; or one number, the negative log-likelihood. It does not contain the prior.
     x : tree of arrays
-        The mode of the posterior, such as ``best.x`` of `minimize` for the sum of the misfit and the prior. Leaves that
-        are not floating are constants.
+        The mode of the posterior (maximum a posteriori estimate), such as ``best.x`` of `minimize` for the sum of the
+        misfit and the prior. Leaves that are not floating are constants.
     prior : Operator, number, or tree of them
         The prior covariance C: an Operator for the array x, or for the flattened x, or a tree like x with one for each
         leaf. It must be symmetric and positive definite. A number is a variance, the same for all entries. Only
         products with C are computed.
     prior_mean : tree like x, or number
+        Mean of the prior, in the units of x.
     prior_root : Operator, or tree of them, optional
         R with R @ R.T equal to C, for samples. Default: C^(1/2), which is computed directly for a number, a diagonal, a
         function of a separable operator (such as ``matrix_power``) and up to 1024 unknowns, and otherwise by a Lanczos
         iteration for each sample.
     rank : int
-        Largest number of eigenpairs. Each takes two vectors of the size of x.
+        Largest number k of eigenpairs. Each takes two vectors of the size of x.
     tolerance : float
-        Eigenvalues below this number are neglected. Variances are then too large by at most the factor 1 + tolerance.
+        Eigenvalues below this number are neglected, between 0 and 1. Variances are then too large by at most the factor
+        1 + tolerance.
     seed : int
         Seed of the random vectors with which the eigenpairs are computed.
 
@@ -108,28 +110,39 @@ def laplace(
 
     Notes
     -----
-    For residuals r with the Jacobian J at x, the Hessian of the misfit is H = J^T J (Gauss-Newton). For a linear
-    function and a normal prior, the result is the exact posterior if x is its mean. For a number, H is the Hessian of
-    the function. With the eigenpairs H v = lambda C^-1 v, v^T C^-1 v = 1, the covariance is
+    **Covariance.** For residuals r with the Jacobian J at x, H = J^T J is the Gauss-Newton approximation of the Hessian
+    of the misfit |r|^2 / 2. For a misfit that returns one number, H is its Hessian. With the eigenpairs
+    H v = lambda C^-1 v, normalized by v^T C^-1 v = 1, the posterior covariance is a low-rank update of C (Woodbury
+    identity) ::
 
-        (H + C^-1)^-1 = C - sum over the pairs of lambda / (1 + lambda) v v^T.
+        (H + C^-1)^-1 = C - sum over the pairs of lambda / (1 + lambda) v v^T
 
-    Data reduce the variance along v_i by the factor 1 / (1 + lambda_i). If eigenvalues below a number t are neglected,
-    all variances are too large, by at most the factor 1 + t.
-    If there are at most `rank` residuals or unknowns, the Jacobian is computed, and no eigenvalue is neglected that
-    exceeds rounding errors. Otherwise the eigenpairs are computed by a randomized block Krylov method from products
-    with H and C.
-    Variances have absolute errors of about 1e-15 times those of the prior, unless there is an eigenpair for each
-    unknown.
-    The posterior, `shift` and `step` assume that the misfit is nearly quadratic within some standard deviations of x.
+    so that data reduce the variance along v_i by the factor 1 / (1 + lambda_i). If eigenvalues below a number t are
+    neglected, all variances are too large, by at most the factor 1 + t.
+
+    **Validity.** If the residuals are linear in x and x is the mode, the result is the exact posterior. Otherwise the
+    misfit must be nearly quadratic within some standard deviations of x; `shift` and `step` assume this, too.
+
+    **Computation.** If there are at most `rank` residuals or unknowns, the Jacobian is computed, and no eigenvalue is
+    neglected that exceeds rounding errors. Otherwise the eigenpairs are computed by a randomized block Krylov method
+    from products with H and C. A product with H = J^T J takes one forward and one backward pass (`jvp`, `vjp`), one
+    with the Hessian of a loss is a backward pass through its gradient (`hvp`). Variances have absolute errors of about
+    1e-15 times those of the prior, unless there is an eigenpair for each unknown.
+
+    **Quantities.** The standard deviation of a quantity q(x) is sqrt(g^T (H + C^-1)^-1 g) with its gradient g at x,
+    which takes one backward pass (delta method).
 
     References
     ----------
     T. Bui-Thanh, O. Ghattas, J. Martin, G. Stadler, A computational framework for infinite-dimensional Bayesian inverse
-    problems, part I, SIAM J. Sci. Comput. 35, 2013.
+    problems, part I, SIAM J. Sci. Comput. 35, 2013; A. Spantini, A. Solonen, T. Cui, J. Martin, L. Tenorio, Y. Marzouk,
+    Optimal low-rank approximations of Bayesian linear inverse problems, SIAM J. Sci. Comput. 37, 2015.
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from sparsedp import laplace
+
     The prior is N(0, 4) for two numbers. The first is measured, with a standard deviation of 1:
 
     >>> posterior = laplace(lambda x: x[:1] - 1.0, np.array([0.8, 0.0]), prior=4.0)
@@ -186,7 +199,7 @@ def laplace(
         squares=hessian.squares,
         seconds=perf_counter() - started,
     )
-    if posterior.shift > FAR:
+    if posterior.shift > LARGEST_SHIFT:
         warnings.warn(NOT_AT_MODE.format(posterior.shift), PosteriorWarning, stacklevel=frames_inside() + 1)
     return posterior
 
@@ -224,6 +237,7 @@ class _Hessian(NamedTuple):
 
 
 def _hessian(misfit, packing, vector, rank):
+    """Return the Hessian of the misfit: the Gauss-Newton one for residuals, the full one for one number."""
     value = misfit(packing.unpack(vector))
     backend_of([value]).check("a misfit of laplace")
     if not is_field(value):

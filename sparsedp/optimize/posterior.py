@@ -48,23 +48,25 @@ class Posterior(Frozen):
     neglected : float
         Estimate of the largest neglected eigenvalue. Variances are too large by at most the factor 1 + neglected.
     error : float
-        Bound on the relative error of all variances, if the prior variances are exact: `neglected`, and the residuals
-        of the eigenpairs.
+        Bound on the relative error of all variances, if the prior variances are exact: the sum of `neglected` and of
+        the residuals of the eigenpairs.
     information_gain : float
-        Kullback-Leibler divergence of the posterior from the prior [nat], for the data at hand and with g the gradient
-        of the misfit at the mode x: (sum of log(1 + lambda) - lambda / (1 + lambda), plus g^T C g) / 2. Here g^T C g is
-        the squared distance of x from the prior mean in the metric C^-1.
+        Kullback-Leibler divergence of the posterior from the prior [nat]. With the gradient g of the misfit at the mode
+        x it is (sum of (log(1 + lambda) - lambda / (1 + lambda)) + g^T C g) / 2, where g^T C g is the squared distance
+        of x from the prior mean in the metric C^-1.
     expected_information_gain : float
-        Its mean over data, if the function is linear: sum of log(1 + lambda) / 2.
+        The expectation of the information gain over data [nat] if the residuals are linear in x, half of the sum of
+        log(1 + lambda).
     shift : float
         The distance from x to the mode of the quadratic model of the posterior, in posterior standard deviations: the
-        largest along an eigenvector, or the root mean square of a leaf in the directions that the data do not reduce.
+        largest component along an eigenvector or, if that is larger, the root mean square of the remainder of a leaf.
     step : tree
-        The step from x to this mode (a Newton step). For a linear function, x + step is the mode.
+        The Newton step -(H + C^-1)^-1 (g + C^-1 (x - mean)) from x to this mode. If the residuals are linear in x,
+        x + step is the mode.
     mean_square, expected_mean_square : float or None
-        The mean square of the m residuals at x, and its mean over data if the function is linear and x the mode,
-        1 - (sum of lambda / (1 + lambda)) / m. If they differ much, the residuals may not have been divided by the
-        standard deviation of the noise, or the prior is too narrow. None for a loss, and without residuals.
+        The mean square of the m residuals at x, and its expectation over data if the residuals are linear in x and x is
+        the mode, 1 - (sum of lambda / (1 + lambda)) / m. If they differ much, the residuals may not have been divided
+        by the standard deviation of the noise, or the prior is too narrow. None for a loss, and without residuals.
     products : int
         Number of products with the Hessian, or with the Jacobian if it was computed.
     seconds : float
@@ -140,19 +142,28 @@ class Posterior(Frozen):
         return from_functions(apply, apply, space, space, name="posterior covariance")
 
     def variance(self, probes: int = 200) -> Any:
-        """Return the variance of each entry of x, a tree like x with None in place of constants.
+        """Return the variance of each entry of x.
 
         Parameters
         ----------
         probes : int
             Number of random vectors with which prior variances are estimated where they are not known exactly.
 
+        Returns
+        -------
+        tree like x
+            Float64 arrays in the squared units of x, and None in place of constants.
+
+        Warns
+        -----
+        PosteriorWarning
+            If the standard error of estimated variances is above 10 % of them (root mean square).
+
         Notes
         -----
         Prior variances are exact for numbers, diagonals, sparse matrices, functions of separable operators, and up to
         1024 unknowns. Otherwise the diagonal of C - sum of v v^T is estimated by the XDiag method, with 2 `probes`
-        products with C. See `variance_error`. A PosteriorWarning is issued if the standard error is above 10 % of the
-        variance (root mean square).
+        products with C. See `variance_error`.
 
         References
         ----------
@@ -181,9 +192,11 @@ class Posterior(Frozen):
 
     @cached_property
     def _known_variances(self):
+        """The variances and their errors by the number of probes."""
         return {}
 
     def _computed_variances(self, probes):
+        """Return the variances and their standard errors: sum of v v^T / (1 + lambda), plus C - sum of v v^T."""
         vectors = self._pairs.vectors
         informed = np.sum(vectors**2 / (1 + self._pairs.values)[:, None], axis=0)
         # The variance that the data do not reduce, C - sum of v v^T, is 0 if there is an eigenpair for each unknown.
@@ -207,12 +220,21 @@ class Posterior(Frozen):
         Parameters
         ----------
         quantity : callable
-            ``quantity(x)`` returns a real number or an array, differentiable. It is replaced by its linearization at x.
+            ``quantity(x)`` returns a real number or an array, differentiable. It is replaced by its linearization at x
+            (delta method).
 
         Returns
         -------
         float or array
-            In the shape of the quantity. An array takes one VJP and one product with C for each entry.
+            In the shape and the units of the quantity: sqrt(g^T (H + C^-1)^-1 g) for each entry, where its gradient g
+            takes one backward pass, and the variance one product with C.
+
+        Raises
+        ------
+        DerivativeError
+            If the quantity is complex.
+        NonFiniteError
+            If the quantity is NaN or infinite.
         """
         check_function("std_of", quantity, "lambda x: np.mean(x)")
         value, pull = pullback(quantity, self._packing.unpack(self._mean))
