@@ -32,7 +32,6 @@ from sparsedp.check.thresholds import THRESHOLDS
 __all__ = ["CONFIRMING_WORDS", "DirectionEvidence", "DirectionResult", "pairwise_orders", "rms_of_both_sides", "weigh"]
 
 CONFIRMING_WORDS = ("agrees", "vanishes")  # results that confirm the gradient
-FLOAT_TINY = np.finfo(float).tiny
 FEW_EPS = 8.0  # assumed rounding error of x, in units of eps, in the error bar
 SINGLE_PRECISION_EPS = 300.0  # smallest detectable gap in units of the eps of x; matters in single precision
 
@@ -278,7 +277,7 @@ def _read_levels(evidence: DirectionEvidence) -> None:
     gaps = (remainders[0] - remainders[1]) / (2 * steps)
     # The difference of the one-sided quotients, without the effect of unequal rounding of both displacements.
     kinks = (remainders[0] + remainders[1]) / steps
-    rounding = line.evaluations.eps * np.max(np.abs(losses), axis=0, initial=max(abs(line.base), FLOAT_TINY))
+    rounding = line.rounding(steps, losses)
     # Variation between the finest levels, in roundings of the loss. It is due to rounding or to an inexact solve.
     variation = np.abs(np.diff(gaps)) * steps[1:] / rounding[1:]
     finest = variation[1 - THRESHOLDS.noise_levels :]
@@ -288,7 +287,9 @@ def _read_levels(evidence: DirectionEvidence) -> None:
     evidence.gaps = gaps
     evidence.kinks = kinks
     evidence.rounding = rounding
-    evidence.jitter = max(float(np.max(finest)), 2 * line.evaluations.noise)
+    evidence.jitter = 2 * line.evaluations.noise
+    if not line.is_short:
+        evidence.jitter = max(float(np.max(finest)), evidence.jitter)
     evidence.noise = max(2.0, evidence.jitter) * rounding
     evidence.curvature = float(np.median(np.abs(kinks / steps)[:3]))
 

@@ -19,7 +19,7 @@ from sparsedp.check.point import Point, audit_generator
 from sparsedp.check.step_sizes import COARSER_STEPS, FINER_STEPS, RIPPLE_STEPS, STEPS_BETWEEN
 from sparsedp.check.thresholds import THRESHOLDS
 
-__all__ = ["RANDOM_DIRECTIONS", "examine_directions", "reclassify_kinks"]
+__all__ = ["RANDOM_DIRECTIONS", "SHIFT", "SHIFT_SEED", "examine_directions", "examine_line", "reclassify_kinks"]
 
 RANDOM_DIRECTIONS = 3
 # A loss with kinks is examined again at a point at this distance from x (in units of x), in a random direction.
@@ -69,7 +69,7 @@ def examine_directions(
         noise, deviation = measure_noise(line)
         evaluations.noise = max(evaluations.noise, noise)
         evaluations.deviation = max(evaluations.deviation, deviation)
-    directions = [_examine_line(line, search_ripples=line is lines[0]) for line in lines]
+    directions = [examine_line(line, search_ripples=line is lines[0]) for line in lines]
     if callable(evaluations.gradient):
         for direction in directions:
             if direction.word == "disagrees":
@@ -108,7 +108,7 @@ def _first_non_finite(values: NDArray[Any]) -> str:
     return f", the first at {place(int(np.argmin(is_finite)), is_finite.shape)}"
 
 
-def _examine_line(line: Line, search_ripples: bool) -> DirectionEvidence:
+def examine_line(line: Line, search_ripples: bool = False) -> DirectionEvidence:
     """Evaluate the loss along a line and return the evidence. Add more steps if there is no decision.
 
     Parameters
@@ -215,7 +215,7 @@ def reclassify_kinks(evaluations: Evaluations, directions: Sequence[DirectionEvi
     with suppress(*EVALUATION_ERRORS):
         shift = SHIFT * point.random(audit_generator(SHIFT_SEED))
         beside = Point(point.unpack(point.vector + shift))
-        evaluations_beside = Evaluations(evaluations.loss, beside, evaluations.gradient, tick=evaluations.tick)
+        evaluations_beside = evaluations.at(beside)
         found = examine_directions(evaluations_beside, RANDOM_DIRECTIONS, audit_generator(None))
         if overall_verdict(*found)[0] == "disagrees":
             return
@@ -248,7 +248,7 @@ def _is_not_additive(evidence: DirectionEvidence) -> bool:
     difference = 0.0
     bar = evidence.bar
     for part in (first, line.direction - first):
-        part_evidence = _examine_line(Line(line.name, part, line.evaluations), search_ripples=False)
+        part_evidence = examine_line(Line(line.name, part, line.evaluations), search_ripples=False)
         difference += part_evidence.difference
         bar += part_evidence.bar
     gap = evidence.difference - difference

@@ -25,6 +25,7 @@ __all__ = ["EVALUATION_ERRORS", "UNCHANGED", "Evaluations", "Level", "Line", "so
 
 EVALUATION_ERRORS = (SparsedpError, ValueError, ArithmeticError)  # exceptions that a loss may raise at a trial point
 UNCHANGED = "the loss does not change"
+FLOAT_TINY = float(np.finfo(float).tiny)
 LOST_SHARE = 0.1  # a step is unusable if the rounding of x changes the displacement by more than this share
 
 
@@ -112,6 +113,10 @@ class Evaluations:
             gradient = self.gradient
         return self.point.gradient(gradient)
 
+    def at(self, point: Point) -> Evaluations:
+        """Return evaluations of the same loss and gradient at another point, with the default steps."""
+        return Evaluations(self.loss, point, self.gradient, tick=self.tick)
+
     def start(self) -> None:
         """Evaluate the loss at the point, and find the tolerances of its solves and time steps.
 
@@ -124,10 +129,21 @@ class Evaluations:
         except TypeError as error:
             advise(error)
             raise
+        self.find_tolerances(self.loss, solves, controlled)
+
+    def find_tolerances(self, function: Callable[[Any], Any], solves: int, controlled: int) -> None:
+        """Find the tolerances of the solves and time steps of a function by another run at the point.
+
+        Parameters
+        ----------
+        function : callable
+        solves, controlled : int
+            The counters of solves and of time steps with error control before the first run of the function.
+        """
         self.solved = thread.solves > solves
         if self.solved or thread.controlled > controlled:
             with recording() as calls, np.errstate(all="ignore"):
-                self.loss(self.point.fresh())
+                function(self.point.fresh())
             tolerances = [solver.system.rtol for _, solver in solvers_of(calls) if solver.engine.iterative]
             self.tolerance = max(tolerances, default=0.0)
             for (_, what), values in calls.notes.items():
@@ -195,7 +211,12 @@ class Line:
         2-norm of the vector of terms g_i d_i of g . d.
     levels : list of Level
         From coarse to fine.
+    is_short : bool
+        Whether the steps do not reach those at which rounding dominates. Differences between the finest levels are then
+        no measure of the noise.
     """
+
+    is_short = False
 
     def __init__(self, name: str, direction: NDArray[Any], evaluations: Evaluations) -> None:
         self.name = name
@@ -245,6 +266,17 @@ class Line:
         if plus == minus == self.base:
             note = UNCHANGED
         return Level(step, plus, minus, ahead, behind, note)
+
+    def rounding(self, steps: NDArray[Any], losses: NDArray[Any]) -> NDArray[Any]:
+        """Return the rounding error of the losses at each step.
+
+        Parameters
+        ----------
+        steps : ndarray, shape (n,)
+        losses : ndarray, shape (2, n)
+            The losses on both sides.
+        """
+        return self.evaluations.eps * np.max(np.abs(losses), axis=0, initial=max(abs(self.base), FLOAT_TINY))
 
     @property
     def usable(self) -> list[Level]:

@@ -25,12 +25,14 @@ GROWTH = 2.0**6  # factor by which the distance is increased while the loss does
 MOST_DISTANCES = 4
 
 
-def measure_noise(line: Line) -> tuple[float, float]:
+def measure_noise(line: Line, points: int = POINTS) -> tuple[float, float]:
     """Measure the noise of a loss: its variation that is not smooth.
 
     Parameters
     ----------
     line : Line
+    points : int
+        Number of values in the table, at least 6.
 
     Returns
     -------
@@ -48,15 +50,15 @@ def measure_noise(line: Line) -> tuple[float, float]:
     """
     distance = SMALLEST_DISTANCE * max(1.0, line.point.eps / float(np.finfo(float).eps)) ** 0.5
     for _ in range(MOST_DISTANCES):
-        ends = [line.end(number * distance) for number in range(1, POINTS + 1)]
+        ends = [line.end(number * distance) for number in range(1, points + 1)]
         if any(note for _, _, note in ends):
             return 0.0, 0.0
         values = np.array([value for value, _, _ in ends])
         changes = np.array([change for _, change, _ in ends])
-        if np.count_nonzero(np.diff(values)) > POINTS // 2:
+        if np.count_nonzero(np.diff(values)) > points // 2:
             size = max(*np.abs(values).tolist(), abs(line.base), np.finfo(float).tiny)
             differences = np.diff(values - line.base - changes, ORDER)
-            deviation = norm(differences) / math.sqrt((POINTS - ORDER) * VARIANCE)
+            deviation = norm(differences) / math.sqrt((points - ORDER) * VARIANCE)
             return deviation / (line.evaluations.eps * size), deviation
         distance *= GROWTH
     return 0.0, 0.0

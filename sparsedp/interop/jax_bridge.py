@@ -17,9 +17,9 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
 from sparsedp._utils.base_classes import ReconstructibleFunction
-from sparsedp._utils.pytree import placed
+from sparsedp._utils.pytree import mapped, placed
 from sparsedp._utils.validation import check_function, check_precision
-from sparsedp.autodiff.tape import Rule, dtype_of, sample
+from sparsedp.autodiff.tape import Rule, dtype_of, is_variable, sample
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.interop.recording import owned, parts, recorded
 
@@ -385,3 +385,38 @@ def _pushed(function, nums, used, count, *values):
 def _alike(slopes, values):
     """Return derivatives converted to the dtypes of the values. JAX requires equal dtypes."""
     return [jnp.asarray(slope, jnp.result_type(x)) for slope, x in zip(slopes, values, strict=True)]
+
+
+# ---- derivatives by JAX, for checks ----------------------------------------------------------------------------------
+
+
+def as_tensors(tree: Any) -> Any:
+    """Return a tree with JAX arrays in place of its arrays and floating numbers."""
+
+    def tensor(leaf: Any) -> Any:
+        if isinstance(leaf, np.ndarray) or is_variable(leaf):
+            return jnp.array(leaf)
+        return leaf
+
+    return mapped(tensor, tree)
+
+
+def as_arrays(tree: Any) -> Any:
+    """Return a tree with NumPy arrays in place of its JAX arrays."""
+
+    def array(leaf: Any) -> Any:
+        if isinstance(leaf, jax.Array):
+            return np.asarray(leaf)
+        return leaf
+
+    return mapped(array, tree)
+
+
+def vjp_of(f: Callable, x: Any, g: Any) -> Any:
+    """Return the VJP of a function of a tree of JAX arrays by `jax.vjp`."""
+    return jax.vjp(f, x)[1](g)[0]
+
+
+def jvp_of(f: Callable, x: Any, t: Any) -> Any:
+    """Return the JVP of a function of a tree of JAX arrays by `jax.jvp`."""
+    return jax.jvp(f, (x,), (t,))[1]

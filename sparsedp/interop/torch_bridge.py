@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from sparsedp._utils.base_classes import ReconstructibleFunction
-from sparsedp._utils.pytree import flatten, leaves, paired, placed
+from sparsedp._utils.pytree import flatten, leaves, mapped, paired, placed
 from sparsedp._utils.validation import check_function, check_leaves
 from sparsedp.autodiff.program_trace import opaque
 from sparsedp.autodiff.tape import Rule, dtype_of, is_variable, isbox
@@ -395,3 +395,65 @@ def _owned(tensor):
     if tensor.is_floating_point() and tensor.dtype.itemsize < 4:
         raise TypeError(f"from_torch takes and gives float32 or float64, got {tensor.dtype}; write tensor.float()")
     return owned(tensor.numpy(force=True))
+
+
+# ---- derivatives by torch, for checks --------------------------------------------------------------------------------
+
+
+def as_tensors(tree: Any) -> Any:
+    """Return a tree with tensors in place of its arrays and floating numbers; they share no memory with the arrays."""
+
+    def tensor(leaf: Any) -> Any:
+        if isinstance(leaf, np.ndarray) or is_variable(leaf):
+            return torch.from_numpy(np.array(leaf))
+        return leaf
+
+    return mapped(tensor, tree)
+
+
+def as_arrays(tree: Any) -> Any:
+    """Return a tree with arrays in place of its tensors. They may share memory with the tensors."""
+
+    def array(leaf: Any) -> Any:
+        if isinstance(leaf, torch.Tensor):
+            return leaf.numpy(force=True)
+        return leaf
+
+    return mapped(array, tree)
+
+
+def vjp_of(f: Callable, x: Any, g: Any) -> Any:
+    """Return the VJP of a function of a tree of tensors by torch."""
+    entries, rebuild = flatten(x)
+    moving = [isinstance(leaf, torch.Tensor) and leaf.dtype.is_floating_point | leaf.is_complex() for leaf in entries]
+    entries = [leaf.requires_grad_() if moves else leaf for leaf, moves in zip(entries, moving, strict=True)]
+    variables = [leaf for leaf, moves in zip(entries, moving, strict=True) if moves]
+    with torch.enable_grad():
+        # A function that changes its argument in place may not do so with a variable itself.
+        results = leaves(f(rebuild([leaf.clone() if moves else leaf for leaf, moves in zip(entries, moving)])))
+    pairs = zip(results, leaves(g), strict=True)
+    pairs = [(y, cotangent) for y, cotangent in pairs if isinstance(y, torch.Tensor) and y.requires_grad]
+    slopes: list[Any] = [None] * len(variables)
+    if pairs:
+        outputs, cotangents = zip(*pairs)
+        slopes = [*torch.autograd.grad(outputs, variables, cotangents, allow_unused=True)]
+    slopes = [torch.zeros_like(v) if slope is None else slope for v, slope in zip(variables, slopes, strict=True)]
+    places = [place for place, moves in enumerate(moving) if moves]
+    return rebuild(placed(entries, places, slopes))
+
+
+def jvp_of(f: Callable, x: Any, t: Any) -> Any:
+    """Return the JVP of a function of a tree of tensors by torch."""
+    entries, rebuild = flatten(x)
+    places = [place for place, leaf in enumerate(entries) if isinstance(leaf, torch.Tensor)]
+    tangents = leaves(t)
+    rebuild_result: Any = None
+
+    def of_tensors(*tensors: Any) -> Any:
+        nonlocal rebuild_result
+        results, rebuild_result = flatten(f(rebuild(placed(entries, places, tensors))))
+        return tuple(results)
+
+    tensors = tuple(entries[place] for place in places)
+    _, slopes = torch.func.jvp(of_tensors, tensors, tuple(tangents[place] for place in places))
+    return rebuild_result(slopes)

@@ -31,6 +31,7 @@ SMALL = {
     "convection.py": "32",
     "cylinder.py": "10",
     "steady_states.py": "24",
+    "stiff_and_extreme.py": "8",
     "obstacle.py": "10",
     "shape.py": "12",
     "velocity_recovery.py": "64",
@@ -49,7 +50,8 @@ SMALL = {
     "ensemble.py": "5",
     "mesh_design.py": "3",
     "mbb_beam.py": "20",
-    "volume_to_point.py": "32",
+    "volume_to_point.py": "16",
+    "room.py": "8",
     "pylops_exchange.py": "32",
     "pendulums.py": "10",
 }  # cells, the end time, or gradients; the others run with 16
