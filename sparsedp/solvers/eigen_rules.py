@@ -464,7 +464,7 @@ class EigenSolution:
     def _solve_row(self, cluster, number, field, numbers):
         if not np.any(field) and not np.any(numbers):
             return np.zeros_like(field), np.zeros_like(numbers)
-        key = cluster.start, number
+        key = cluster, number
         if key not in self._solves:
             build_solve = _bordered_lu
             if self.pencil.unknowns > BORDERED_LU_UP_TO and isinstance(self.which, str):

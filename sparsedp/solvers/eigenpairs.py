@@ -392,15 +392,19 @@ class Eigenpairs:
         -------
         float
             Differentiable in forward and reverse mode, to every order, unless `start` or `stop` cuts a cluster.
+
+        Raises
+        ------
+        ValueError
+            Unless 0 <= start < stop <= number of pairs; unlike for a list, negative numbers do not count from the end.
         """
-        chosen = self._range_of(start, stop)
+        whole, parts = self._divided(start, stop)
         total = 0.0
-        for number in self._clusters_in(chosen):
-            if self._is_whole(number, chosen):
-                block = self._problem.block(self.clusters[number])
-                total = total + anp.sum(block * np.eye(len(block)))
-            else:
-                total = total + anp.sum(self._values_of(number)[self._members_in(number, chosen)])
+        if whole:
+            block = self._problem.block(whole)
+            total = total + anp.sum(block * np.eye(len(whole)))
+        for number, places in parts:
+            total = total + anp.sum(self._values_of(number)[places])
         return total
 
     def project(self, u: Any, start: int = 0, stop: int | None = None) -> Any:
@@ -416,47 +420,67 @@ class Eigenpairs:
         -------
         array like u
             The sum of v (v . M u) over these vectors. Differentiable in u and in the coefficients, in forward and
-            reverse mode, to every order, unless `start` or `stop` cuts a cluster.
+            reverse mode, to every order, unless `start` or `stop` cuts a cluster. Gaps between the eigenvalues of these
+            pairs do not matter, only those to other pairs.
+
+        Raises
+        ------
+        ValueError
+            Unless 0 <= start < stop <= number of pairs.
         """
-        chosen = self._range_of(start, stop)
+        whole, parts = self._divided(start, stop)
         check_plain("project", u)
         check_on("project", u, self._domain)
         problem = self._problem
         _, of_mass = problem.parts(problem.coefficients)
         image = anp.reshape(problem.plain_solution.weights * problem.mass.product(u, of_mass), (-1,))
+        spaces = [problem.vectors(whole)] if whole else []
+        spaces += [self._vectors_of(number)[places] for number, places in parts]
         total = np.zeros(self._domain.shape)
-        for number in self._clusters_in(chosen):
-            if self._is_whole(number, chosen):
-                vectors = problem.vectors(self.clusters[number])
-            else:
-                vectors = self._vectors_of(number)[self._members_in(number, chosen)]
+        for vectors in spaces:
             shares = anp.dot(anp.conj(anp.reshape(vectors, (len(vectors), -1))), image)
             total = total + anp.tensordot(shares, vectors, axes=1)
         return total
 
+    def _divided(self, start, stop):
+        """Divide the pairs start to stop - 1 into whole clusters and parts of clusters.
+
+        The whole clusters are one block for derivatives of a sum or a projection: these depend on the space of its
+        vectors only, and so not on the gaps inside, which single vectors would be divided by.
+
+        Returns
+        -------
+        whole : range
+            Pairs of whole clusters; may be empty.
+        parts : list of (number of a cluster, slice of places in it)
+        """
+        chosen = self._range_of(start, stop)
+        whole = []
+        parts = []
+        for number, members in enumerate(self.clusters):
+            first = max(chosen.start, members.start)
+            last = min(chosen.stop, members.stop)
+            if first >= last:
+                continue
+            if len(members) == last - first and not self.cut[number]:
+                whole += members
+            else:
+                parts.append((number, slice(first - members.start, last - members.start)))
+        if not whole:
+            return range(0), parts
+        return range(whole[0], whole[-1] + 1), parts
+
     def _range_of(self, start, stop):
-        """Return the range of pairs of two indices, as for a list."""
-        chosen = range(len(self))[start:stop]
-        if not chosen:
-            raise ValueError(f"pairs {start} to {stop} of {len(self)} eigenpairs are none; write start < stop")
-        return chosen
-
-    def _clusters_in(self, chosen):
-        """Return the numbers of the clusters with members in a range of pairs."""
-        return [
-            number
-            for number, members in enumerate(self.clusters)
-            if members.start < chosen.stop and chosen.start < members.stop
-        ]
-
-    def _is_whole(self, number, chosen):
-        members = self.clusters[number]
-        return not self.cut[number] and chosen.start <= members.start and members.stop <= chosen.stop
-
-    def _members_in(self, number, chosen):
-        """Return the places of the members of a cluster that belong to a range of pairs."""
-        first = self.clusters[number].start
-        return slice(max(chosen.start - first, 0), chosen.stop - first)
+        """Return the range of the pairs start to stop - 1."""
+        count = len(self)
+        if stop is None:
+            stop = count
+        advice = f"; write 0 <= start < stop <= {count}"
+        start = check_whole("start", start, 0, advice)
+        stop = check_whole("stop", stop, 0, advice)
+        if not start < stop <= count:
+            raise ValueError(f"start={start} and stop={stop} are not a range of {count} eigenpairs{advice}")
+        return range(start, stop)
 
     def _cluster_and_member(self, index):
         """Return the number of the cluster of a pair, and the place of the pair in it."""

@@ -193,6 +193,26 @@ def test_sums_of_values_over_a_cluster():
     assert np.allclose(hvp(lambda k: anp.sum(pairs_of_square(k).values), ONES, direction), second)
 
 
+def test_small_gaps_inside_a_range_do_not_matter():
+    """The two pairs are no cluster; their gap of 1e-5 would divide rounding errors."""
+    direction = np.cos(np.arange(ONES.size))
+    k = ONES + 1e-5 * direction
+    divergence, gradient = dp.divergence(SQUARE).matrix.toarray(), dp.gradient(SQUARE, dp.dirichlet).matrix.toarray()
+    values, vectors = np.linalg.eigh(-divergence @ (k[:, None] * gradient))
+    inside, outside = vectors[:, 1:3], np.delete(vectors, [1, 2], axis=1)
+    gaps = values[1:3] - np.delete(values, [1, 2])[:, None]
+    u = U.ravel()
+    cotangent = 2 * u * (inside @ (inside.T @ u))
+    shares = np.outer(outside.T @ cotangent, inside.T @ u) + np.outer(outside.T @ u, inside.T @ cotangent)
+    expected = -np.sum((divergence.T @ outside @ (shares / gaps)) * (gradient @ inside), axis=1)
+    found = grad(lambda k: anp.sum(U * pairs_of_square(k).project(U, 1, 3) ** 2))(k)
+    assert pairs_of_square(k).clusters[1] == range(1, 2)
+    near([found], [expected], 1e-12)
+    change = -outside.T @ divergence @ (direction[:, None] * gradient) @ inside
+    second = hvp(lambda k: pairs_of_square(k).sum(1, 3), k, direction) @ direction
+    assert second == pytest.approx(2 * np.sum(change**2 / gaps), rel=1e-12)
+
+
 REFUSED = {
     "a member": lambda k: pairs_of_square(k).values[1],
     "a vector": lambda k: anp.sum(U * pairs_of_square(k).vectors[1]),

@@ -177,7 +177,27 @@ TABLE = [
     (
         lambda: dp.eigenpairs(TWO, 2).sum(1, 1),
         VALUE,
-        "pairs 1 to 1 of 2 eigenpairs are none; write start < stop",
+        "start=1 and stop=1 are not a range of 2 eigenpairs; write 0 <= start < stop <= 2",
+    ),
+    (
+        lambda: dp.eigenpairs(TWO, 2).sum(0, 9),
+        VALUE,
+        "start=0 and stop=9 are not a range of 2 eigenpairs; write 0 <= start < stop <= 2",
+    ),
+    (
+        lambda: dp.eigenpairs(TWO, 2).project(np.ones(2), 2),
+        VALUE,
+        "start=2 and stop=2 are not a range of 2 eigenpairs; write 0 <= start < stop <= 2",
+    ),
+    (
+        lambda: dp.eigenpairs(TWO, 2).project(np.ones(2), -1),
+        VALUE,
+        "start must be a whole number >= 0, got -1; write 0 <= start < stop <= 2",
+    ),
+    (
+        lambda: dp.eigenpairs(TWO, 2).sum(0, -1),
+        VALUE,
+        "stop must be a whole number >= 0, got -1; write 0 <= start < stop <= 2",
     ),
     (
         lambda: dp.eigenpairs(TWO, 2).project(np.ones(3)),
