@@ -87,9 +87,10 @@ def eigenpairs(
     cluster : float
         Neighbouring eigenvalues whose relative difference is smaller form a cluster; see Notes.
     method : "auto", "dense", "arpack" or "lobpcg"
-        "dense" is LAPACK on the full matrix. "arpack" is the implicitly restarted Lanczos method of ARPACK in
-        shift-invert mode: with the inverse of A - sigma M. "lobpcg" has an approximate solve as preconditioner, and
-        takes which="smallest" only. "auto" is "dense" up to 512 unknowns, else "arpack".
+        "dense" is LAPACK on the full matrix, followed by "arpack" if rounding errors are larger than the eigenvalues.
+        "arpack" is the implicitly restarted Lanczos method of ARPACK in shift-invert mode: with the inverse of
+        A - sigma M. "lobpcg" has an approximate solve as preconditioner, and takes which="smallest" only. "auto" is
+        "dense" up to 512 unknowns, else "arpack".
     rtol : float
         Largest relative residual |A v - lambda M v| / |lambda M v| of a pair, unless the residual is at the level of
         rounding errors.
@@ -192,11 +193,7 @@ def eigenpairs(
     if not settings.symmetric:
         return _general(problem, pencil)
     if pencil.weights is None or not pencil.mass_is_symmetric:
-        name = pencil.name if pencil.weights is None else "the mass"
-        raise TypeError(
-            f"eigenpairs takes a symmetric operator, and {name} is not; write symmetric=False for its eigenvalues, or "
-            "0.5 * (A + A.T) for its symmetric part"
-        )
+        raise _not_symmetric(pencil, isinstance(op, ParametricSolver))
     if pencil.complex and any(map(isbox, problem.coefficients)):
         raise DerivativeError(
             "eigenpairs of complex operators have no derivatives; write the real symmetric operator of real and "
@@ -284,6 +281,20 @@ def _check_count(k, pencil):
     """Raise ValueError if there are fewer than k eigenvalues."""
     if k > pencil.unknowns:
         raise ValueError(f"eigenpairs got k={k}, but {pencil.name} has {pencil.unknowns} unknowns; write a smaller k")
+
+
+def _not_symmetric(pencil, has_coefficients):
+    """Return the error for an operator or a mass that is not symmetric."""
+    name = pencil.name if pencil.weights is None else "the mass"
+    if pencil.complex:
+        return TypeError(
+            f"eigenpairs takes complex operators that are equal to their conjugate transpose, and {name} is not; write "
+            "symmetric=False for eigenvalues"
+        )
+    advice = "" if has_coefficients else ", or 0.5 * (A + A.T) for its symmetric part"
+    return TypeError(
+        f"eigenpairs takes a symmetric operator, and {name} is not; write symmetric=False for its eigenvalues{advice}"
+    )
 
 
 def _general(problem, pencil):
@@ -455,7 +466,7 @@ class Eigenpairs:
         parts : list of (number of a cluster, slice of places in it)
         """
         chosen = self._range_of(start, stop)
-        whole = []
+        whole: list[int] = []
         parts = []
         for number, members in enumerate(self.clusters):
             first = max(chosen.start, members.start)

@@ -60,6 +60,7 @@ SYMMETRIC = 1e-12  # two products that should be equal may differ by this share 
 LARGEST_EXPONENT = 200  # an operator or a mass beyond this power of two is scaled
 AT_ROUNDOFF = 128 * EPS  # residuals below this share of the terms are rounding errors
 ZERO = 4 * EPS  # lambda M v below this share of the terms of A v is 0
+LARGE_CONTRAST = 1e6  # of the mass; beyond it, errors name it as the reason
 INNER = 1e-11  # relative tolerance of the solves inside of ARPACK
 TIGHT = 1e-11  # tolerance of ARPACK; a step of inverse iteration follows
 LOOSE = 1e-6  # tolerance of the search for missing copies
@@ -212,6 +213,14 @@ class Pencil:
         other = np.conj(x @ (weights * product(y)))
         size = np.abs(y) @ (weights * magnitude(np.abs(x)))
         return bool(abs(one - other) <= SYMMETRIC * size)
+
+    @property
+    def mass_contrast(self) -> float:
+        """The largest entry on the diagonal of M divided by the smallest, for a positive M with entries; else 1."""
+        if self.mass is None or (isinstance(self.mass, Operator) and not self.mass.structure.has_entries):
+            return 1.0
+        diagonal = self.matrices[1].diagonal().real
+        return float(np.max(diagonal) / np.min(diagonal)) if np.min(diagonal) > 0 else 1.0
 
     def masked(self, x: NDArray[Any]) -> NDArray[Any]:
         """Return a vector with 0 in the entries that are not unknowns."""
@@ -433,6 +442,10 @@ def symmetric_pairs(pencil: Pencil, settings: EigenSettings) -> Spectrum:
     method = _chosen_method(pencil, settings)
     if method == "dense":
         values, vectors = _dense(pencil)
+        # Errors of LAPACK are rounding errors of the largest eigenvalue, which may be larger than the smallest one.
+        if k + 1 < pencil.unknowns and not _are_accurate(pencil, k, scaled_which, values, vectors):
+            method = "arpack"
+            values, vectors = _by_arpack(pencil, k, scaled_which, maxiter)
     elif method == "lobpcg":
         values, vectors = _by_lobpcg(pencil, k, maxiter)
     else:
@@ -442,7 +455,7 @@ def symmetric_pairs(pencil: Pencil, settings: EigenSettings) -> Spectrum:
     beyond = values[order[k : k + 1]]
     vectors = np.array([_with_fixed_sign(vector) for vector in vectors[chosen]])
     residuals = [PairResidual.of(pencil, *pair) for pair in zip(values[chosen], vectors, strict=True)]
-    _check_residuals(residuals, pencil.rtol)
+    _check_residuals(residuals, pencil, method)
     is_zero = np.array([residual.is_zero for residual in residuals], bool)
     return Spectrum(
         np.ldexp(np.where(is_zero, 0.0, values[chosen]), pencil.exponent),
@@ -497,11 +510,15 @@ def _dense(pencil):
         else:
             values, vectors = la.eigh(stiffness, mass)
     except la.LinAlgError:
-        raise _mass_error() from None
+        raise _mass_error(pencil) from None
     return values, pencil.embedded(vectors.T)
 
 
-def _mass_error():
+def _mass_error(pencil):
+    """Return the error for products v_i . M v_j that are not those of a positive definite M."""
+    if not isinstance(pencil.mass, Operator):  # its entries are positive
+        message = f"eigenpairs found vectors that are parallel up to rounding errors; {_advice(pencil, 'lobpcg')}"
+        return ConvergenceError(message, info=failure("stagnated"))
     return ValueError("mass must be positive definite, and the one given is not; write a mass > 0 in all unknowns")
 
 
@@ -675,7 +692,7 @@ def _rayleigh_ritz(pencil, vectors):
     try:
         values, combinations = la.eigh((stiffness + stiffness.conj().T) / 2, (mass + mass.conj().T) / 2)
     except la.LinAlgError:
-        raise _mass_error() from None
+        raise _mass_error(pencil) from None
     return values, combinations.T @ vectors
 
 
@@ -700,6 +717,7 @@ def _by_lobpcg(pencil, k, maxiter):
     block = np.array([pencil.masked(line) for line in block])
     for _ in range(2):
         block = np.array([solve(pencil.apply_mass(line)) for line in block])
+        block = la.qr(block.T, mode="economic")[0].T  # near a null vector the solutions are almost parallel
         bounds, block = _rayleigh_ritz(pencil, block)  # upper bounds of the eigenvalues
     if pencil.is_positive:  # a preconditioner that is nearly singular would favour one vector
         precondition = pencil.shifted_inverse(min(sigma, -0.1 * bounds[k]), 1e-2, True)
@@ -749,15 +767,35 @@ class PairResidual(NamedTuple):
         return cls(float(residual / (size or 1.0)), bool(is_small), bool(size <= ZERO * terms))
 
 
-def _check_residuals(residuals, rtol):
+def _are_accurate(pencil, k, which, values, vectors):
+    """Return whether the residuals of the selected pairs are small."""
+    selected = _distances(values, which).argsort(kind="stable")[:k]
+    return all(PairResidual.of(pencil, values[number], vectors[number]).is_small for number in selected)
+
+
+def _check_residuals(residuals, pencil, method):
     """Raise ConvergenceError if a pair does not satisfy A v = lambda M v."""
     for number, residual in enumerate(residuals):
         if not residual.is_small:
             raise ConvergenceError(
-                f"pair {number} of eigenpairs has a relative residual of {residual.relative:.1e}, more than {rtol:g}; "
-                "give a shift near to it by which, or increase maxiter",
+                f"pair {number} of eigenpairs has a relative residual of {residual.relative:.1e}, more than "
+                f"{pencil.rtol:g}; {_advice(pencil, method)}",
                 info=failure("stagnated"),
             )
+
+
+def _advice(pencil, method):
+    """Return what to do about pairs that are not accurate."""
+    contrast = pencil.mass_contrast
+    if contrast > LARGE_CONTRAST:
+        return (
+            f"the mass varies by a factor of {contrast:.0e}, so that rounding errors of the largest eigenvalues are "
+            "large beside this one; write which='smallest' with method='arpack', a mass that varies less, or a larger "
+            "rtol"
+        )
+    if method == "arpack":
+        return "give a shift near to it by which, or increase maxiter"
+    return "write method='arpack', or a larger rtol"
 
 
 def _with_fixed_sign(vector):

@@ -388,6 +388,25 @@ def test_small_and_special_operators():
     assert slope.dtype == np.float32
 
 
+def test_a_mass_that_varies_by_16_orders_of_magnitude():
+    """A heavy cell stands still, apart from one slow pair; rounding errors of LAPACK alone are larger than this one."""
+    op = -dp.laplacian(SQUARE, dp.dirichlet)
+    matrix = op.matrix.toarray()
+    mass = np.ones(25)
+    mass[12] = 1e16
+    values = dp.eigenpairs(op, 3, mass=mass.reshape(5, 5), method="dense").values
+    without = np.delete(np.delete(matrix, 12, 0), 12, 1)
+    assert values[0] == pytest.approx(1e-16 / np.linalg.inv(matrix)[12, 12], rel=1e-9)
+    assert np.allclose(values[1:], np.linalg.eigvalsh(without)[:2], rtol=1e-9)
+
+
+@pytest.mark.parametrize(("n", "k"), [(11, 1), (30, 5)])
+def test_lobpcg_of_small_operators_with_a_null_vector(n, k):
+    op = -dp.laplacian(dp.Grid(n, size=1.0), dp.neumann)
+    pairs = dp.eigenpairs(op, k, method="lobpcg")
+    assert pairs.values == pytest.approx(4.0 * n**2 * np.sin(0.5 * np.pi * np.arange(k) / n) ** 2, abs=1e-7)
+
+
 def test_the_caller_may_write_into_coefficients():
     k, mass = K.copy(), MASS.copy()
     pairs = dp.eigenpairs(SOLVE, 2, coefficients=k, mass=mass)

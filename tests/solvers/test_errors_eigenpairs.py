@@ -23,6 +23,9 @@ HERMITIAN = dp.from_matrix([[2.0, 1j], [-1j, 2.0]], name="hermitian")
 LINE = dp.from_functions(lambda u: 2 * u, lambda u: 2 * u, 600, 600, name="line")
 LONG = dp.upwind(dp.Grid(40, periodic=True), 0, 1)
 FACES = np.ones(GRID.faces.shape)
+ENTRIES = dp.matrix_solver.from_coo([0, 0, 1, 1], [0, 1, 0, 1])
+LIGHT = np.where(np.arange(25) == 12, 1e-12, 1.0).reshape(5, 5)
+HEAVY = np.where(np.arange(25) == 12, 1e20, 1.0).reshape(5, 5)
 
 
 def pairs(*args, **options):
@@ -57,6 +60,25 @@ TABLE = [
         TYPE,
         "eigenpairs takes a symmetric operator, and the mass is not; write symmetric=False for its eigenvalues, or "
         "0.5 * (A + A.T) for its symmetric part",
+    ),
+    (
+        pairs(SOLVE, coefficients=(1.0 + 1j) * FACES),
+        TYPE,
+        "eigenpairs takes complex operators that are equal to their conjugate transpose, and 0 - divergence @ diag(k) "
+        "@ gradient is not; write symmetric=False for eigenvalues",
+    ),
+    (
+        pairs(ENTRIES, coefficients=np.arange(4.0)),
+        TYPE,
+        "eigenpairs takes a symmetric operator, and matrix of 4 entries is not; write symmetric=False for its "
+        "eigenvalues",
+    ),
+    (
+        pairs(L, 3, mass=HEAVY, method="lobpcg"),
+        FAILED,
+        "eigenpairs found vectors that are parallel up to rounding errors; the mass varies by a factor of 1e+20, so "
+        "that rounding errors of the largest eigenvalues are large beside this one; write which='smallest' with "
+        "method='arpack', a mass that varies less, or a larger rtol",
     ),
     (pairs(TWO, 3), VALUE, "eigenpairs got k=3, but one has 2 unknowns; write a smaller k"),
     (pairs(TWO, 0), VALUE, "k of eigenpairs must be a whole number >= 1, got 0"),
@@ -245,7 +267,19 @@ def test_messages_of_failures(monkeypatch):
     )
     with pytest.raises(FAILED, match=message):
         dp.eigenpairs(L, rtol=1e-20)
+    message = (
+        "pair 0 of eigenpairs has a relative residual of .*, more than .*; write method='arpack', or a larger rtol"
+    )
+    with pytest.raises(FAILED, match=message):
+        dp.eigenpairs(L, 25, rtol=1e-20)
     monkeypatch.undo()
+    message = (
+        r"pair 0 of eigenpairs has a relative residual of .*, more than .*; the mass varies by a factor of 1e\+12, "
+        "so that rounding errors of the largest eigenvalues are large beside this one; write which='smallest' with "
+        "method='arpack', a mass that varies less, or a larger rtol"
+    )
+    with pytest.raises(FAILED, match=message):
+        dp.eigenpairs(L, 3, "largest", mass=LIGHT)
     monkeypatch.setattr(eigen_rules, "BORDERED_LU_UP_TO", 0)
     monkeypatch.setattr(eigen_rules, "MOST_ITERATIONS", 1)
     message = (
