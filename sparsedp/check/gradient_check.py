@@ -87,7 +87,7 @@ def gradient(
 
     See Also
     --------
-    value_and_grad, differentiable, certify, stress, v_curve, check.order, check.jit
+    value_and_grad, differentiable, certify, stress, v_curve, check.vjp, check.order, check.jit
 
     Notes
     -----
@@ -351,7 +351,7 @@ class Audit(Result):
         Number of entries of all floating leaves.
     """
 
-    _plain = (
+    _plain: tuple[str, ...] = (
         "verdict",
         "reason",
         "digits",

@@ -422,17 +422,24 @@ def as_arrays(tree: Any) -> Any:
     return mapped(array, tree)
 
 
+def _is_floating(tensor: Any) -> bool:
+    """Return whether a tensor has a real or complex floating dtype."""
+    return tensor.is_floating_point() or tensor.is_complex()
+
+
 def vjp_of(f: Callable, x: Any, g: Any) -> Any:
     """Return the VJP of a function of a tree of tensors by torch."""
     entries, rebuild = flatten(x)
-    moving = [isinstance(leaf, torch.Tensor) and leaf.dtype.is_floating_point | leaf.is_complex() for leaf in entries]
+    moving = [isinstance(leaf, torch.Tensor) and _is_floating(leaf) for leaf in entries]
     entries = [leaf.requires_grad_() if moves else leaf for leaf, moves in zip(entries, moving, strict=True)]
     variables = [leaf for leaf, moves in zip(entries, moving, strict=True) if moves]
     with torch.enable_grad():
         # A function that changes its argument in place may not do so with a variable itself.
         results = leaves(f(rebuild([leaf.clone() if moves else leaf for leaf, moves in zip(entries, moving)])))
-    pairs = zip(results, leaves(g), strict=True)
-    pairs = [(y, cotangent) for y, cotangent in pairs if isinstance(y, torch.Tensor) and y.requires_grad]
+    pairs = []
+    for y, cotangent in zip(results, leaves(g), strict=True):
+        if isinstance(y, torch.Tensor) and y.requires_grad:
+            pairs.append((y, cotangent))
     slopes: list[Any] = [None] * len(variables)
     if pairs:
         outputs, cotangents = zip(*pairs)
@@ -445,7 +452,7 @@ def vjp_of(f: Callable, x: Any, g: Any) -> Any:
 def jvp_of(f: Callable, x: Any, t: Any) -> Any:
     """Return the JVP of a function of a tree of tensors by torch."""
     entries, rebuild = flatten(x)
-    places = [place for place, leaf in enumerate(entries) if isinstance(leaf, torch.Tensor)]
+    places = [place for place, leaf in enumerate(entries) if isinstance(leaf, torch.Tensor) and _is_floating(leaf)]
     tangents = leaves(t)
     rebuild_result: Any = None
 

@@ -1,0 +1,125 @@
+"""Audits of products with a Hessian: by differences of a gradient, or by second differences of the loss."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sparsedp._utils.pytree import norm
+from sparsedp.check.derivative_audit import DerivativeAudit, Group, Options
+from sparsedp.check.directions import examine_line
+from sparsedp.check.evaluations import Evaluations, Level, Line
+from sparsedp.check.functionals import FunctionalEvaluations
+from sparsedp.check.point import Point
+from sparsedp.check.programs import Program
+from sparsedp.check.summary import Row
+
+__all__ = ["GradientHessianAudit", "LossHessianAudit"]
+
+SYMMETRY_SHARE = 1e-8  # a larger relative gap between <u, H v> and <v, H u> is an error
+STEPS = tuple(2.0**-exponent for exponent in range(1, 28, 2))  # second differences need more of the coarse steps
+EVEN_EPS = 4.0  # rounding error of f(x + t d) + f(x - t d) - 2 f(x), in units of eps |f|
+
+
+class GradientHessianAudit(DerivativeAudit):
+    """The audit of a Hessian as the JVP of a gradient. The program is the gradient."""
+
+    def examine(self) -> None:
+        """Examine the products, and their symmetry."""
+        super().examine()
+        test_symmetry(self)
+
+
+def test_symmetry(audit: DerivativeAudit) -> None:
+    """Compare <u, H v> with <v, H u>."""
+    if len(audit.pairs) < 2:
+        return
+    (u, Hu), (v, Hv) = audit.pairs
+    size = max(norm(u * Hv), norm(v * Hu))
+    difference = abs(float(u @ Hv) - float(v @ Hu))
+    gap = difference / size if size else 0.0
+    allowed = audit.allowed(SYMMETRY_SHARE)
+    audit.rows.append(Row("<u, H v> = <v, H u>", gap, allowed, gap <= allowed))
+    if not gap <= allowed:
+        audit.findings.append(("broken", f"the Hessian is not symmetric: <u, H v> and <v, H u> differ by {gap:.1e}"))
+
+
+class SecondDifferences(Line):
+    """The function (f(x + t d) + f(x - t d) - 2 f(x)) / t of t, whose derivative at 0 is d . H d.
+
+    It is odd in t, so that its central difference quotient is the second difference quotient of f.
+    """
+
+    def __init__(self, name: str, direction: NDArray[Any], evaluations: Evaluations, product: NDArray[Any]) -> None:
+        super().__init__(name, direction, evaluations)
+        self.slope = float(direction @ product)
+        self.typical = norm(direction * product)
+        self.loss = self.base
+        self.base = 0.0
+
+    def level(self, step: float) -> Level:
+        """Evaluate the loss at x + t d and x - t d."""
+        plus, _, note_ahead = self.end(step)
+        minus, _, note_behind = self.end(-step)
+        change = ((plus - self.loss) + (minus - self.loss)) / step
+        return Level(step, change, -change, step * self.slope, -step * self.slope, note_ahead or note_behind)
+
+    def rounding(self, steps: NDArray[Any], losses: NDArray[Any]) -> NDArray[Any]:
+        """Return the rounding error of the second differences divided by the step."""
+        return EVEN_EPS * self.evaluations.eps * abs(self.loss) / steps
+
+
+class LossHessianAudit(DerivativeAudit):
+    """The audit of a Hessian by second differences of the loss. The program is the loss."""
+
+    def __init__(self, program: Program, options: Options) -> None:
+        super().__init__(program, options, "jvp")
+
+    def _steps(self) -> tuple[float, ...]:
+        """Return the step sizes of a sweep."""
+        return self.options.steps or STEPS
+
+    def examine(self) -> None:
+        """Examine d . H d along random directions at x and beside x, and the symmetry of H."""
+        program = self.program
+        if self.base.size != 1:
+            raise ValueError("check.hessian needs a loss f(x) with one value, got several; give gradient=f instead")
+        program.jvp_result = program.point
+        first = self.point.random(self.options.rng)
+        other = self.point.random(self.options.rng)
+        products = [self.products(self.point, direction) for direction in (first, other)]
+        self.pairs = [(self.tangent(first), products[0]), (self.tangent(other), products[1])]
+        test_symmetry(self)
+        directions = {"random 1": (first, products[0]), "random 2": (other, products[1])}
+        self._examine_lines(self.point, self.base, directions)
+        balanced = self.balanced(np.zeros(self.point.size), None)
+        point, base = self.beside()
+        name = "balanced" if point is self.point else "balanced, beside x"
+        self._examine_lines(point, base, {name: (balanced, self.products(point, balanced))})
+
+    def _examine_lines(
+        self, point: Point, base: NDArray[Any], directions: dict[str, tuple[NDArray[Any], NDArray[Any]]]
+    ) -> None:
+        """Examine d . H d along directions from a point. Each direction comes with its product H d."""
+        evaluations = FunctionalEvaluations(self._loss, point, None, self.like.steps)
+        evaluations.base = float(base[0])
+        evaluations.slopes = np.zeros(point.size)
+        evaluations.eps = self.like.eps
+        evaluations.may_extend = False
+        group = Group(evaluations, np.ones(1))
+        self.groups.append(group)
+        for name, (direction, product) in directions.items():
+            if not np.all(np.isfinite(product)):
+                self.findings.append(("broken", "the Hessian product holds NaN or infinity"))
+                continue
+            group.directions.append(examine_line(SecondDifferences(name, direction, evaluations, product)))
+
+    def _loss(self, tree: Any) -> float:
+        """Return the loss."""
+        return float(self.program.value(tree)[0])
+
+    def products(self, point: Point, direction: NDArray[Any]) -> NDArray[Any]:
+        """Return H d at a point by the products under test."""
+        return self.program.push(point.fresh(), self.tangent(direction))

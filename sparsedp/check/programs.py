@@ -1,0 +1,339 @@
+"""Programs of other libraries as functions between real vectors, with their derivatives.
+
+A program maps a tree of arrays to a tree of arrays: a NumPy function, a torch function or module, a JAX function, a
+SciPy LinearOperator, an Operator, or an object with methods ``apply`` and ``vjp``. A complex number is stored as two
+real numbers in each vector, so that every inner product is an ordinary dot product.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sparsedp._utils.pytree import TreeStructure, keys, leaves, mapped
+from sparsedp._utils.validation import check_function
+from sparsedp.autodiff.derivative import jvp as forward_derivative
+from sparsedp.autodiff.flattening import Packing, joined
+from sparsedp.autodiff.tape import is_variable
+from sparsedp.check.point import Point
+from sparsedp.check.summary import error_text
+from sparsedp.errors import DerivativeError, ShapeError
+from sparsedp.interop.recording import recorded
+
+__all__ = ["CONVENTIONS", "Library", "Program", "WrongResult", "library_of"]
+
+CONVENTIONS = ("transpose", "adjoint")
+
+
+class WrongResult(Exception):
+    """A derivative returned something that cannot be a derivative: a wrong structure, shape or dtype."""
+
+
+class Library(NamedTuple):
+    """How a library stores arrays, and its convention for complex cotangents.
+
+    Attributes
+    ----------
+    name : "numpy", "torch" or "jax"
+    arrays : callable
+        ``arrays(tree)`` returns the tree with NumPy arrays.
+    tensors : callable
+        ``tensors(tree)`` returns the tree with arrays of the library.
+    vjp, jvp : callable
+        ``vjp(f, x, g)`` and ``jvp(f, x, t)`` return the derivatives by the library, for trees of its arrays.
+    convention : "transpose" or "adjoint"
+        The derivative of a real loss along dz is Re(sum(g * dz)) for "transpose", and Re(sum(conj(g) * dz)) for
+        "adjoint".
+    """
+
+    name: str
+    arrays: Callable[[Any], Any]
+    tensors: Callable[[Any], Any]
+    vjp: Callable[[Any, Any, Any], Any]
+    jvp: Callable[[Any, Any, Any], Any]
+    convention: str
+
+
+def _unchanged(thing: Any) -> Any:
+    """Return the argument."""
+    return thing
+
+
+def _tape_vjp(f: Callable[[Any], Any], x: Any, g: Any) -> Any:
+    """Return the VJP by the tape of this library, for a function whose result is a tree."""
+    structure = TreeStructure(x, "x", is_variable)
+    arrays = structure.variables(x)
+
+    def of_arrays(arrays: Any) -> Any:
+        return f(structure.build(arrays))
+
+    _, _, gradients = recorded(of_arrays, arrays, [True] * len(arrays))
+    return structure.build(gradients([g_leaf if is_variable(g_leaf) else None for g_leaf in leaves(g)]))
+
+
+def _tape_jvp(f: Callable[[Any], Any], x: Any, t: Any) -> Any:
+    """Return the JVP by the tape of this library."""
+    return forward_derivative(f, x, t)[1]
+
+
+NUMPY = Library("numpy", _unchanged, _unchanged, _tape_vjp, _tape_jvp, "transpose")
+
+
+def _torch() -> Library:
+    """Return the library torch. It is imported only if something of torch was given."""
+    from sparsedp.interop import torch_bridge
+
+    bridge = torch_bridge
+    return Library("torch", bridge.as_arrays, bridge.as_tensors, bridge.vjp_of, bridge.jvp_of, "adjoint")
+
+
+def _jax() -> Library:
+    """Return the library JAX. It is imported only if something of JAX was given."""
+    from sparsedp.interop import jax_bridge
+
+    bridge = jax_bridge
+    return Library("jax", bridge.as_arrays, bridge.as_tensors, bridge.vjp_of, bridge.jvp_of, "transpose")
+
+
+ROOTS = {"torch": _torch, "jax": _jax, "jaxlib": _jax}
+
+
+def library_of(*things: Any) -> Library:
+    """Return the library that one of some functions and arrays belongs to; NumPy if none belongs to another one."""
+    for thing in things:
+        for kind in type(thing).__mro__:
+            root = kind.__module__.partition(".")[0]
+            if root in ROOTS:
+                return ROOTS[root]()
+    return NUMPY
+
+
+class Program:
+    """A program at a point, as a function between real vectors.
+
+    Parameters
+    ----------
+    f : callable
+        ``f(x)``, a function of trees of arrays of its library.
+    x : tree of arrays
+    vjp, jvp : callable or None
+        The derivatives under test, ``vjp(x, g)`` and ``jvp(x, t)``. None: the derivatives of the library.
+    convention : "transpose" or "adjoint", optional
+        The convention of `vjp` for complex numbers. Default: that of the library.
+
+    Attributes
+    ----------
+    library : Library
+    point : Point
+    result : Packing
+        The structure of f(x). Set by the first run.
+    runs : dict
+        Number of runs of "f", "vjp" and "jvp".
+    changed : dict
+        Name of an argument that a run changed in place, by name of the function that ran.
+    jvp_name : str
+        The call of the JVP, for messages.
+    jvp_result : Packing or None
+        The structure of the JVP if it is not that of f(x).
+    takes_arrays : bool
+        Whether the derivatives under test take and return NumPy arrays for every library of `f`.
+    """
+
+    result: Packing
+
+    def __init__(
+        self,
+        f: Callable[[Any], Any],
+        x: Any,
+        vjp: Callable[[Any, Any], Any] | None = None,
+        jvp: Callable[[Any, Any], Any] | None = None,
+        convention: str | None = None,
+    ) -> None:
+        self.library = library_of(f, *leaves(x))
+        self.point = Point(self.library.arrays(x))
+        self.f = f
+        self._vjp = vjp
+        self._jvp = jvp
+        self.given_convention = convention
+        self.convention = convention or self.library.convention
+        self.jvp_name = "jvp(x, t)"
+        self.jvp_result: Packing | None = None
+        self.takes_arrays = False
+        self.runs = {"f": 0, "vjp": 0, "jvp": 0}
+        self.changed: dict[str, str] = {}
+
+    # ---------------------------------------------------------------- values
+
+    def start(self) -> NDArray[Any]:
+        """Run f at the point for the first time, and return its value as a vector."""
+        value = self._run(self.point.fresh())
+        if self.library is NUMPY:
+            library = library_of(*leaves(value))
+            if library is not NUMPY:  # a function of NumPy arrays that computes with another library
+                self._change_library(library)
+                value = self._run(self.point.fresh())
+        arrays = self.library.arrays(value)
+        for leaf in leaves(arrays):
+            if np.asarray(leaf).dtype == object:
+                raise TypeError(f"f(x) must be an array or a tree of arrays, got {type(leaf).__name__}; return arrays")
+        self.result = Packing(mapped(np.array, arrays), "f(x)")
+        return joined(self.result.values)
+
+    def _change_library(self, library: Library) -> None:
+        """Let the arguments be arrays of another library, in the dtypes that it gives them."""
+        self.library = library
+        self.point = Point(library.arrays(library.tensors(self.point.fresh())))
+        self.convention = self.given_convention or library.convention
+
+    def _run(self, tree: Any) -> Any:
+        """Run f for a tree of NumPy arrays, and return what it returns."""
+        self.runs["f"] += 1
+        with np.errstate(all="ignore"):
+            return self._watched("f", self.f, tree)
+
+    def value(self, tree: Any) -> NDArray[Any]:
+        """Run f for a tree of NumPy arrays, and return its value as a vector."""
+        return joined(self._like_result(self.library.arrays(self._run(tree)), "f(x)"))
+
+    def _like_result(self, value: Any, name: str, result: Packing | None = None) -> list[NDArray[Any]]:
+        """Return the leaves of a tree that must have the structure and the shapes of f(x), or of another result."""
+        result = result or self.result
+        advice = f"; return a tree like {result.root}"
+        parts = []
+        for leaf, part, y in zip(
+            result.names_under(name), result.variables(value, name, advice=advice), result.values, strict=True
+        ):
+            part = np.asarray(part)
+            if part.shape != y.shape:
+                raise ShapeError(f"{leaf}: expected shape {y.shape}, got {part.shape}{advice}")
+            if part.dtype.kind not in "biufc":
+                raise ShapeError(f"{leaf}: expected numbers, got dtype {part.dtype}{advice}")
+            if np.iscomplexobj(y):
+                part = part.astype(np.result_type(y, complex))
+            else:
+                part = np.real(part)
+            parts.append(part)
+        return parts
+
+    def _watched(self, name: str, function: Callable[..., Any], *trees: Any) -> Any:
+        """Call a function with trees of NumPy arrays, and note if it changes one of them in place."""
+        before = [_bytes_of(tree) for tree in trees]
+        arguments = trees
+        if not (self.takes_arrays and name != "f"):
+            arguments = tuple(self.library.tensors(tree) for tree in trees)
+        value = function(*arguments)
+        if self.library is NUMPY or self.library.name == "torch":
+            for number, (argument, bytes_before) in enumerate(zip(arguments, before)):
+                if _bytes_of(self.library.arrays(argument)) != bytes_before:
+                    self.changed.setdefault(name, ("x", "its cotangent or tangent")[number])
+        return value
+
+    def rounded(self, weights: NDArray[Any]) -> NDArray[Any]:
+        """Return weights of the result, rounded to the dtypes of its leaves."""
+        return joined(self.result.arrays(weights))
+
+    # ---------------------------------------------------------------- derivatives
+
+    def cotangent(self, weights: NDArray[Any], conjugate: bool = False) -> Any:
+        """Return the cotangent of the functional sum(weights * f) as a tree like f(x), in the convention of `vjp`."""
+        arrays = self.result.arrays(weights)
+        if (self.convention == "transpose") != conjugate:
+            arrays = [np.conj(array) for array in arrays]
+        return self.result.tree(arrays)
+
+    def pull(
+        self, tree: Any, weights: NDArray[Any], conjugate_argument: bool = False, conjugate_result: bool = False
+    ) -> NDArray[Any]:
+        """Return J^T weights at a tree by the VJP under test.
+
+        Parameters
+        ----------
+        tree : tree of NumPy arrays
+        weights : ndarray
+        conjugate_argument, conjugate_result : bool
+            Whether the cotangent and the result are conjugated, to find a missing conjugate.
+
+        Raises
+        ------
+        WrongResult
+            If the result does not have the structure and the shapes of x.
+        """
+        self.runs["vjp"] += 1
+        g = self.cotangent(weights, conjugate_argument)
+        with np.errstate(all="ignore"):
+            if self._vjp is None:
+                slopes = self._own("vjp", tree, g)
+            else:
+                slopes = self.library.arrays(self._watched("vjp", self._vjp, tree, g))
+        slopes = self._like_x(slopes, "vjp(x, g)")
+        if (self.convention == "adjoint") != conjugate_result:
+            slopes = mapped(_conjugated, slopes)
+        try:
+            return self.point.gradient(slopes)
+        except DerivativeError as error:
+            raise WrongResult(str(error).replace("gradient", "vjp(x, g)", 1)) from error
+
+    def push(self, tree: Any, tangent: NDArray[Any]) -> NDArray[Any]:
+        """Return J tangent at a tree by the JVP under test.
+
+        Raises
+        ------
+        WrongResult
+            If the result does not have the structure and the shapes of f(x).
+        """
+        self.runs["jvp"] += 1
+        t = self.point.unpack(tangent)
+        with np.errstate(all="ignore"):
+            if self._jvp is None:
+                value = self._own("jvp", tree, t)
+            else:
+                value = self.library.arrays(self._watched("jvp", self._jvp, tree, t))
+        try:
+            return joined(self._like_result(value, self.jvp_name, self.jvp_result))
+        except ShapeError as error:
+            raise WrongResult(str(error)) from error
+
+    def _like_x(self, slopes: Any, name: str) -> Any:
+        """Return a cotangent of x. JAX returns a tuple with one entry for a function of one argument."""
+        if slopes is None:
+            raise WrongResult(f"{name}: expected a tree like x, got None; return the cotangent of x")
+        is_single = keys(self.point.template) is None
+        if is_single and isinstance(slopes, (tuple, list)) and len(slopes) == 1:
+            return slopes[0]
+        return slopes
+
+    def _own(self, name: str, tree: Any, direction: Any) -> Any:
+        """Return the VJP or JVP by the library of f."""
+        derivative = getattr(self.library, name)
+        try:
+            value = derivative(self.f, self.library.tensors(tree), self.library.tensors(direction))
+        except TypeError as error:
+            arguments = {"vjp": "vjp(x, g)", "jvp": "jvp(x, t)"}[name]
+            raise DerivativeError(
+                f"f cannot be differentiated without {name} ({error_text(error)}); give a function {arguments}"
+            ) from error
+        return self.library.arrays(value)
+
+
+def _bytes_of(tree: Any) -> list[bytes]:
+    """Return the bytes of all arrays of a tree, to notice changes in place."""
+    return [leaf.tobytes() for leaf in leaves(tree) if isinstance(leaf, np.ndarray)]
+
+
+def _conjugated(leaf: Any) -> Any:
+    """Return the complex conjugate of a leaf if it is complex; return all other leaves unchanged."""
+    if np.iscomplexobj(leaf):
+        return np.conj(leaf)
+    return leaf
+
+
+def function_of(f: Any, name: str) -> Callable[[Any], Any]:
+    """Return the function f(x) of a program that is a function or an object with a method ``apply``."""
+    for method in ("matvec", "apply"):
+        if not callable(f) and hasattr(f, method):
+            return getattr(f, method)
+    check_function(name, f, "lambda x: ...")
+    return f

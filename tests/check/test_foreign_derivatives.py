@@ -1,0 +1,222 @@
+"""Derivatives that other code computes: right ones agree, wrong ones disagree, within 40 runs of a right program."""
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from scipy.sparse.linalg import LinearOperator, aslinearoperator
+
+import sparsedp as dp
+
+VJP = dp.check.vjp
+JVP = dp.check.jvp
+X = np.linspace(1.0, 2.0, 12)
+M = np.cos(np.arange(60.0)).reshape(5, 12)
+
+
+def cube(u):
+    return u**3
+
+
+def cube_vjp(u, g):
+    return 3 * u**2 * g
+
+
+def wave(u):
+    return {"a": np.sin(u["p"]) * u["q"], "b": np.sum(u["p"] ** 2)}
+
+
+def wave_vjp(u, g):
+    p, q = u["p"], u["q"]
+    return {"p": np.cos(p) * q * g["a"] + 2 * p * g["b"], "q": np.sum(np.sin(p) * g["a"])}
+
+
+def wave_jvp(u, t):
+    p, q = u["p"], u["q"]
+    return {"a": np.cos(p) * q * t["p"] + np.sin(p) * t["q"], "b": np.sum(2 * p * t["p"])}
+
+
+WAVE_POINT = {"q": 0.7, "p": X}
+
+
+class Simulator:
+    """A simulator with an adjoint, as many codes have it."""
+
+    def apply(self, x):
+        return np.cumsum(x**2)
+
+    def vjp(self, x, g):
+        return 2 * x * np.cumsum(g[::-1])[::-1]
+
+    def jvp(self, x, t):
+        return np.cumsum(2 * x * t)
+
+
+# ---- right derivatives ---------------------------------------------------------------------------------------------
+
+
+def test_right_derivatives_agree():
+    for result in (
+        VJP(cube, cube_vjp, X),
+        VJP(wave, wave_vjp, WAVE_POINT, jvp=wave_jvp),
+        JVP(wave, wave_jvp, WAVE_POINT),
+        VJP(Simulator(), x=X),
+        JVP(Simulator(), x=X),
+        VJP(dp.laplacian(dp.Grid((3, 4)))),
+        VJP(aslinearoperator(M)),
+        VJP(lambda z: z**2, lambda z, g: 2 * z * g, X + 0.5j),
+        VJP(lambda z: z**2, lambda z, g: 2 * np.conj(z) * g, X + 0.5j, convention="adjoint"),
+    ):
+        assert result.verdict == "agrees" and result.digits >= 8, result
+        assert result.evaluations <= 41 and not result.gaps
+    assert len(VJP(wave, wave_vjp, WAVE_POINT, jvp=wave_jvp).identities) == 4
+
+
+def test_a_vjp_takes_forty_runs():
+    runs = []
+
+    def slow(u):
+        runs.append("f")
+        return np.sin(u) + np.roll(u, 1) ** 2
+
+    def slow_vjp(u, g):
+        runs.append("vjp")
+        return np.cos(u) * g + 2 * u * np.roll(g, -1)
+
+    x = np.linspace(0.5, 2.0, 10**4)
+    result = VJP(slow, slow_vjp, x)
+    assert result and len(runs) == result.evaluations <= 40
+
+
+# ---- wrong derivatives ---------------------------------------------------------------------------------------------
+
+
+def changes_its_cotangent(u, g):
+    g *= 3 * u**2
+    return g
+
+
+def one_wrong_entry(u, g):
+    return cube_vjp(u, g) * (1 + 1e-3 * (np.arange(12) == 7))
+
+
+class Accumulator:
+    """A VJP that adds to the cotangents of earlier calls."""
+
+    def __init__(self):
+        self.total = 0.0
+
+    def __call__(self, u, g):
+        self.total = self.total + cube_vjp(u, g)
+        return self.total
+
+
+WRONG = {
+    "factor": (lambda u, g: 1.001 * cube_vjp(u, g), "off by"),
+    "entry": (one_wrong_entry, "off by"),
+    "single precision inside": (lambda u, g: cube_vjp(u, g).astype(np.float32), "off by"),
+    "constant of x": (lambda u, g: cube_vjp(X, g), "beside x"),
+    "not linear": (lambda u, g: cube_vjp(u, np.clip(g, -0.1, 0.1)), "vjp is not linear in g"),
+    "in place": (changes_its_cotangent, "vjp(x, g) changes its cotangent or tangent in place"),
+    "state": (Accumulator(), "two runs of vjp at x differ"),
+    "NaN": (lambda u, g: np.where(np.arange(12) == 3, np.nan, g), "NaN or infinity in x, the first at 3"),
+    "shape": (lambda u, g: g[:, None] * u, "vjp(x, g): expected shape (12,), got (12, 12)"),
+    "nothing": (lambda u, g: None, "got None; return the cotangent of x"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_vjps_disagree(name):
+    function, words = WRONG[name]
+    result = VJP(cube, function, X)
+    assert result.verdict == "disagrees" and words in str(result), result
+    assert not result
+
+
+def test_wrong_derivatives_of_other_kinds_disagree():
+    assert JVP(cube, lambda u, t: 3.001 * u**2 * t, X).verdict == "disagrees"
+    assert JVP(cube, lambda u, t: 3 * X**2 * t, X).verdict == "disagrees"
+    assert VJP(lambda z: z**2, lambda z, g: 2 * np.conj(z) * g, X + 0.5j).verdict == "disagrees"
+    wrong = LinearOperator((5, 12), matvec=lambda v: M @ v, rmatvec=lambda g: M.T @ g + 1e-6 * g[0], dtype=float)
+    assert VJP(wrong).verdict == "disagrees"
+    mismatch = VJP(cube, cube_vjp, X, jvp=lambda u, t: 3.01 * u**2 * t)
+    assert mismatch.verdict == "disagrees" and "vjp is not the transpose of jvp" in mismatch.reason
+
+
+def test_a_function_that_changes_its_argument():
+    def doubled(u):
+        u *= 2
+        return u
+
+    result = VJP(doubled, lambda u, g: 2 * g, X)
+    assert result.verdict == "disagrees" and "f(x) changes x in place" in result.reason
+
+
+# ---- matrices ------------------------------------------------------------------------------------------------------
+
+
+def test_jacobians():
+    slopes = np.diag(np.cos(X))
+    for J in (
+        slopes,
+        sp.diags(np.cos(X)),
+        aslinearoperator(slopes),
+        dp.from_matrix(slopes),
+        lambda u: np.diag(np.cos(u)),
+    ):
+        assert dp.check.jacobian(np.sin, J, X)
+    assert dp.check.jacobian(lambda z: M @ z**2, lambda z: 2 * M * z, X + 0.5j)
+    assert dp.check.jacobian(np.sin, 1.001 * slopes, X).verdict == "disagrees"
+    wrong = dp.check.jacobian(np.sin, M, X)
+    assert wrong.verdict == "disagrees" and wrong.reason == "the Jacobian has shape (5, 12), expected (12, 12)"
+
+
+def test_hessians():
+    loss = lambda u: np.sum(u**4)
+    gradient = lambda u: 4 * u**3
+    product = lambda u, v: 12 * u**2 * v
+    matrix = np.diag(12 * X**2)
+    for H in (product, matrix, lambda u: np.diag(12 * u**2)):
+        assert dp.check.hessian(loss, H, X)
+        assert dp.check.hessian(loss, H, X, gradient=gradient).digits >= 7
+    assert dp.check.hessian(loss, 1.001 * matrix, X).verdict == "disagrees"
+    assert dp.check.hessian(loss, lambda u: matrix, X).verdict == "disagrees"
+    assert dp.check.hessian(loss, lambda u, v: product(u, v) * (1 + 1e-6), X, gradient=gradient).verdict == "disagrees"
+    A = M.T @ np.roll(M, 1, 0)
+    for options in ({}, {"gradient": lambda u: (A + A.T) @ u}):
+        wrong = dp.check.hessian(lambda u: u @ A @ u, 2 * A, X, **options)
+        assert wrong.verdict == "disagrees" and "the Hessian is not symmetric" in wrong.reason
+        assert dp.check.hessian(lambda u: u @ A @ u, A + A.T, X, **options)
+
+
+# ---- messages ------------------------------------------------------------------------------------------------------
+
+
+def test_messages():
+    with pytest.raises(
+        TypeError, match=r"^grid takes a Grid, a Space, or a list of them, got int; write grid=dp.Grid\(...\)$"
+    ):
+        VJP(cube, cube_vjp, X, grid=3)
+    with pytest.raises(TypeError, match="check.vjp needs the point x at which the derivative is checked; write x=..."):
+        VJP(cube, cube_vjp)
+    with pytest.raises(TypeError, match=r"^f\(x\) must be an array or a tree of arrays, got Grid; return arrays"):
+        VJP(lambda u: dp.Grid(3), cube_vjp, X)
+    with pytest.raises(
+        dp.errors.DerivativeError,
+        match=r"^f cannot be differentiated without vjp \(DerivativeError: .*\); give a function vjp\(x, g\)$",
+    ):
+        VJP(lambda u: np.asarray(u, float), x=X)
+    with pytest.raises(
+        TypeError,
+        match="check.hessian takes real x, got complex numbers; split them into real and imaginary parts",
+    ):
+        dp.check.hessian(lambda u: abs(u), 1.0, 1j)
+    with pytest.raises(
+        ValueError,
+        match=r"^check.hessian needs a loss f\(x\) with one value, got several; give gradient=f instead",
+    ):
+        dp.check.hessian(cube, lambda u, v: v, X)
+    with pytest.raises(
+        TypeError,
+        match="the Jacobian takes an array, a sparse matrix, an operator, or a function of x that returns one, got str",
+    ):
+        dp.check.jacobian(cube, "J", X)
