@@ -35,11 +35,11 @@ parser.add_argument("elements", nargs="?", type=int, default=20, help="elements 
 parser.add_argument("--out", type=Path, metavar="FOLDER", help="draw a picture into this folder")
 options = parser.parse_args()
 
-SHARE = 0.5  # of the area that may be filled
-POISSON = 0.3  # Poisson's ratio
-POWER = 3.0  # the penalty of intermediate densities
+VOLUME_FRACTION = 0.5  # the largest one of the material
+POISSON_RATIO = 0.3
+PENALIZATION = 3.0  # the exponent of SIMP, which penalizes intermediate densities
 VOID = 1e-9  # Young's modulus of an empty element; that of a full one is 1
-MOVE = 0.2  # largest change of a density in one iteration
+MOVE_LIMIT = 0.2  # largest change of a density in one iteration
 PUBLISHED = {"sensitivity filter": 216.81, "density filter": 233.71}  # Andreassen et al., 60 x 20 elements
 
 # %%
@@ -57,8 +57,8 @@ width = 3 * height
 mesh = skfem.MeshQuad.init_tensor(np.arange(width + 1.0), np.arange(height + 1.0))
 basis = skfem.Basis(mesh, skfem.ElementVector(skfem.ElementQuad1()))
 
-first_lame = POISSON / (1.0 - POISSON**2)  # of plane stress, where Young's modulus is 1
-shear_modulus = 0.5 / (1.0 + POISSON)
+first_lame = POISSON_RATIO / (1.0 - POISSON_RATIO**2)  # of plane stress, where Young's modulus is 1
+shear_modulus = 0.5 / (1.0 + POISSON_RATIO)
 entries = linear_elasticity(first_lame, shear_modulus).coo_data(basis)
 element = np.arange(entries.data.size) % mesh.nelements  # scikit-fem lists one pair of unknowns after the other
 
@@ -83,8 +83,8 @@ element = element[kept]
 # %%
 # Density and stiffness
 # ---------------------
-# Each element has a density :math:`\rho` between 0 and 1. A layout of full and empty elements is the aim. The
-# **SIMP** law makes intermediate densities unattractive, because they give less stiffness than they cost material:
+# Each element has a density :math:`\rho` between 0 and 1. The aim is a layout of full and empty elements. The **SIMP**
+# law (solid isotropic material with penalization) makes intermediate densities less stiff than the material they take:
 #
 # .. math:: E(\rho) = E_{min} + \rho^3 \, (1 - E_{min}) .
 #
@@ -93,7 +93,7 @@ element = element[kept]
 
 def stiffness(density):
     """Return Young's modulus of each element."""
-    return VOID + (1.0 - VOID) * density**POWER
+    return VOID + (1.0 - VOID) * density**PENALIZATION
 
 
 def displacement(density):
@@ -109,28 +109,28 @@ def compliance(density):
 # %%
 # The derivative
 # --------------
-# For the compliance the adjoint equation is the equation of the beam itself, so that textbooks write
+# The compliance is self-adjoint: the adjoint equation is the equation of the beam itself, so that textbooks write
 #
 # .. math:: \frac{\partial c}{\partial \rho_e} = -3 \, \rho_e^2 \, (1 - E_{min}) \; u_e^T K_e \, u_e .
 #
-# The adjoint solve finds the same, and would also work for any other loss. It uses the factors of the forward solve,
-# and so it costs little.
+# Automatic differentiation gives the same by an adjoint solve, and does so for any other loss. The adjoint solve uses
+# the factors of the forward solve, so that it costs little.
 
-value_and_slope = dp.value_and_grad(compliance)
-even = np.full(mesh.nelements, SHARE)
-c, slope = value_and_slope(even)
+value_and_gradient = dp.value_and_grad(compliance)
+uniform = np.full(mesh.nelements, VOLUME_FRACTION)
+c, gradient = value_and_gradient(uniform)
 
 u = np.zeros(basis.N)
-u[free] = displacement(even)
-of_element = u[basis.element_dofs].T
-energy = np.einsum("ei,eij,ej->e", of_element, entries.tolocal(), of_element)
-by_hand = -POWER * even ** (POWER - 1) * (1.0 - VOID) * energy
+u[free] = displacement(uniform)
+u_of_elements = u[basis.element_dofs].T
+energy = np.einsum("ei,eij,ej->e", u_of_elements, entries.tolocal(), u_of_elements)
+by_formula = -PENALIZATION * uniform ** (PENALIZATION - 1) * (1.0 - VOID) * energy
 
-error = np.max(np.abs(slope - by_hand)) / np.max(np.abs(by_hand))
+error = np.max(np.abs(gradient - by_formula)) / np.max(np.abs(by_formula))
 seconds = solve.info.setup_seconds, solve.info.forward.seconds, solve.info.adjoint.seconds
 print(f"{mesh.nelements} elements, {free.size} unknowns, {unit.size} entries")
 print(f"adjoint against the formula of textbooks: difference {error:.0e}")
-print("derivative against finite differences:", dp.check.gradient(compliance, even, quick=True).verdict)
+print("derivative against finite differences:", dp.check.gradient(compliance, uniform, quick=True).verdict)
 print("factors {:.4f} s, forward solve {:.4f} s, adjoint solve {:.4f} s".format(*seconds))
 
 # %%
@@ -140,14 +140,14 @@ print("factors {:.4f} s, forward solve {:.4f} s, adjoint solve {:.4f} s".format(
 # it. Both published filters are weighted means over the neighbours of an element, up to the distance
 # :math:`r = 0.04` of the width. A neighbour at the distance :math:`d` has the weight :math:`r - d`.
 #
-# - The **sensitivity filter** replaces the slope by a mean of the slopes around. It is a heuristic: the result is not
-#   the derivative of any loss, and so it is of no use to `minimize`.
-# - The **density filter** replaces the density by the mean :math:`\bar\rho = H z` of the unknowns around. The chain
-#   rule does the rest.
+# - The **sensitivity filter** replaces each derivative by a mean of the derivatives of its neighbours. It is a
+#   heuristic: the result is not the gradient of any loss, so that `minimize` cannot use it.
+# - The **density filter** replaces each density by the mean :math:`\bar\rho = H z` of the unknowns of its neighbours.
+#   It is part of the loss, and differentiated with it.
 
-middles = mesh.p[:, mesh.t].mean(axis=1).T
+centres = mesh.p[:, mesh.t].mean(axis=1).T
 radius = 0.04 * width
-tree = cKDTree(middles)
+tree = cKDTree(centres)
 pairs = tree.sparse_distance_matrix(tree, radius, output_type="coo_matrix")
 weights = pairs.copy()
 weights.data = radius - pairs.data
@@ -156,29 +156,30 @@ totals = np.ravel(weights.sum(axis=1))
 average = dp.from_matrix(diags(1.0 / totals) @ weights)
 
 
-def filtered_slope(density, slope):
-    """Return the slope after the sensitivity filter."""
-    return (weights @ (density * slope)) / (totals * np.maximum(density, 1e-3))
+def filtered_gradient(density, gradient):
+    """Return the gradient after the sensitivity filter."""
+    return (weights @ (density * gradient)) / (totals * np.maximum(density, 1e-3))
 
 
 # %%
 # Optimality criteria
 # -------------------
-# At the optimum the slope of the compliance is :math:`-\lambda` times the slope of the volume, in each element that is
-# neither full nor empty. The published loop multiplies each unknown by the square root of the ratio of both, and finds
-# :math:`\lambda` by bisection, such that the volume is right.
+# At the optimum the derivative of the compliance is :math:`-\lambda` times that of the volume, with the Lagrange
+# multiplier :math:`\lambda`, in each element that is neither full nor empty. The published algorithm multiplies each
+# unknown by the square root of the ratio of both sides, and finds the :math:`\lambda` for which the volume is right by
+# bisection.
 
 
-def update(z, slope, volume_slope, volume):
-    """Return the unknowns after one iteration of optimality criteria."""
-    lowest = np.maximum(z - MOVE, 0.0)
-    highest = np.minimum(z + MOVE, 1.0)
+def updated(z, gradient, volume_gradient, volume):
+    """Return the unknowns after one iteration of optimality criteria; ``volume(z)`` returns the volume fraction."""
+    lowest = np.maximum(z - MOVE_LIMIT, 0.0)
+    highest = np.minimum(z + MOVE_LIMIT, 1.0)
     lower, upper = 0.0, 1e9
     while upper - lower > 1e-3 * (upper + lower):
         multiplier = 0.5 * (lower + upper)
-        factor = np.sqrt(-slope / (multiplier * volume_slope))
+        factor = np.sqrt(-gradient / (multiplier * volume_gradient))
         new = np.clip(z * factor, lowest, highest)
-        if volume(new) > SHARE:
+        if volume(new) > VOLUME_FRACTION:
             lower = multiplier
         else:
             upper = multiplier
@@ -187,8 +188,8 @@ def update(z, slope, volume_slope, volume):
 
 def by_sensitivity_filter(z):
     """Return compliance and next unknowns, where the unknowns are the densities."""
-    c, slope = value_and_slope(z)
-    return c, update(z, filtered_slope(z, slope), 1.0, np.mean)
+    c, gradient = value_and_gradient(z)
+    return c, updated(z, filtered_gradient(z, gradient), 1.0, np.mean)
 
 
 def compliance_of_unknowns(z):
@@ -196,24 +197,24 @@ def compliance_of_unknowns(z):
     return compliance(average(z))
 
 
-value_and_slope_of_unknowns = dp.value_and_grad(compliance_of_unknowns)
-volume_slope = average.T(np.ones(mesh.nelements))
+value_and_gradient_of_unknowns = dp.value_and_grad(compliance_of_unknowns)
+volume_gradient = average.T(np.ones(mesh.nelements))
 
 
 def volume(z):
-    """Return the share of the area that is filled."""
+    """Return the volume fraction."""
     return np.mean(average(z))
 
 
 def by_density_filter(z):
     """Return compliance and next unknowns, where the densities are filtered."""
-    c, slope = value_and_slope_of_unknowns(z)
-    return c, update(z, slope, volume_slope, volume)
+    c, gradient = value_and_gradient_of_unknowns(z)
+    return c, updated(z, gradient, volume_gradient, volume)
 
 
 def optimality_criteria(iterate):
     """Iterate until no unknown changes by more than 0.01."""
-    z = even
+    z = uniform
     change = 1.0
     iterations = 0
     while change > 0.01:
@@ -228,44 +229,46 @@ print(f"\n{'':40}compliance  published  iterations  seconds  grey")
 
 
 def report(label, density, c, iterations, seconds, published):
-    """Print one row; `grey` is 0 for a layout of full and empty elements, and 1 for the density 1/2 everywhere."""
+    """Print one row; `grey`, the measure of non-discreteness, is 0 for full and empty elements, 1 for densities 1/2."""
     grey = np.mean(4.0 * density * (1.0 - density))
     print(f"{label:40}{c:10.2f} {published:>10} {iterations:11} {seconds:8.1f} {grey:5.2f}")
 
 
 layouts = {}
 for name, iterate in {"sensitivity filter": by_sensitivity_filter, "density filter": by_density_filter}.items():
-    began = perf_counter()
+    start = perf_counter()
     z, c, iterations = optimality_criteria(iterate)
-    seconds = perf_counter() - began
+    seconds = perf_counter() - start
     density = z if iterate is by_sensitivity_filter else average(z)
     published = PUBLISHED[name] if height == 20 else "-"
     report(f"optimality criteria, {name}", density, c, iterations, seconds, published)
     layouts[f"optimality criteria, {name}"] = density
 
 # %%
-# A general search
-# ----------------
-# The published loop is made for this loss and this constraint. `minimize` takes other losses and other constraints as
-# well. The volume becomes a function that is at most 0 where a layout is allowed. The method of moving asymptotes is
-# the usual one for designs. The augmented Lagrangian also takes many constraints at once, and equalities. A small
-# initial penalty suits designs: with a large one the search follows the constraint in short steps.
+# General methods
+# ---------------
+# Optimality criteria are for this loss and this constraint. `minimize` takes other losses and other constraints as
+# well. The constraint is a function that is <= 0 at a feasible layout. The method of moving asymptotes is the usual one
+# for designs. The augmented Lagrangian also takes many constraints, and equalities. A small initial penalty suits
+# designs: with a large one the search follows the constraint in short steps.
 
-METHODS = {"moving asymptotes": {"method": "mma"}, "augmented Lagrangian": {"method": "augmented_lagrangian"}}
-METHODS["augmented Lagrangian"]["penalty"] = 0.01
+METHODS = {
+    "moving asymptotes": {"method": "mma"},
+    "augmented Lagrangian": {"method": "augmented_lagrangian", "penalty": 0.01},
+}
 
 for name, settings in METHODS.items():
-    began = perf_counter()
+    start = perf_counter()
     best = dp.minimize(
         compliance_of_unknowns,
-        even,
-        constraints=lambda z: volume(z) - SHARE,
+        uniform,
+        constraints=lambda z: volume(z) - VOLUME_FRACTION,
         bounds=(0.0, 1.0),
         maxiter=200,
         tolerance=1e-4,
         **settings,
     )
-    seconds = perf_counter() - began
+    seconds = perf_counter() - start
     density = average(best.x)
     report(f"{name}, density filter", density, best.value, len(best.history) - 1, seconds, "")
     print(f"{'':40}multiplier {best.multipliers:.1f}, volume {np.mean(density):.6f}, {best.evaluations} gradients")
@@ -274,10 +277,10 @@ for name, settings in METHODS.items():
 # %%
 # The picture
 # -----------
-# All layouts are trusses. The density filter leaves grey seams at the edges of bars, which cost stiffness: a full and
-# an empty element cannot be neighbours. The published loop stops when no unknown changes by more than 0.01; the other
-# methods get a little lower. The multiplier says what more material would be worth: the compliance falls by 0.01 times
-# the multiplier if one more percent of the area may be filled.
+# All layouts are trusses. The density filter leaves intermediate densities at the edges of bars, which cost stiffness:
+# a full and an empty element cannot be neighbours. Optimality criteria stop when no unknown changes by more than 0.01;
+# the other methods reach a slightly lower compliance. The multiplier is the sensitivity of the optimum to the
+# constraint: if one more percent of the area may be filled, the compliance decreases by 0.01 times the multiplier.
 #
 # Exercises
 # ---------
@@ -285,14 +288,14 @@ for name, settings in METHODS.items():
 #    so small?
 # 2. Halve the elements (``mbb_beam.py 40``). The radius grows with the width: does the layout change? What happens if
 #    the radius stays at 2.4 elements?
-# 3. Make the deflection of one point small in place of the compliance: replace `load` in `compliance` by another
-#    vector. The formula by hand is wrong now. Which check above says so?
+# 3. Minimize the deflection of one point instead of the compliance: replace `load` in `compliance` by another vector.
+#    The formula of the textbooks is wrong now. Which check above shows this?
 
 if options.out:
     from matplotlib import pyplot
 
     picture, places = pyplot.subplots(len(layouts), 1, figsize=(8, 1.7 * len(layouts)), layout="constrained")
-    column, row = middles.astype(int).T
+    column, row = centres.astype(int).T
     for ax, (title, density) in zip(places, layouts.items()):
         half = np.zeros((height, width))
         half[row, column] = density

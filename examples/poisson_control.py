@@ -2,12 +2,12 @@ r"""
 Optimal control of Poisson's equation
 =====================================
 
-To the exact optimum, and at the same cost on every grid.
+The exact optimum, and a number of iterations that does not grow with the number of cells.
 
-We heat a plate with cold edges, and want a given temperature in it, at a low price for heating. This is the standard
-problem of optimal control. Since both of its terms are quadratic, sine waves solve it one by one, and we can see how
-close to the exact optimum a search with gradients ends. Whether it takes more steps on finer grids depends on one line,
-and for a source that must be smooth on one argument.
+We heat a plate with cold edges so that its temperature is close to a given one, and add a penalty of the heat source
+(Tikhonov regularization). This is the standard problem of optimal control. Both terms are quadratic, and sine waves
+diagonalize them, so that the exact optimum is known. Whether a search takes more iterations on finer grids depends on
+one line, and for a smooth source on one argument.
 
 Run it: ``python examples/poisson_control.py [cells] [--out FOLDER]``
 """
@@ -37,25 +37,26 @@ options = parser.parse_args()
 
 
 class Problem:
-    """One grid and one price of heating."""
+    """The control problem on one grid, for one weight alpha of the penalty."""
 
     def __init__(self, cells, alpha):
         self.grid = dp.Grid((cells, cells), size=1.0)
-        self.h, self.alpha = 1.0 / cells, alpha
+        self.h = 1.0 / cells
+        self.alpha = alpha
         x, y = self.grid.centres()
         self.wanted = x * (1 - x**2) * y**2 * (1 - y)
         self.solve = dp.inverse(-dp.laplacian(self.grid, dp.dirichlet))
 
     def loss(self, v):
-        """The loss of v = h u; see below."""
+        """Return the loss of v = h u; see below."""
         miss = self.h * (self.solve(v / self.h) - self.wanted)
         return 0.5 * np.sum(miss**2) + 0.5 * self.alpha * np.sum(v**2)
 
     def exact(self):
-        """The least loss, by sine modes."""
+        """Return the smallest loss, by sine modes."""
         cells = self.grid.shape[0]
-        line = 4 * cells**2 * np.sin(np.pi * np.arange(1, cells + 1) / (2 * cells)) ** 2
-        mu = line[:, None] + line
+        mu_of_line = 4 * cells**2 * np.sin(np.pi * np.arange(1, cells + 1) / (2 * cells)) ** 2
+        mu = mu_of_line[:, None] + mu_of_line
         modes = self.h * dstn(self.wanted, type=2, norm="ortho")
         return 0.5 * np.sum(self.alpha * mu**2 / (1 + self.alpha * mu**2) * modes**2)
 
@@ -63,17 +64,17 @@ class Problem:
 # %%
 # The one line
 # ------------
-# A search knows nothing of functions; it takes steps in a list of numbers. On a fine grid the numbers of :math:`u` are
-# many and each counts little, :math:`h^2`. In :math:`v = h \, u` the plain sum of squares *is* the norm of the
-# function,
+# A search takes steps in a vector of numbers, with the Euclidean norm. On a fine grid this norm of :math:`u` differs
+# from the norm of the function by the factor :math:`h`. For :math:`v = h \, u` both are equal,
 #
 # .. math:: \sum_i v_i^2 = h^2 \sum_i u_i^2 = |u|^2 ,
 #
-# so that the gradient is the one of the function, on every grid alike.
+# so that the gradient with respect to :math:`v` is the gradient in the function space, on every grid.
 #
 # The exact optimum
 # -----------------
-# For a sine wave, :math:`-\Delta` is a number :math:`\mu`. Each wave :math:`k` of the wanted field then leaves
+# Sine waves are eigenvectors of :math:`-\Delta`, with eigenvalues :math:`\mu`. The wave :math:`k` of the target
+# contributes to the smallest loss
 #
 # .. math:: J_k = \frac{1}{2} \, \frac{\alpha \, \mu_k^2}{1 + \alpha \, \mu_k^2} \, y_{d,k}^2 .
 
@@ -92,14 +93,15 @@ for alpha in (1e-2, 1e-4):
 # %%
 # A smooth source
 # ---------------
-# Now the slopes of the source cost as well:
+# Now the penalty contains the gradient of the source as well:
 #
 # .. math:: \min_u \; \frac{1}{2} \, | y - y_d |^2 + \frac{\alpha}{2} \left( | u |^2 + | \nabla u |^2 \right) .
 #
 # The second term is :math:`u \cdot M u` with :math:`M = h^2 (1 - \Delta)`. On a finer grid a source can be rougher, so
 # that the largest second derivatives of the loss grow with the number of cells, and so does the number of iterations.
-# No factor of :math:`u` helps. But if changes of :math:`u` are measured by the same :math:`M`, the steepest direction
-# is :math:`M^{-1} g` in place of the gradient :math:`g`, and every grid takes the same number of iterations.
+# No factor of :math:`u` prevents this. But in the inner product of :math:`M`, the direction of steepest descent is
+# :math:`-M^{-1} g` in place of :math:`-g` with the gradient :math:`g` (:math:`M^{-1} g` is its Riesz representer), and
+# every grid takes about the same number of iterations.
 
 print()
 print("cells   iterations  in the metric  difference of the losses")
@@ -122,13 +124,13 @@ for cells in (options.cells // 16, options.cells // 8, options.cells // 4, optio
 # %%
 # The picture
 # -----------
-# What is wanted, what comes of it at both prices (dear heat leaves the plate cold), and the iterations for a smooth
-# source.
+# The target, the temperatures that are reached with both weights (a large weight leaves the plate cold), and the
+# iterations for a smooth source.
 #
 # Exercises
 # ---------
 # 1. Search in :math:`u` instead of :math:`v`. How many iterations does each grid take?
-# 2. Heat may not be negative: give `dp.minimize` the `bounds=(0, None)`. Which cells stay off?
+# 2. The source may not be negative: give `dp.minimize` the `bounds=(0, None)`. In which cells is it 0?
 # 3. In the last search write ``method="newton_cg"``, and compare ``best.history[-1].solves``.
 
 if options.out:

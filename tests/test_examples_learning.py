@@ -23,7 +23,7 @@ def test_conductivity_design():
 
 @example("limited_heating.py")
 def test_limited_heating():
-    """The limit is met in each cell, its price is the change of the loss, and p-norms are too strict."""
+    """The limit is met in each cell, the multipliers are the change of the loss, and p-norms are too strict."""
     printed = run("limited_heating.py")
     free, limited, low, high = rows(printed, r"^(\S.*\S) +(\d\.\d+) +(\d\.\d+) +(\d+) +\S+$")
     assert free[2] > 1.3 and abs(limited[2] - 1.0) <= 1e-5 and max(low[2], high[2]) < 1.0
@@ -128,7 +128,7 @@ def test_mbb_beam():
 
 @example("membrane_design.py")
 def test_membrane_design():
-    """The optimality condition of the lowest tone, a cluster that is refused, and both values of it raised alike."""
+    """The optimality condition of the lowest eigenvalue, a cluster that is refused, and both of its values raised alike."""
     printed = run("membrane_design.py")
     heavy, light = map(float, re.search(r"u\^2 up to (\S+) in heavy cells, from (\S+) in light ones", printed).groups())
     assert heavy < light
