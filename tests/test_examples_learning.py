@@ -128,7 +128,7 @@ def test_mbb_beam():
 
 @example("membrane_design.py")
 def test_membrane_design():
-    """The optimality condition of the lowest eigenvalue, a cluster that is refused, and both of its values raised alike."""
+    """The optimality condition of the lowest eigenvalue, and a refused cluster whose values are raised alike."""
     printed = run("membrane_design.py")
     heavy, light = map(float, re.search(r"u\^2 up to (\S+) in heavy cells, from (\S+) in light ones", printed).groups())
     assert heavy < light
