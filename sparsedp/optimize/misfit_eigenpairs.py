@@ -141,15 +141,15 @@ def eigenpairs_of_jacobian(jacobian: NDArray, prior: PriorCovariance, tolerance:
     neglected = rounding if len(rows) else 0.0
     empty = np.zeros((0, prior.size))
     return MisfitEigenpairs(
-        np.concatenate([np.zeros(0), *values]),
-        np.concatenate([empty, *vectors]),
-        np.concatenate([empty, *duals]),
-        float(neglected),
-        0.0,
-        products,
-        "products with the Jacobian",
-        bool(neglected <= tolerance),
-        bool(neglected > tolerance),
+        values=np.concatenate([np.zeros(0), *values]),
+        vectors=np.concatenate([empty, *vectors]),
+        duals=np.concatenate([empty, *duals]),
+        neglected=float(neglected),
+        residual=0.0,
+        products=products,
+        kind="products with the Jacobian",
+        is_complete=bool(neglected <= tolerance),
+        lost_in_rounding=bool(neglected > tolerance),
     )
 
 
@@ -268,10 +268,12 @@ class KrylovSpace:
 
     @property
     def _least_threshold(self):
+        """The threshold without a limit of the number of pairs."""
         return max(self._tolerance, self._rounding)
 
     @property
     def _rounding(self):
+        """The size of rounding errors of eigenvalues."""
         return max(ROUNDING * np.max(np.abs(self.values), initial=0.0), self.asymmetry)
 
     def count_above(self, threshold: float) -> int:
@@ -340,6 +342,7 @@ class KrylovSpace:
         self._update_ritz_pairs()
 
     def _extend_matrix(self, products, place):
+        """Add the columns and rows of a block to the matrix, given its products with H."""
         columns = np.concatenate([block.images @ products.T for block in self._blocks])
         matrix = np.zeros((place.stop, place.stop))
         matrix[: place.start, : place.start] = self.matrix
@@ -351,6 +354,7 @@ class KrylovSpace:
         self.matrix = matrix
 
     def _update_ritz_pairs(self):
+        """Compute the Ritz values and residuals; raise ValueError if H + C^-1 is not positive definite."""
         self.values, self._vectors = np.linalg.eigh(self.matrix)
         if len(self.values) and self.values[0] <= -1:  # eigenvalues are at most as large as Ritz values
             raise ValueError(NEGATIVE.format(self.values[0]))
@@ -436,19 +440,20 @@ class KrylovSpace:
             vectors += weights @ block.images
             start += block.dimension
         return MisfitEigenpairs(
-            self.values[kept],
-            vectors,
-            duals,
-            float(neglected),
-            2 * float(np.linalg.norm(self.residuals[kept])),
-            self.products,
-            "products with the Hessian",
-            bool(neglected <= self._tolerance),
-            bool(self._tolerance < neglected <= self._rounding),
+            values=self.values[kept],
+            vectors=vectors,
+            duals=duals,
+            neglected=float(neglected),
+            residual=2 * float(np.linalg.norm(self.residuals[kept])),
+            products=self.products,
+            kind="products with the Hessian",
+            is_complete=bool(neglected <= self._tolerance),
+            lost_in_rounding=bool(self._tolerance < neglected <= self._rounding),
         )
 
 
 def _symmetric(matrix):
+    """Return the symmetric part of a matrix."""
     return 0.5 * (matrix + matrix.T)
 
 

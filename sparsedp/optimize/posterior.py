@@ -300,6 +300,7 @@ class Posterior(Frozen):
         return facts("posterior of laplace", self._facts())
 
     def _facts(self):
+        """Return the entries of the table as a dict of texts."""
         values = self.eigenvalues
         shown = ", ".join(f"{value:.3g}" for value in values[:SHOWN])
         if len(values) > SHOWN:

@@ -190,6 +190,7 @@ class PriorBlock(Uncached):
             self._check_eigenvalues(tests[0])
 
     def _check_symmetry(self, tests, images):
+        """Raise ValueError if products u . C v and v . C u of test vectors differ."""
         products = tests @ images.T
         # The typical size of u . C v for independent u and v.
         scale = max(map(norm, images)) or 1.0
@@ -198,12 +199,14 @@ class PriorBlock(Uncached):
             raise ValueError(NOT_SYMMETRIC.format(self.name, difference))
 
     def _check_root(self, root, tests, images):
+        """Raise ValueError if products of test vectors with R R^T and with C differ."""
         by_root = _product(root, _product(root.T, tests))
         difference = norm(by_root - images) / (norm(images) or 1.0)
         if not difference <= SYMMETRY:
             raise ValueError(OTHER_ROOT.format(self.name, difference))
 
     def _check_eigenvalues(self, start):
+        """Raise ValueError if C has a negative eigenvalue or is singular, as far as a Lanczos iteration shows."""
         largest, smallest, rounding = self._extreme_eigenvalues(start)
         if smallest < -rounding * abs(largest):
             raise ValueError(INDEFINITE.format(self.name, smallest))
@@ -340,6 +343,7 @@ class PriorCovariance:
 
 
 def _trace(block):
+    """Return the trace of a block: the sum of its variances, or Hutchinson's estimate from random signs."""
     if block.diagonal is not None:
         return float(np.sum(block.diagonal))
     signs = np.random.default_rng(1).choice([-1.0, 1.0], (16, block.size))
@@ -408,5 +412,6 @@ def _checked_root(root, shape):
 
 
 def _check_real(name, op):
+    """Raise TypeError if an operator is complex."""
     if op.dtype.kind == "c":
         raise TypeError(f"{name} has complex entries; laplace takes real unknowns and a real covariance")

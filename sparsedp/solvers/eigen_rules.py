@@ -260,6 +260,8 @@ class EigenProblem:
         return self._refusing_rule(forward, refusal)
 
     def _refusing_rule(self, forward, refusal):
+        """Return ``forward(*values)``, all derivatives of which raise the error of `refusal` unless they are 0."""
+
         def vjp(nums, ans, *values):
             def pull(g):
                 zero = anp.sum(_without_derivative(g, refusal))
@@ -270,6 +272,8 @@ class EigenProblem:
         return _member_rule(forward, vjp, refusal)(*self.coefficients)
 
     def _block_rule(self, cluster):
+        """Return the rule of L, whose derivatives need no solve: dL = V dA V^T - (L N + N L) / 2."""
+
         def forward(*values):
             return np.diag(self.solution(values).spectrum.values[cluster.start : cluster.stop])
 
@@ -292,6 +296,8 @@ class EigenProblem:
         return Rule("eigenpairs", forward, vjp, jvp)
 
     def _vectors_rule(self, cluster):
+        """Return the rule of V, whose derivatives take one solve of the bordered system for each vector."""
+
         def forward(*values):
             return self.solution(values).fields(cluster)
 
@@ -324,6 +330,13 @@ class EigenProblem:
         """Return the rule that maps (data, L, V, *values) to (X, B), the solution of the bordered system.
 
         A row of `data` and of the solution holds a field and m numbers.
+
+        Notes
+        -----
+        The system is A X - L M X - B M V = F, -X M V^T = E, with the data (F, E). For a cotangent S of the solution,
+        the adjoint solution K (Y, C) = S is the cotangent of the data, and the terms -(Y, C) . dK (X, B) are
+
+            (Y (M X)^T) : dL + (B^T Y + C^T X) . M dV - Y . dA X + (L^T Y) . dM X + (B^T Y + C^T X) . dM V .
         """
         name = "eigenpairs, adjoint,"
         weights = self.plain_solution.weights
@@ -340,6 +353,7 @@ class EigenProblem:
             return anp.concatenate([anp.reshape(fields, (len(v), -1)), numbers], axis=1)
 
         def back(params, places, adjoint, s):
+            """Return the cotangents of L, V and the coefficients at `places`."""
             block, v, *values = params
             y, c = self._split(adjoint)
             x, b = self._split(s)
@@ -462,6 +476,7 @@ class EigenSolution:
         return result
 
     def _solve_row(self, cluster, number, field, numbers):
+        """Solve the bordered system of one eigenvalue in the units of the pencil; its set-up is kept."""
         if not np.any(field) and not np.any(numbers):
             return np.zeros_like(field), np.zeros_like(numbers)
         key = cluster, number
@@ -598,6 +613,8 @@ def member_vectors(vectors: Any, refusal: Callable[[], DerivativeError]) -> Any:
 
 
 def _member_rule(forward, vjp, refusal):
+    """Return a rule whose derivatives in forward mode are refused."""
+
     def jvp(nums, tangents, ans, *values):
         raise refusal()
 

@@ -505,6 +505,7 @@ class Eigenpairs:
     # ------------------------------------------------------------ clusters
 
     def _values_of(self, number):
+        """Return the eigenvalues of a cluster, with the derivatives that exist."""
         members = self.clusters[number]
         if self.cut[number]:
             return self._problem.cut_values(members, partial(self._refusal, number))
@@ -516,6 +517,7 @@ class Eigenpairs:
         return member_values(block, partial(self._refusal, number), float(spread))
 
     def _vectors_of(self, number):
+        """Return the eigenvectors of a cluster, with the derivatives that exist."""
         members = self.clusters[number]
         if self.cut[number]:
             return self._problem.cut_vectors(members, partial(self._refusal, number))
@@ -533,8 +535,8 @@ class Eigenpairs:
             gap = float(np.min(np.abs(values - nearest)))
             return DerivativeError(
                 f"pair {members.stop - 1} of eigenpairs has no derivative: its eigenvalue {values[-1]:.10g} differs "
-                f"by {gap:.1e} from {nearest:.10g} of the first pair that was not asked for; ask for another k, so "
-                "that no cluster is cut"
+                f"by {gap:.1e} from {nearest:.10g} of the next pair, which was not computed; write another k, so that "
+                "no cluster is cut"
             )
         gap = float(np.max(np.diff(values)))
         return DerivativeError(

@@ -48,7 +48,7 @@ METHODS = ("auto", "dense", "arpack", "lobpcg")
 DENSE_UP_TO = 512  # unknowns for which "auto" takes LAPACK: 0.1 s
 GENERAL_DENSE_UP_TO = 1024  # the same for operators that are not symmetric: 1 s
 DENSE_AT_MOST = 20_000  # unknowns for which "dense" is accepted: a matrix of 3 GB
-LARGE_SHARE = 4  # "auto" takes LAPACK too where more than one eigenvalue in 4 is asked for
+LARGE_SHARE = 4  # "auto" takes LAPACK too for more than one eigenvalue in 4
 # Distance of the shift from 0 for operators without negative eigenvalues, relative to the mean size of the rows. It is
 # larger where 0 is an eigenvalue and multigrid solves, whose cycles in single precision must see the shift.
 SHIFT = 1e-10
@@ -206,6 +206,7 @@ class Pencil:
         return self._is_symmetric(self._plain_mass, self.weights, self.mass.structure.magnitude())
 
     def _is_symmetric(self, product, weights, magnitude):
+        """Return whether y . w A x and x . w A y are equal for random x and y, relative to their terms."""
         x, y = np.random.default_rng(0).standard_normal((2, self.size))
         x = self.masked(x)
         y = self.masked(y)
@@ -229,9 +230,11 @@ class Pencil:
     # ------------------------------------------------------------ products
 
     def _stiffness(self, x):
+        """Return A x."""
         return self.masked(self.op._acting.product(x))
 
     def _plain_mass(self, x):
+        """Return M x."""
         if self.mass is None:
             return x
         if isinstance(self.mass, Operator):
@@ -487,6 +490,7 @@ def _chosen_method(pencil, settings):
 
 
 def _too_large(n):
+    """Return the error for a full matrix that does not fit into the memory."""
     return ValueError(f"method dense takes up to {DENSE_AT_MOST} unknowns, got {n}; write method='arpack'")
 
 

@@ -244,8 +244,8 @@ def test_messages_of_clusters():
     with pytest.raises(DERIVATIVE, match=message):
         slope(lambda pairs: pairs.values[1], 3)()
     message = (
-        "pair 1 of eigenpairs has no derivative: its eigenvalue .* differs by .* from .* of the first pair that was "
-        "not asked for; ask for another k, so that no cluster is cut"
+        "pair 1 of eigenpairs has no derivative: its eigenvalue .* differs by .* from .* of the next pair, which was "
+        "not computed; write another k, so that no cluster is cut"
     )
     with pytest.raises(DERIVATIVE, match=message):
         slope(lambda pairs: pairs.values[1], 2)()
