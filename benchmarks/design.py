@@ -6,7 +6,8 @@ filled, with the same filter (radius 0.05) and the same penalty (SIMP, power 3) 
 
 - First table: filter and penalty without projection; each method may use N gradients of the loss (200 by default).
 - Second table: five stages of projection with steepness 1 to 16, N / 5 gradients each. Optimality criteria need a
-  small move there: with 0.2 they oscillate.
+  small move there: with 0.2 they oscillate. The augmented Lagrangian is shown with the multipliers 0 at the begin of
+  each stage, and with those of the stage before.
 
 A row: compliance (the mean temperature), share of the plate that is filled, how grey the design is (0: full and empty
 cells only), gradients of the loss, and seconds. SLSQP forms dense matrices: it runs up to 16^2 cells.
@@ -59,8 +60,8 @@ class Plate:
         return np.mean(self.density(z, steepness))
 
 
-def optimality_criteria(plate, z, steepness, gradients, move):
-    """Return the unknowns after the given number of updates, and this number."""
+def optimality_criteria(plate, z, steepness, gradients, multipliers, move):
+    """Return the unknowns after the given number of updates, this number, and None for the multipliers."""
     slope_of_loss = dp.grad(lambda z: plate.compliance(z, steepness))
     slope_of_volume = dp.grad(lambda z: plate.volume(z, steepness))
     for _ in range(gradients):
@@ -75,11 +76,16 @@ def optimality_criteria(plate, z, steepness, gradients, move):
             else:
                 upper = multiplier
         z = new
-    return z, gradients
+    return z, gradients, None
 
 
-def by_minimize(plate, z, steepness, gradients, method, **settings):
-    """Return the unknowns that a method of `minimize` finds, and the number of gradients that it used."""
+def by_minimize(plate, z, steepness, gradients, multipliers, method, continues=False, **settings):
+    """Return the unknowns that a method of `minimize` finds, the number of gradients, and the multipliers.
+
+    If the method continues, it begins with the multipliers of the stage before.
+    """
+    if continues:
+        settings["multipliers"] = multipliers
     best = dp.minimize(
         lambda z: plate.compliance(z, steepness),
         z,
@@ -90,16 +96,18 @@ def by_minimize(plate, z, steepness, gradients, method, **settings):
         callback=lambda record, x: record.evaluations >= gradients,
         **settings,
     )
-    return best.x, best.evaluations
+    return best.x, best.evaluations, best.multipliers
 
 
-def searches(n):
+def searches(n, in_stages):
     """Return the methods that run on this grid, with their settings."""
     found = {
         "mma": {"method": "mma"},
         "augmented_lagrangian": {"method": "augmented_lagrangian"},
         "the same, penalty 0.01": {"method": "augmented_lagrangian", "penalty": 0.01},
     }
+    if in_stages:
+        found["the same, continued"] = {"method": "augmented_lagrangian", "continues": True}
     if n <= LARGEST_FOR_SLSQP:
         found["slsqp"] = {"method": "slsqp"}
     return found
@@ -111,9 +119,10 @@ def row(n, label, stages, gradients, search):
     z = plate.even
     dp.value_and_grad(lambda z: plate.compliance(z, stages[0]))(z)  # compiling is no part of a search
     used = 0
+    multipliers = None
     began = process_time()
     for steepness in stages:
-        z, evaluations = search(plate, z, steepness, gradients // len(stages))
+        z, evaluations, multipliers = search(plate, z, steepness, gradients // len(stages), multipliers)
         used += evaluations
     seconds = process_time() - began
     density = plate.density(z, stages[-1])
@@ -127,7 +136,7 @@ def table(cells, title, stages, gradients, move):
     print(f"\n{title}\n  cells  {'method':22}compliance   volume   grey  gradients  seconds")
     for n in cells:
         row(n, "optimality criteria", stages, gradients, partial(optimality_criteria, move=move))
-        for label, settings in searches(n).items():
+        for label, settings in searches(n, len(stages) > 1).items():
             row(n, label, stages, gradients, partial(by_minimize, **settings))
 
 

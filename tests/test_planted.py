@@ -968,6 +968,18 @@ BUGS = {
         "has_not_fallen and",
         "tests/optimize/test_minimize_constraints.py",
     ),
+    "a penalty that grows after inner searches that have not converged": Bug(
+        "optimize/augmented_lagrangian.py",
+        "is_solved = inaccuracy <= state.accuracy or state.steps < self.inner\n",
+        "is_solved = True\n",
+        "tests/optimize/test_minimize_constraints.py",
+    ),
+    "initial multipliers without their unit": Bug(
+        "optimize/augmented_lagrangian.py",
+        "rows_of_multipliers(self.multipliers) / problem.loss_unit",
+        "rows_of_multipliers(self.multipliers)",
+        "tests/optimize/test_minimize_constraints.py",
+    ),
     "multipliers with the wrong sign": Bug(
         "optimize/constraints.py",
         "function.in_shape(function.cotangent(part)) for",

@@ -128,11 +128,13 @@ class AugmentedLagrangian(ConstrainedMethod):
     penalty : float
         Initial penalty parameter, in units of the loss and of the constraints.
     growth : float
-        Factor of the penalty if the violation has not fallen enough.
+        Factor of the penalty if the violation has not fallen enough from one minimizer to the next.
     inner : int
         Maximum number of steps between two updates of the multipliers.
     memory, line_search
         As for lbfgs.
+    multipliers : tree, optional
+        Multipliers with which the run begins, in the structure of `Minimum.multipliers`. Default: 0.
 
     Notes
     -----
@@ -158,6 +160,7 @@ class AugmentedLagrangian(ConstrainedMethod):
     inner: int = 50
     memory: int = 10
     line_search: int = 20
+    multipliers: Any = None
 
     def __post_init__(self) -> None:
         check_number("penalty of augmented_lagrangian", self.penalty, "> 0", "; the default is 1")
@@ -183,11 +186,11 @@ class AugmentedLagrangian(ConstrainedMethod):
             except NoStepFound as error:
                 return str(error)
             try:
-                run.record(problem.at(state.inner.current.point), self.multipliers(state, problem))
+                run.record(problem.at(state.inner.current.point), self.multipliers_of(state, problem))
             finally:
                 save(state)
 
-    def multipliers(self, state: AugmentedState, problem: ConstrainedProblem) -> NDArray[np.float64]:
+    def multipliers_of(self, state: AugmentedState, problem: ConstrainedProblem) -> NDArray[np.float64]:
         """Return the estimates of the multipliers at the current point, for which no Jacobian is formed."""
         return self.function(state, problem).estimates(problem.at(state.inner.current.point))
 
@@ -198,6 +201,8 @@ class AugmentedLagrangian(ConstrainedMethod):
     def begin(self, problem: ConstrainedProblem) -> AugmentedState:
         """Return the state at the start."""
         multipliers = np.zeros(problem.start.rows.size)
+        if self.multipliers is not None:
+            multipliers = problem.constraints.rows_of_multipliers(self.multipliers) / problem.loss_unit
         first = AugmentedFunction(problem, multipliers, self.penalty).of_point(problem.start)
         inner = self._lbfgs.begin(first)
         return AugmentedState(inner, multipliers, self.penalty, FIRST_ACCURACY, np.inf, 0, 0, first.point)
@@ -250,8 +255,12 @@ class AugmentedLagrangian(ConstrainedMethod):
     def _updated(self, state, problem):
         """Return the state with updated multipliers, and with a larger penalty if the violation has not fallen.
 
-        The penalty stays if the violation is below the inaccuracy of the inner minimization: a larger one would make
-        this minimization still slower.
+        The penalty grows only if two minimizers of augmented Lagrangians, the last with a violation, differ too little.
+        It stays
+
+        - if the step limit has ended the inner minimization: the violation of a point on the way tells nothing,
+        - after the first violation: before, no constraint was active, and their multipliers were 0,
+        - if the violation is below the inaccuracy of the inner minimization, which a larger one would make slower.
         """
         point = problem.at(state.inner.current.point)
         estimates = np.clip(self.function(state, problem).estimates(point), -LARGEST_MULTIPLIER, LARGEST_MULTIPLIER)
@@ -260,14 +269,18 @@ class AugmentedLagrangian(ConstrainedMethod):
         penalty = state.penalty
         inner = state.inner
         inaccuracy = self._inaccuracy(state, problem)
+        is_solved = inaccuracy <= state.accuracy or state.steps < self.inner
         has_not_fallen = violation > SUFFICIENT_DECREASE * state.violation
-        if has_not_fallen and violation > inaccuracy and penalty < LARGEST_PENALTY:
+        if is_solved and has_not_fallen and violation > inaccuracy and penalty < LARGEST_PENALTY:
             penalty *= self.growth
             inner = inner.without_memory()
+        last_violation = state.violation
+        if is_solved and (violation > 0.0 or np.isfinite(last_violation)):
+            last_violation = violation
         accuracy = state.accuracy
         if inaccuracy <= accuracy:
             accuracy = max(ACCURACY_FACTOR * accuracy, LEAST_ACCURACY)
         fruitless = state.fruitless + 1
-        state = AugmentedState(inner, estimates, penalty, accuracy, violation, 0, fruitless, point.z)
+        state = AugmentedState(inner, estimates, penalty, accuracy, last_violation, 0, fruitless, point.z)
         current = self.function(state, problem).of_point(point)
         return state._replace(inner=inner._replace(current=current))

@@ -362,7 +362,7 @@ class ConstrainedMethod(ABC):
     def check_available(self) -> None:  # noqa: B027 most methods need no library
         """Raise ImportError if the library of the method is not installed."""
 
-    def multipliers(self, state: Any, problem: ConstrainedProblem) -> NDArray[np.float64]:
+    def multipliers_of(self, state: Any, problem: ConstrainedProblem) -> NDArray[np.float64]:
         """Return the multipliers that belong to a state; default: a least-squares estimate at the start."""
         return problem.estimated_multipliers(problem.start)
 
@@ -462,7 +462,7 @@ def _check_arguments(method, tolerance, other_arguments):
 def _run(problem, method, run, checkpoints):
     """Start or resume a run, and iterate until it has ended."""
     state = method.begin(problem)
-    multipliers = method.multipliers(state, problem)
+    multipliers = method.multipliers_of(state, problem)
     functions = CheckpointFunctions(problem, multipliers)
     template = None
     if state is not None:
@@ -484,7 +484,7 @@ def _run(problem, method, run, checkpoints):
             state = resumed.state
             best = _best(problem, functions.best.point, functions.best.gradient)
             closest = _best(problem, resumed.closest, resumed.closest_multipliers)
-            last = _best(problem, resumed.current.point, method.multipliers(state, problem))
+            last = _best(problem, resumed.current.point, method.multipliers_of(state, problem))
             problem.objective.count = functions.count
             run.resume_from(last, best, closest)
         run.library_ended(method.run(problem, run, state, save))

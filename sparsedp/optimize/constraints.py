@@ -13,8 +13,8 @@ import scipy.sparse as sp
 
 from sparsedp._utils.base_classes import Frozen
 from sparsedp._utils.calls import wrapped_functions
-from sparsedp._utils.pytree import flatten, labels, leaves, norm, power_of_two
-from sparsedp._utils.validation import check_finite, check_function
+from sparsedp._utils.pytree import flatten, labels, leaves, norm, paired, power_of_two
+from sparsedp._utils.validation import check_finite, check_function, check_kind
 from sparsedp.autodiff.derivative import pullback, push
 from sparsedp.autodiff.flattening import joined
 from sparsedp.autodiff.tape import is_variable, isbox, sample
@@ -168,6 +168,30 @@ class ConstraintFunction:
         y = np.zeros(int(np.prod(self.shape)))
         np.add.at(y, self.index, self.sign * rows)
         return y
+
+    def rows_of_multiplier(self, multiplier: Any, name: str) -> NDArray[np.float64]:
+        """Return the multipliers of the rows, given one of the shape of y: the inverse of `cotangent`.
+
+        Raises
+        ------
+        ShapeError, ValueError, NonFiniteError
+            If the multiplier has another shape, or a sign that no row has, or is not finite.
+        """
+        values = np.asarray(multiplier)
+        check_kind(name, values.dtype, "real numbers")
+        if values.shape != self.shape:
+            raise ShapeError(f"{name} must have the shape {self.shape} of the constraint, got {values.shape}")
+        check_finite(name, values)
+        y = values.astype(float).reshape(-1)
+        rows = self.sign * y[self.index]
+        rows = np.where(self.equality, rows, np.maximum(rows, 0.0))
+        lost = np.abs(self.cotangent(rows) - y) > 0
+        if np.any(lost):
+            raise ValueError(
+                f"{name} contains {y[lost][0]:g}, and no limit there has a multiplier of this sign; those of "
+                "function(x) <= 0 are >= 0"
+            )
+        return rows
 
     def in_shape(self, flat: NDArray[np.float64]) -> Any:
         """Return flat entries in the shape of y; a number if y is a number."""
@@ -345,6 +369,7 @@ class Constraints:
 
     def __init__(self, given: Any, packing: Packing):
         self._packing = packing
+        self._tree = given
         entries: list[Any] = []
         names: list[str] = []
         self._build = None
@@ -396,6 +421,23 @@ class Constraints:
         """
         values = [function.in_shape(function.cotangent(part)) for function, part in self.split(rows / self.unit)]
         return self._in_structure(values)
+
+    def rows_of_multipliers(self, multipliers: Any) -> NDArray[np.float64]:
+        """Return the multipliers of the rows in units, given those in the structure of the argument `constraints`.
+
+        Raises
+        ------
+        TypeError, ShapeError, ValueError, NonFiniteError
+            If there are no constraints, or if a multiplier has another structure, shape or sign or is not finite.
+        """
+        if self._build is None:
+            raise TypeError("multipliers belong to constraints, and there are none; leave multipliers out")
+        entries = paired(multipliers, self._tree, "multipliers", advice="; write them as best.multipliers has them")
+        names = labels(self._tree, "multipliers")
+        parts = [
+            function.rows_of_multiplier(entry, name) for function, entry, name in zip(self._functions, entries, names)
+        ]
+        return joined(parts) * self.unit if parts else np.zeros(0)
 
     def values(self, at_point: ConstraintValues) -> Any:
         """Return the values y at a point in the structure of the argument `constraints`."""

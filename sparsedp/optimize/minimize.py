@@ -205,6 +205,7 @@ def minimize(
         ====================  ===================  =======  ==========================================================
         augmented_lagrangian  penalty              1.0      initial penalty parameter, in units of loss / constraint^2
         augmented_lagrangian  growth               10.0     its factor if the violation has not fallen enough
+        augmented_lagrangian  multipliers          None     initial multipliers, such as best.multipliers of another run
         augmented_lagrangian  inner                50       maximum number of steps between updates of the multipliers
         augmented_lagrangian  memory, line_search  same     as for lbfgs
         mma                   model                "mma"    "mma" (NLopt's LD_MMA), or "quadratic" (LD_CCSAQ)

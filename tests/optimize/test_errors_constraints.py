@@ -153,6 +153,26 @@ WRONG = [
         ValueError,
         "growth of augmented_lagrangian must be > 1, got 1; the default is 10",
     ),
+    (
+        run({"a": above}, multipliers=1.0),
+        ShapeError,
+        "multipliers: expected a dict of a, got an array of shape (); write them as best.multipliers has them",
+    ),
+    (
+        run([above], multipliers=[np.ones(2)]),
+        ShapeError,
+        "multipliers[0] must have the shape () of the constraint, got (2,)",
+    ),
+    (
+        run(above, multipliers=-1.0),
+        ValueError,
+        "multipliers contains -1, and no limit there has a multiplier of this sign; those of function(x) <= 0 are >= 0",
+    ),
+    (
+        run(None, multipliers=1.0),
+        TypeError,
+        "multipliers belong to constraints, and there are none; leave multipliers out",
+    ),
     (lambda: dp.equal(3), TypeError, "equal takes a function, got int; write lambda x: np.sum(x) - 1.0"),
 ]
 

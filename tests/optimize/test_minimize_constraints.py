@@ -12,6 +12,7 @@ import pytest
 from scipy.optimize import Bounds, LinearConstraint, NonlinearConstraint, minimize
 
 import sparsedp as dp
+from sparsedp.optimize.augmented_lagrangian import AugmentedLagrangian
 
 WHOLE = pytest.mark.whole
 METHODS = ["augmented_lagrangian", "slsqp", "trust_constr"]
@@ -554,6 +555,47 @@ def test_unknowns_that_bounds_hold_fixed(method):
     best = dp.minimize(lambda x: anp.sum((x - 2.0) ** 2), start, method, constraints=constraint, bounds=(lower, upper))
     assert best.converged and np.allclose(best.x, [0.5, 0.25, 0.25], atol=1e-6)
     assert np.isclose(best.multipliers, 3.5, atol=1e-6)
+
+
+def test_the_penalty_grows_only_if_minimizers_differ_too_little(monkeypatch):
+    """Not after the first violation, which is the first in which the constraint takes part, and not on the way."""
+    updated = AugmentedLagrangian._updated
+    penalties = []
+
+    def recorded(*args):
+        state = updated(*args)
+        penalties.append(state.penalty)
+        return state
+
+    monkeypatch.setattr(AugmentedLagrangian, "_updated", recorded)
+    loss, limit = lambda x: (x - 1.3) ** 4, lambda x: x - 1.0
+    best = dp.minimize(loss, 0.0, "augmented_lagrangian", constraints=limit)
+    assert best.converged and penalties[:4] == [1.0, 1.0, 1.0, 10.0]
+    best = dp.minimize(loss, 0.0, "augmented_lagrangian", constraints=limit, inner=1)
+    assert best.converged and best.evaluations < 30 and penalties[-1] == 10.0
+    loss, start, bounds, constraints, *_ = HOCK[76]  # where the violation is below the accuracy of the inner search
+    limits = {"bounds": bounds, "constraints": constraints}
+    best = dp.minimize(loss, np.array(start), "augmented_lagrangian", penalty=100.0, **limits)
+    assert best.converged and best.evaluations < 60
+
+
+def test_multipliers_of_another_run():
+    target = np.array([3.0, 2.0, 1.0])
+    constraints = {
+        "cells": lambda x: x - 1.5,
+        "sum": [dp.equal(lambda x: anp.sum(x) - 2.0)],
+        "two": NonlinearConstraint(lambda x: x[:2] * np.array([1.0, -1.0]), [0.0, -0.6], [1.4, -0.5]),
+    }
+
+    def run(method, start, **options):
+        return dp.minimize(lambda x: anp.sum((x - target) ** 2), start, method, constraints=constraints, **options)
+
+    best = run("slsqp", np.ones(3))
+    assert np.allclose(best.x, [1.4, 0.6, 0.0]) and np.allclose(best.multipliers["two"], [1.2, -0.8])
+    again = run("augmented_lagrangian", best.x, multipliers=best.multipliers)
+    assert again.converged and again.history[0].optimality < 1e-6 and len(again.history) < 4
+    for one, other in zip(dp.flatten(again.multipliers)[0], dp.flatten(best.multipliers)[0], strict=True):
+        assert one == pytest.approx(other, abs=1e-6)
 
 
 def test_dependent_constraints_have_multipliers_too():
