@@ -16,7 +16,7 @@ from sparsedp.check.evaluations import EVALUATION_ERRORS, Evaluations, Line
 from sparsedp.check.loss_noise import measure_noise
 from sparsedp.check.overall_verdict import overall_verdict
 from sparsedp.check.point import Point, audit_generator
-from sparsedp.check.step_sizes import COARSER_STEPS, FINER_STEPS, RIPPLE_STEPS, STEPS_BETWEEN
+from sparsedp.check.step_sizes import FINER_STEPS, RIPPLE_STEPS, STEPS_BETWEEN
 from sparsedp.check.thresholds import THRESHOLDS
 
 __all__ = ["RANDOM_DIRECTIONS", "SHIFT", "SHIFT_SEED", "examine_directions", "examine_line", "reclassify_kinks"]
@@ -128,7 +128,7 @@ def examine_line(line: Line, search_ripples: bool = False) -> DirectionEvidence:
         if not evidence.jitter <= THRESHOLDS.rounding_noise:
             line.sweep(FINER_STEPS)
         if not evidence.jitter > THRESHOLDS.rounding_noise:
-            line.sweep(COARSER_STEPS)
+            line.sweep(line.evaluations.coarser_steps)
         extended = weigh(line)
         if not evidence.resolution < extended.resolution:
             evidence = extended

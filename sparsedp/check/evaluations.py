@@ -17,7 +17,7 @@ from sparsedp._utils.validation import advise
 from sparsedp.autodiff.derivative import check_loss
 from sparsedp.autodiff.flattening import joined
 from sparsedp.check.point import Point
-from sparsedp.check.step_sizes import default_steps
+from sparsedp.check.step_sizes import COARSER_STEPS, default_steps
 from sparsedp.check.summary import error_text
 from sparsedp.errors import SparsedpError
 
@@ -65,9 +65,13 @@ class Evaluations:
         The largest relative tolerance of the iterative solves; 0 if there are none.
     step_tolerance : float
         The largest tolerance of time steps with error control; 0 if there are none.
+    coarser_steps : tuple of float
+        Steps that extend a sweep in which rounding errors hide the derivative.
     eps : float
         Machine epsilon of the dtype with the lowest precision that the loss has returned, at least that of float64.
     """
+
+    coarser_steps = COARSER_STEPS
 
     def __init__(
         self,

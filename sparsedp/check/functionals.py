@@ -20,8 +20,13 @@ from sparsedp.check.programs import Program
 __all__ = ["FunctionalEvaluations", "Functionals", "balanced_weights", "leaf_weights"]
 
 
+NOISY_EPS = 100.0  # an entry with more noise than this multiple of its rounding error has a smaller share
+
+
 class FunctionalEvaluations(Evaluations):
     """Evaluations of a functional. The gradient under test is a function of a tree that returns a vector."""
+
+    coarser_steps = ()  # a bounded function looks constant for steps that are much larger than x
 
     def gradient_at(self, tree: Any) -> NDArray[Any]:
         """Return the gradient under test as a vector."""
@@ -127,13 +132,15 @@ def leaf_weights(program: Program, base: NDArray[Any], change: NDArray[Any], rng
 
 
 def balanced_weights(
-    program: Program, base: NDArray[Any], change: NDArray[Any], rng: np.random.Generator
+    program: Program, base: NDArray[Any], change: NDArray[Any], noise: NDArray[Any], rng: np.random.Generator
 ) -> NDArray[Any]:
     """Return random weights with which all entries of the result have about the same share of the functional.
 
-    An error of a small entry is then as visible as that of a large one.
+    An error of a small entry is then as visible as that of a large one. An entry that consists of rounding errors has a
+    small share.
     """
-    sizes = np.maximum(np.abs(base), np.abs(change))
+    sizes = np.where(base == 0, np.abs(change), np.abs(base))
+    sizes = np.maximum(sizes, noise / (NOISY_EPS * program.result.eps))
     typical = np.median(sizes[sizes > 0]) if np.any(sizes) else 1.0
     sizes = np.where(sizes > 0, sizes, typical)
     weights = rng.choice([-1.0, 1.0], base.size) * rng.uniform(0.5, 1.5, base.size)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sparsedp._utils.pytree import norm
+from sparsedp.check.balanced_directions import balanced_direction
 from sparsedp.check.derivative_audit import DerivativeAudit, Group, Options
 from sparsedp.check.directions import examine_line
 from sparsedp.check.evaluations import Evaluations, Level, Line
@@ -94,7 +95,7 @@ class LossHessianAudit(DerivativeAudit):
         test_symmetry(self)
         directions = {"random 1": (first, products[0]), "random 2": (other, products[1])}
         self._examine_lines(self.point, self.base, directions)
-        balanced = self.balanced(np.zeros(self.point.size), None)
+        balanced = balanced_direction(self.point, None, self.options.rng)
         point, base = self.beside()
         name = "balanced" if point is self.point else "balanced, beside x"
         self._examine_lines(point, base, {name: (balanced, self.products(point, balanced))})

@@ -17,7 +17,15 @@ from sparsedp._utils.validation import check_finite
 from sparsedp.autodiff.backend import gathered
 from sparsedp.autodiff.flattening import Packing, joined
 
-__all__ = ["LARGEST_SHARE", "QUICK_DIRECTIONS", "Point", "audit_generator", "is_random", "root_mean_square"]
+__all__ = [
+    "LARGEST_SHARE",
+    "MOST_LEAVES",
+    "QUICK_DIRECTIONS",
+    "Point",
+    "audit_generator",
+    "is_random",
+    "root_mean_square",
+]
 
 MOST_LEAVES = 8  # a tree with more leaves has no separate direction for each leaf
 LARGEST_SHARE = 4.0  # the gradient direction moves an entry by at most this many units

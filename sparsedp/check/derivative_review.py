@@ -1,0 +1,155 @@
+"""Review of an audit of a derivative: what looks like an error, but is a property of the program or of its solves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from sparsedp._utils.pytree import norm
+from sparsedp.check.direction_evidence import CONFIRMING_WORDS, DirectionEvidence
+from sparsedp.check.directions import reclassify_kinks
+from sparsedp.check.evaluations import UNCHANGED
+
+__all__ = ["review"]
+
+WRONG = ("disagrees", "outside")
+UNDECIDED = ("few", "noise", "rough", "masked", "constant")
+ABSOLUTE = "absolute"  # name of directions with steps relative to a whole leaf, if there are relative ones too
+NOT_LINEAR = 1e-2  # a larger gap of a linear combination is an error; a smaller one may be that of an inexact solve
+INEXACT_SHARES = 1e3  # a gap up to this multiple of the gap of linearity may be due to the same inexact solve
+LEAST_INEXACT = 1e-13  # gaps of linearity below this value are rounding errors
+SINGLE_EPS = float(np.finfo(np.float32).eps)
+NUDGE = 1e-10  # relative change of a vector, far below the rounding of single precision
+ROUGH_SHARE = 0.3  # a larger second difference of the derivative is due to rounding
+LONG_SCALE = 2.0**6  # ratio of two steps over which the change of a differentiable function decreases clearly
+CHANGE_SHARE = 0.1
+STAIRS = 2  # number of steps at which a staircase does not change although it should
+CLEAR_OF_ROUNDING = 100.0
+
+
+def review(audit: Any) -> None:
+    """Change words of directions and add findings, if what looks like an error has another explanation.
+
+    Parameters
+    ----------
+    audit : DerivativeAudit
+        Its groups and findings are changed.
+    """
+    for group in audit.groups:
+        for direction in group.directions:
+            if direction.word in WRONG:
+                _find_other_scales(direction)
+    if audit.base.size and np.all(np.isfinite(audit.base)) and audit.pairs:
+        _review_linearity(audit)
+    for group in audit.groups:
+        if group.evaluations.gradient is not None:
+            reclassify_kinks(group.evaluations, group.directions)
+    _drop(audit, "hidden entries", UNDECIDED)  # no difference can show a derivative that changes f so little
+    if audit.has_wide_leaves:
+        _drop_absolute_steps(audit)
+
+
+def _find_other_scales(direction: DirectionEvidence) -> None:
+    """Change the word to "noise" if the function varies on a finer scale than the steps, or is a staircase."""
+    line = direction.line
+    levels = [level for level in line.levels if not level.note and level.step <= direction.step]
+    if len(levels) > 1 and levels[0].step >= LONG_SCALE * levels[-1].step:
+        changes = [max(abs(level.plus - line.base), abs(level.minus - line.base)) for level in levels]
+        if changes[-1] >= CHANGE_SHARE * changes[0] > 0:
+            direction.word = "noise"
+            direction.note = "f varies on a scale below the smallest step: differences see no derivative"
+            return
+    rounding = CLEAR_OF_ROUNDING * line.evaluations.eps * abs(line.base)
+    expected = abs(direction.difference)
+    stairs = [level for level in line.levels if level.note == UNCHANGED and level.step * expected > rounding]
+    if len(stairs) >= STAIRS:
+        direction.word = "noise"
+        direction.note = f"f does not change at all for steps up to {stairs[0].step:.0e}: it is a staircase"
+
+
+def _review_linearity(audit: Any) -> None:
+    """Decide whether a gap of linearity is an error, an inexact solve, or rounding errors.
+
+    If it is an inexact solve or rounding errors, then gaps of the same size along directions are no errors either.
+    """
+    gap = audit.linear_gap
+    if gap <= max(LEAST_INEXACT, 100 * max(audit.point.eps, audit.program.result.eps)):
+        return
+    allowed = audit.allowed(1e-5)
+    suspects = [
+        direction
+        for group in audit.groups
+        for direction in group.directions
+        if direction.word in WRONG and direction.share <= INEXACT_SHARES * gap
+    ]
+    if gap <= allowed and not suspects:
+        return
+    name = audit.kind
+    vector, _ = audit.pairs[0]
+    zero = norm(audit.derivative(0 * vector))
+    if zero:
+        audit.findings.append(("broken", f"{name} is not linear: for a vector of zeros it does not return zeros"))
+        return
+    roughness = _roughness(audit)
+    if roughness > ROUGH_SHARE:
+        if gap > allowed:
+            reason = f"{name} has rounding errors of {gap:.1e}: the problem is too ill-conditioned to tell"
+            audit.findings.append(("unsound", reason))
+        elif suspects:
+            audit.findings.append(("note", f"{name} has the rounding errors of single precision, {gap:.0e}"))
+        return
+    if gap > NOT_LINEAR:
+        argument = {"vjp": "g", "jvp": "t"}[name]
+        audit.findings.append(("broken", f"{name} is not linear in {argument}: it is off by {gap:.1e}"))
+        return
+    for direction in suspects:
+        direction.word = "noise"
+        direction.note = (
+            f"off by {direction.share:.1e}, and {name} is linear only to {gap:.0e}: "
+            "a solve in it may be inexact, tighten its tolerance"
+        )
+    if gap > allowed and not suspects:
+        audit.findings.append(("note", f"{name} is linear only to {gap:.0e}: a solve in it may be inexact"))
+
+
+def _roughness(audit: Any) -> float:
+    """Return the relative size of the second difference of the derivative for a tiny change of its vector.
+
+    It is about 0 for a smooth function of the vector, and about 1 if the results are rounding errors.
+    """
+    if max(audit.point.eps, audit.program.result.eps) > SINGLE_EPS / 2:
+        return 0.0  # every change is rounded
+    vector, _ = audit.pairs[0]
+    change = NUDGE * vector * np.random.default_rng(0).uniform(-1.0, 1.0, vector.size)
+    middle = audit.derivative(vector)
+    ahead = audit.derivative(vector + change) - middle
+    behind = audit.derivative(vector - change) - middle
+    size = max(norm(ahead), norm(behind))
+    return norm(ahead + behind) / size if size else 1.0
+
+
+def _drop_absolute_steps(audit: Any) -> None:
+    """Turn directions with steps relative to a whole leaf into notes, if relative steps decide.
+
+    Where the entries of a leaf differ by many orders of magnitude, a step relative to the largest ones is too large for
+    the small ones. Relative steps decide if they examine all entries.
+    """
+    relative = []
+    for group in audit.groups:
+        relative += [direction for direction in group.directions if not direction.direction.startswith(ABSOLUTE)]
+    if audit.covered == 1 and all(direction.word in CONFIRMING_WORDS for direction in relative):
+        _drop(audit, ABSOLUTE, (*UNDECIDED, *WRONG))
+
+
+def _drop(audit: Any, name: str, words: Sequence[str]) -> None:
+    """Turn directions whose names start with `name` into notes if they have one of some words."""
+    for group in audit.groups:
+        kept = []
+        for direction in group.directions:
+            if direction.direction.startswith(name) and direction.word in words:
+                audit.findings.append(("note", f"along {direction.direction}, not used: {direction.note}"))
+            else:
+                kept.append(direction)
+        group.directions = kept
