@@ -1,6 +1,6 @@
 r"""
-Two weights by cross-validation
-===============================
+Regularization weights by cross-validation
+==========================================
 
 Scattered, noisy data are smoothed with the two weights that predict omitted data best: five folds in one call.
 

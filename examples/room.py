@@ -2,12 +2,11 @@ r"""
 A ventilated room
 =================
 
-An inlet, an outlet and a heated strip, each on a part of a wall; and the air supply that keeps people comfortable.
+An inlet, an outlet and a heated strip, each on part of a wall, and the optimal velocity of the air at the inlet.
 
 Fresh air enters through an opening high in the left wall and leaves through an opening low in the right wall. The sun
 warms a strip of the floor: its temperature varies along the strip and in time. How fast should the air enter, at each
-height of the inlet, so that the lower half of the room has the temperature that people like, with little power of the
-fan?
+height of the inlet, so that the lower half of the room has a comfortable temperature, with little power of the fan?
 
 Run it: ``python examples/room.py [cells] [--out FOLDER]``
 """
@@ -30,31 +29,33 @@ grid = dp.Grid((n, n), size=1.0)
 # %%
 # Conditions on part of a wall
 # ----------------------------
-# `dp.patch` takes the place of the condition of a wall. It holds on an interval of the wall; on the other faces another
-# condition holds, by default `no_slip` for the flow and `neumann` (insulated) for the temperature. The air that enters
-# has the temperature 0, so that the inlet is a patch of `dirichlet` for the temperature.
+# `dp.patch` is written in place of the condition of a wall. It holds on an interval of the wall; on the other faces
+# another condition holds, by default `no_slip` for the flow and `neumann` (insulated) for the temperature. The air that
+# enters has the temperature 0, so that the inlet is a patch of `dirichlet` for the temperature.
 
 inlet = dp.patch((0.7, 0.95), dp.inflow, elsewhere=dp.no_slip)
 outlet = dp.patch((0.05, 0.3), dp.outflow)
 supply = dp.patch((0.7, 0.95), dp.dirichlet, elsewhere=dp.neumann)
 strip = dp.patch((0.25, 0.75), dp.dirichlet)
 
-openings = {"x": (inlet, outlet)}
-warmth = {"x": (supply, dp.neumann), "y": (strip, dp.neumann)}
-walls = dp.lift(grid, warmth).domain
-to_faces = dp.average(grid, warmth)
-print(f"the heat: {dp.laplacian(grid, warmth).name}")
+flow_boundary = {"x": (inlet, outlet)}
+heat_boundary = {"x": (supply, dp.neumann), "y": (strip, dp.neumann)}
+walls = dp.lift(grid, heat_boundary).domain
+to_faces = dp.average(grid, heat_boundary)
+print(f"operator of the heat: {dp.laplacian(grid, heat_boundary).name}")
 
 # %%
 # The equations
 # -------------
-# The temperature :math:`T` is carried and conducted. The velocity :math:`v` is pushed up where the air is warm:
+# The temperature :math:`T` is transported by the velocity :math:`v`, and diffuses. The air rises where it is warm
+# (Boussinesq approximation):
 #
 # .. math:: T_t + v \cdot \nabla T = \kappa \, \Delta T, \qquad
 #           v_t + v \cdot \nabla v = \nu \, \Delta v - \nabla p + T \, e_y, \qquad \nabla \cdot v = 0 .
 #
-# The parameters are the speed at each face of the inlet and the time. Data on the walls are functions of them: one line
-# for the speed along the inlet, one for the temperature along the strip, which the sun passes from left to right.
+# The parameters are the speed at each face of the inlet and the time. Boundary data are functions of the parameters:
+# one line for the speed along the inlet, and one for the temperature along the strip, which the sun warms from left to
+# right.
 
 DT = 0.2 / n
 STEPS = 16 * n
@@ -64,7 +65,7 @@ at_left = grid.face_centres(0)[0] == 0.0  # the x-faces on the left wall
 
 
 def speed_of_inlet(params):
-    """Return a velocity on faces, of which `flow_step` reads those of the inlet."""
+    """Return velocities on all faces; `flow_step` uses only those of the inlet."""
     return grid.join(at_left * inlet.values(grid, "x", params["speed"]), 0.0)
 
 
@@ -84,10 +85,10 @@ step = dp.flow_step(
     DT,
     2e-3,
     buoyancy,
-    boundary=openings,
+    boundary=flow_boundary,
     inflow=speed_of_inlet,
     implicit=True,
-    scalars={"heat": {"diffusivity": 2e-3, "boundary": warmth, "values": temperature_of_walls}},
+    scalars={"heat": {"diffusivity": 2e-3, "boundary": heat_boundary, "values": temperature_of_walls}},
 )
 
 
@@ -100,8 +101,8 @@ def simulate(speed):
 
 
 # %%
-# What enters leaves
-# ------------------
+# Conservation of mass
+# --------------------
 
 first = 0.2 * np.ones(n)
 state = simulate(first)
@@ -113,9 +114,9 @@ print(f"air in {h * np.sum(along_x[0]):.6f}, out {h * np.sum(along_x[-1]):.6f}, 
 # %%
 # The search
 # ----------
-# The loss compares the temperature in the lower half of the room, away from the walls, with 0.2, and adds the power of
-# the fan, which grows with the third power of the speed. One adjoint gives the derivatives with respect to the speed at
-# all faces of the inlet.
+# The loss is the mean square difference of the temperature in the lower half of the room, away from the walls, from
+# 0.2, plus the power of the fan, which grows with the third power of the speed. One backward pass gives the derivatives
+# with respect to the speed at all faces of the inlet.
 
 x, y = grid.centres()
 zone = (x > 0.15) & (x < 0.85) & (y > 0.1) & (y < 0.5)
@@ -130,12 +131,11 @@ def loss(speed):
     return 100 * discomfort + 0.3 * h * np.sum(at_inlet**3)
 
 
-value, gradient = dp.value_and_grad(loss)(first)
+gradient = dp.grad(loss)(first)
 direction = np.cos(3.0 * y[0])
 difference = (loss(first + 1e-4 * direction) - loss(first - 1e-4 * direction)) / 2e-4
 print(f"gradient along a direction {np.sum(gradient * direction):.6f}, by a difference {difference:.6f}")
-found = dp.minimize(loss, first, method="lbfgs", bounds=(0.0, 1.0), maxiter=15)
-best = found.x
+best = dp.minimize(loss, first, method="lbfgs", bounds=(0.0, 1.0), maxiter=15).x
 after = simulate(best)
 print(f"loss {loss(first):.4f} -> {loss(best):.4f}")
 for name, end in (("before", state), ("after", after)):
@@ -146,8 +146,8 @@ for name, end in (("before", state), ("after", after)):
 # %%
 # The picture
 # -----------
-# Left: the temperature and the direction of the air before the search; the openings are green, the strip is red.
-# Middle: after it. Right: the speed along the inlet.
+# Left: the temperature and the streamlines before the search; the openings are green, the strip is red. Middle: the
+# same after the search. Right: the speed along the inlet.
 #
 # Exercises
 # ---------

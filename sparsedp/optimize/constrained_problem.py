@@ -170,6 +170,17 @@ class ConstrainedProblem:
         self._points = [(self.start.z, self.start)]
         return self.start
 
+    @property
+    def limits(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The lower and the upper bounds of z as arrays of shape (n,), infinite where there are none."""
+        shape = self.start.z.shape
+        return np.broadcast_to(self.box.lower, shape), np.broadcast_to(self.box.upper, shape)
+
+    @property
+    def least_rows(self) -> NDArray[np.float64]:
+        """The lower limits of the rows, shape (m,): 0 for equalities, minus infinity for inequalities."""
+        return np.where(self.equality, 0.0, -np.inf)
+
     def at(self, z: NDArray[np.float64]) -> Point:
         """Return the point at z, which is clipped to the bounds. The last points are stored."""
         z = self.box.nearest(z)

@@ -124,15 +124,15 @@ class Ipopt(ConstrainedMethod):
         """Iterate until Ipopt ends; see `ConstrainedMethod`."""
         cyipopt = _cyipopt()
         callbacks = IpoptCallbacks(problem, run)
-        size = problem.start.z.size
+        lower, upper = problem.limits
         count = problem.start.rows.size
         ipopt = cyipopt.Problem(
-            n=size,
+            n=problem.start.z.size,
             m=count,
             problem_obj=callbacks,
-            lb=np.broadcast_to(problem.box.lower, (size,)),
-            ub=np.broadcast_to(problem.box.upper, (size,)),
-            cl=np.where(problem.equality, 0.0, -np.inf),
+            lb=lower,
+            ub=upper,
+            cl=problem.least_rows,
             cu=np.zeros(count),
         )
         for name, value in {**SETTINGS, **(self.settings or {})}.items():

@@ -94,15 +94,23 @@ class Metric(Euclidean):
     ValueError
         If test vectors show that an operator is not symmetric, not positive definite, or singular.
 
-    Notes
-    -----
-    The inverse of each operator is set up once. For an `Inverse`, the operator that it inverts is used for M^-1. An
-    operator on fields acts on each field of a leaf with leading axes.
-
     Attributes
     ----------
     fingerprint : list of arrays
         Products of the operators with test vectors, which identify the metric in a checkpoint.
+
+    Notes
+    -----
+    The derivative of the loss along u is g . u = <M^-1 g, u>, so that M^-1 g is its Riesz representer: the gradient in
+    this inner product, and the direction of steepest ascent. The norm of the representer is sqrt(g . M^-1 g).
+
+    The inverse of each operator is set up once. For an `Inverse`, the operator that it inverts is used for M^-1. An
+    operator on fields acts on each field of a leaf with leading axes.
+
+    References
+    ----------
+    T. Schwedes, D. A. Ham, S. W. Funke, M. D. Piggott, Mesh Dependence in PDE-Constrained Optimisation, Springer, 2017;
+    R. Herzog, K. Kunisch, Algorithms for PDE-constrained optimization, GAMM-Mitteilungen 33, 2010.
     """
 
     def __init__(self, metric: Any, packing: Packing):

@@ -33,9 +33,10 @@ class MMA(ConstrainedMethod):
 
     Notes
     -----
-    In each iteration the loss and the constraints are replaced by convex functions that are sums of functions of one
-    unknown, and the dual of this problem, which has one unknown for each constraint, is solved. The method suits many
-    unknowns with bounds and few constraints. It takes inequalities only.
+    In each iteration the loss and the constraints are replaced by convex separable approximations, sums of functions of
+    one unknown. The dual of this problem has one unknown for each constraint, and is solved by NLopt. The method suits
+    many unknowns with bounds and few constraints. It takes inequalities only. The gradient of each row of the
+    constraints takes one backward pass.
 
     An iteration is an evaluation at a new point, also if the method rejects this point. The multipliers are a
     least-squares estimate from the gradients, because NLopt does not return those of the dual problem.
@@ -73,10 +74,10 @@ class MMA(ConstrainedMethod):
         """Run NLopt from the best point, and return why it has ended by itself."""
         nlopt = _nlopt()
         algorithm = nlopt.LD_MMA if self.model == "mma" else nlopt.LD_CCSAQ
-        size = problem.start.z.size
-        optimizer = nlopt.opt(algorithm, size)
-        optimizer.set_lower_bounds(np.broadcast_to(problem.box.lower, (size,)))
-        optimizer.set_upper_bounds(np.broadcast_to(problem.box.upper, (size,)))
+        lower, upper = problem.limits
+        optimizer = nlopt.opt(algorithm, problem.start.z.size)
+        optimizer.set_lower_bounds(lower)
+        optimizer.set_upper_bounds(upper)
         optimizer.set_xtol_rel(LEAST_STEP)
         optimizer.set_param("dual_algorithm", nlopt.LD_LBFGS)  # needs a quarter of the time of NLopt's default
         optimizer.set_param("dual_maxeval", DUAL_EVALUATIONS)

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import numpy as np
-
 from sparsedp.optimize.constrained_run import ConstrainedMethod
 
 if TYPE_CHECKING:
@@ -31,7 +29,8 @@ class SLSQP(ConstrainedMethod):
 
     References
     ----------
-    D. Kraft, A software package for sequential quadratic programming, DFVLR-FB 88-28, 1988.
+    D. Kraft, A software package for sequential quadratic programming, DFVLR-FB 88-28, 1988; J. Nocedal, S. J. Wright,
+    Numerical Optimization, Springer, 2006, chapter 18.
     """
 
     name: ClassVar[str] = "slsqp"
@@ -40,9 +39,6 @@ class SLSQP(ConstrainedMethod):
         """Iterate until SciPy ends; see `ConstrainedMethod`."""
         from scipy.optimize import Bounds, minimize
 
-        size = problem.start.z.size
-        lower = np.broadcast_to(problem.box.lower, (size,))
-        upper = np.broadcast_to(problem.box.upper, (size,))
         constraints = []
         for kind, rows, sign in (("eq", problem.equality, 1.0), ("ineq", ~problem.equality, -1.0)):
             if not rows.any():
@@ -59,7 +55,7 @@ class SLSQP(ConstrainedMethod):
             problem.start.z,
             method="SLSQP",
             jac=lambda z: problem.functions(z).gradient,
-            bounds=Bounds(lower, upper),
+            bounds=Bounds(*problem.limits),
             constraints=constraints,
             callback=lambda z: run.record(problem.functions(z).usable),
             options={"ftol": ACCURACY, "maxiter": UNLIMITED},

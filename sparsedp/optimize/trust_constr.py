@@ -62,8 +62,7 @@ class TrustConstr(ConstrainedMethod):
         from scipy.optimize import BFGS, Bounds, NonlinearConstraint, minimize
 
         whole_start = problem.start.z
-        lower = np.broadcast_to(problem.box.lower, whole_start.shape)
-        upper = np.broadcast_to(problem.box.upper, whole_start.shape)
+        lower, upper = problem.limits
         moving = lower < upper  # a barrier needs an interior
         if not moving.any():
             return "the bounds allow one point only"
@@ -81,7 +80,7 @@ class TrustConstr(ConstrainedMethod):
             constraints.append(
                 NonlinearConstraint(
                     lambda z: functions(z).rows,
-                    np.where(problem.equality, 0.0, -np.inf),
+                    problem.least_rows,
                     np.zeros(problem.equality.size),
                     jac=lambda z: functions(z).jacobian[:, moving],
                     hess=BFGS(),
