@@ -189,16 +189,17 @@ def laplace(
             advice = "give data with larger standard deviations, or a prior with smaller ones"
         message = NOT_COMPLETE.format(pairs.neglected, reason, 1 + pairs.neglected, advice)
         warnings.warn(message, PosteriorWarning, stacklevel=frames_inside() + 1)
-    posterior = Posterior(
-        x=x,
-        pairs=pairs,
-        prior=covariance,
-        packing=packing,
-        gradient=hessian.gradient,
-        offset=vector - mean,
-        squares=hessian.squares,
-        seconds=perf_counter() - started,
-    )
+    with np.errstate(over="ignore", invalid="ignore"):  # far from the mode the information gain is infinite
+        posterior = Posterior(
+            x=x,
+            pairs=pairs,
+            prior=covariance,
+            packing=packing,
+            gradient=hessian.gradient,
+            offset=vector - mean,
+            squares=hessian.squares,
+            seconds=perf_counter() - started,
+        )
     if posterior.shift > LARGEST_SHIFT:
         warnings.warn(NOT_AT_MODE.format(posterior.shift), PosteriorWarning, stacklevel=frames_inside() + 1)
     return posterior
@@ -253,7 +254,8 @@ def _hessian(misfit, packing, vector, rank):
     is_small = min(count, packing.size) <= rank and (count <= packing.size or count * packing.size <= MOST_ENTRIES)
     linearization = Linearization(misfit, packing, vector, dense=is_small)
     gradient = linearization.vjp(linearization.flat)
-    squares = linearization.flat**2
+    with np.errstate(over="ignore"):  # the mean square is infinite then
+        squares = linearization.flat**2
     if is_small:
         return _Hessian(gradient, squares, jacobian=linearization.jacobian())
 

@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import scipy.linalg
 
+from sparsedp._utils.pytree import norm
 from sparsedp._utils.validation import EPS, check_finite
 from sparsedp.errors import DerivativeError
 
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 
     from sparsedp.optimize.prior_covariance import PriorCovariance
 
-__all__ = ["MisfitEigenpairs", "eigenpairs_of_jacobian", "eigenpairs_of_products"]
+__all__ = ["RESCALE", "MisfitEigenpairs", "eigenpairs_of_jacobian", "eigenpairs_of_products"]
 
 BLOCK = 10  # random samples, and vectors in a block of the Krylov space
 FIRST_BLOCKS = 2  # convergence is not tested before the space has this number of blocks
@@ -468,7 +469,7 @@ def _checked_asymmetry(matrix, scale):
         If the matrix is not finite.
     """
     check_finite("the Hessian of the misfit, in the metric of the prior,", matrix, advice=RESCALE)
-    difference = float(np.linalg.norm(matrix - matrix.T))
+    difference = norm(matrix - matrix.T)  # without squares that overflow
     if difference > ASYMMETRY * scale:
         raise DerivativeError(NOT_SYMMETRIC.format(difference / scale))
     return difference

@@ -12,12 +12,14 @@ import numpy as np
 from sparsedp._utils.base_classes import Frozen
 from sparsedp._utils.calls import frames_inside
 from sparsedp._utils.html import facts
+from sparsedp._utils.pytree import norm, power_of_two
 from sparsedp._utils.validation import check_finite, check_function, check_whole
 from sparsedp.autodiff.derivative import pullback
 from sparsedp.errors import DerivativeError, PosteriorWarning
 from sparsedp.grid.space import Space
 from sparsedp.operators.given import from_functions
 from sparsedp.operators.operator import Operator
+from sparsedp.optimize.misfit_eigenpairs import RESCALE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -117,7 +119,7 @@ class Posterior(Frozen):
             eigenvalues=values.copy(),
             neglected=pairs.neglected,
             error=pairs.neglected + pairs.residual,
-            information_gain=0.5 * float(np.sum(divergence) + max(gradient @ preconditioned, 0.0)),
+            information_gain=0.5 * float(np.sum(divergence) + max(_product(gradient, preconditioned), 0.0)),
             expected_information_gain=0.5 * float(np.sum(np.log1p(values))),
             shift=shift,
             step=_tree(packing, step),
@@ -241,13 +243,14 @@ class Posterior(Frozen):
         if np.iscomplexobj(value):
             raise DerivativeError("std_of takes a real quantity, got a complex one; take its real part")
         check_finite("the quantity of std_of", value)
-        variances = np.zeros(np.size(value))
-        for number in range(variances.size):
-            cotangent = np.zeros(variances.size, np.asarray(value).dtype)
+        deviations = np.zeros(np.size(value))
+        for number in range(deviations.size):
+            cotangent = np.zeros(deviations.size, np.asarray(value).dtype)
             cotangent[number] = 1
             gradient = self._packing.pack_gradient(pull(cotangent.reshape(np.shape(value))))
-            variances[number] = self._variance_along(gradient)
-        deviations = np.sqrt(variances).reshape(np.shape(value))
+            unit = power_of_two(norm(gradient))  # squares of very large or small gradients are not representable
+            deviations[number] = unit * np.sqrt(self._variance_along(gradient / unit))
+        deviations = deviations.reshape(np.shape(value))
         return float(deviations) if deviations.ndim == 0 else deviations
 
     def _variance_along(self, gradient):
@@ -325,6 +328,13 @@ class Posterior(Frozen):
         return entries
 
 
+def _product(u, v):
+    """Return u . v, in which the squares of large and small numbers do not overflow or underflow."""
+    u_unit = power_of_two(norm(u))
+    v_unit = power_of_two(norm(v))
+    return (u / u_unit) @ (v / v_unit) * u_unit * v_unit
+
+
 def _mean_squares(squares, values):
     """Return the mean of the squared residuals, and its expected value."""
     if squares is None or not squares.size:
@@ -374,7 +384,8 @@ def _newton_step(residual, pairs, prior):
     for block, trace in zip(prior.blocks, prior.traces(), strict=True):
         remaining = trace - np.sum(pairs.vectors[:, block.part] ** 2)
         if remaining > 1e-6 * trace:
-            shift = max(shift, np.linalg.norm(others[block.part]) / np.sqrt(remaining))
+            shift = max(shift, norm(others[block.part]) / np.sqrt(remaining))
+    check_finite("the distance of x from the mode", step, advice=RESCALE)
     return step, float(shift)
 
 

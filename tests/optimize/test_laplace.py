@@ -293,6 +293,21 @@ def test_units(unit, rng):
         assert posterior.variance() / unit**2 == pytest.approx(expected.variance(), rel=1e-8)
 
 
+def test_numbers_whose_squares_are_not_representable():
+    """A prior of 1e200, the deviation of a quantity with a gradient of 1e200 or 1e-200, and x 1e160 from the mode."""
+    rows = np.random.default_rng(0).standard_normal((5, 4))
+    mean = np.linalg.solve(rows.T @ rows, rows.T @ np.ones(5))
+    posterior = dp.laplace(lambda x: anp.dot(rows, x) - 1.0, mean, 1e200)
+    covariance = np.linalg.inv(rows.T @ rows)
+    assert np.allclose(posterior.variance(), np.diag(covariance), rtol=1e-9) and posterior.shift < 1e-9
+    for size in (1e-200, 1e200):
+        assert posterior.std_of(lambda x: size * x[1]) == pytest.approx(size * covariance[1, 1] ** 0.5, rel=1e-9)
+    with pytest.warns(dp.errors.PosteriorWarning, match="x is 2.4e\\+160 posterior") as caught:
+        prior = dp.from_matrix(np.eye(4) + 0.3)
+        far = dp.laplace(lambda x: anp.dot(rows[:2], x) - 1.0, np.full(4, 1e160), prior)
+    assert len(caught) == 1 and far.information_gain == np.inf and np.allclose(far.x + far.step, 0.0, atol=1e145)
+
+
 def test_single_precision():
     x = np.zeros(40, np.float32)
     posterior = dp.laplace(lambda x: 3.0 * x[:20], x, 1.0)
