@@ -545,7 +545,7 @@ BUGS = {
     ),
     "an information gain without the distance from the prior mean": Bug(
         "optimize/posterior.py",
-        "np.sum(divergence) + max(gradient @ preconditioned, 0.0)",
+        "np.sum(divergence) + max(_product(gradient, preconditioned), 0.0)",
         "np.sum(divergence)",
         "tests/optimize/test_laplace.py",
     ),
