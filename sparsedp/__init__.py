@@ -155,7 +155,7 @@ _SUGGESTIONS = {  # names that users of other libraries may try, and what to wri
     "write": "dp.save('run.npz', grid, u=u)",
     "zeros": "numpy.zeros(grid.shape): fields are plain arrays",
 }
-_PUBLIC_PACKAGES = ("check", "errors", "interop", "network", "report")
+_PUBLIC_PACKAGES = ("check", "errors", "interop", "network", "report", "testing")
 _CALLED_BY_MISTAKE = ("advection", "optimize")  # internal packages; the error of a call names the right function
 _MODULE_OF = {name: module for module, names in _PUBLIC_NAMES.items() for name in names.split()}
 

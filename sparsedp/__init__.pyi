@@ -3,6 +3,7 @@ from . import errors as errors
 from . import interop as interop
 from . import network as network
 from . import report as report
+from . import testing as testing
 from .advection.transport import transport as transport
 from .autodiff.derivative import grad as grad
 from .autodiff.derivative import hvp as hvp

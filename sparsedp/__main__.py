@@ -104,13 +104,14 @@ def _parser() -> Parser:
 
 
 def run_check(options: argparse.Namespace) -> int:
-    """Check the gradient of a loss that is defined in a file."""
-    from sparsedp.check.gradient_check import gradient
+    """Check the derivative of a function that is defined in a file or a module."""
+    from sparsedp.check.choice import DERIVATIVES, check_derivative
     from sparsedp.report.scene_file import errors_as_value_error, load_scene
 
-    scene = load_scene(options.scene)
+    names = {kind: getattr(options, kind) for kind in DERIVATIVES if getattr(options, kind) is not None}
+    scene = load_scene(options.scene, names)
     with errors_as_value_error(options.scene):
-        audit = gradient(scene.loss, scene.x, quick=options.quick)
+        audit = check_derivative(scene.loss, scene.x, quick=options.quick, **scene.derivatives)
     print(audit)
     return EXIT_CODES[audit.verdict]
 
@@ -178,11 +179,16 @@ class Command(NamedTuple):
 
 
 ARGUMENTS: dict[str, Any] = {
-    "scene": {"help": "FILE.py, FILE.py:loss or FILE.py:loss:start; by default the names are loss, and start or x"},
+    "scene": {"help": "FILE.py, FILE.py:loss, FILE.py:loss:start, or MODULE:loss; default names: loss, and start or x"},
     "--input": {"type": Path, "metavar": "FILE", "help": "a 2-D field as .npy, .npz or .png (default: terrain)"},
     "--size": {"type": int, "default": 64, "metavar": "N", "help": "cells along the longest side (default: 64)"},
     "--out": {"type": Path, "metavar": "DIR", "help": "folder for the results (default: a new folder sparsedp-...)"},
     "--force": {"action": "store_true", "help": "overwrite results of an earlier run"},
+    "--gradient": {"metavar": "NAME", "help": "gradient(x) of the loss, if it is not differentiated by this library"},
+    "--vjp": {"metavar": "NAME", "help": "vjp(x, g): the function may have results of any shape"},
+    "--jvp": {"metavar": "NAME", "help": "jvp(x, t)"},
+    "--jacobian": {"metavar": "NAME", "help": "the Jacobian matrix, or a function J(x) that returns it"},
+    "--hessian": {"metavar": "NAME", "help": "the Hessian of the loss: a matrix, H(x) or H(x, v)"},
     "--quick": {"action": "store_true", "help": "check two directions only, for a loss that takes minutes"},
 }
 COMMANDS = {
@@ -193,9 +199,9 @@ COMMANDS = {
     ),
     "check": Command(
         run_check,
-        "check the gradient of a loss in a file. Exit code: 0 agrees, 1 disagrees, 3 inconclusive, 2 invalid input, "
-        "130 interrupted",
-        ("scene", "--quick"),
+        "check the gradient of a loss in a file or a module, or another derivative of any function. "
+        "Exit code: 0 agrees, 1 disagrees, 3 inconclusive, 2 invalid input, 130 interrupted",
+        ("scene", "--gradient", "--vjp", "--jvp", "--jacobian", "--hessian", "--quick"),
     ),
     "report": Command(
         run_report,

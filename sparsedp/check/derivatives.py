@@ -82,7 +82,7 @@ def vjp(
 
     See Also
     --------
-    check.jvp, check.jacobian, check.gradient
+    check.jvp, check.jacobian, check.gradient, testing.assert_gradient
 
     Examples
     --------

@@ -87,7 +87,8 @@ def gradient(
 
     See Also
     --------
-    value_and_grad, differentiable, certify, stress, v_curve, check.vjp, check.order, check.jit
+    value_and_grad, differentiable, certify, stress, v_curve, check.vjp, check.order,
+    check.jit, testing.assert_gradient
 
     Notes
     -----

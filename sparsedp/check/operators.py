@@ -392,7 +392,7 @@ def transpose(op: Operator, seeds: int = 5, rng: Rng = None) -> Summary:
 
     See Also
     --------
-    check.operator, check.twin
+    check.operator, check.twin, testing.assert_transpose
 
     Notes
     -----

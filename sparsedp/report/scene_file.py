@@ -1,4 +1,4 @@
-"""Load a scene (a loss and a point) from a Python file named on the command line, and create the folder of results.
+"""Load a scene (a loss and a point) from a file or module named on the command line, and create the folder of results.
 
 The user's code may end the process or change its state. While it runs, standard output, ``sys.argv``, ``sys.path`` and
 ``os._exit`` are replaced. They are restored afterwards, also after an error. Only ``python -m sparsedp`` calls the
@@ -8,14 +8,16 @@ functions of this module.
 from __future__ import annotations
 
 import contextlib
+import importlib
 import inspect
 import os
 import re
 import runpy
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import FunctionType
 from typing import Any, NamedTuple, NoReturn
 
 from sparsedp._utils.calls import warn_deprecated
@@ -27,49 +29,65 @@ OPTIONS = ("work_precision", "stress")  # the file may define their arguments as
 
 
 class SceneFile(NamedTuple):
-    """A loss and a point from a file, and arguments for `work_precision` and `stress`.
+    """A loss and a point from a file or a module, its derivatives, and arguments for `work_precision` and `stress`.
 
     Attributes
     ----------
     name : str
-    loss : callable
-        ``loss(x)``.
+    loss : callable or object
+        ``loss(x)``, or an object with the method ``apply(x)``.
     x : tree of arrays
+    derivatives : dict
+        The objects that `derivatives` of `load_scene` names.
     options : dict
         Dict of arguments for "work_precision" and "stress".
     """
 
     name: str
-    loss: Callable[[Any], Any]
+    loss: Any
     x: Any
+    derivatives: dict[str, Any]
     options: dict[str, dict[str, Any]]
 
 
-def load_scene(target: str) -> SceneFile:
-    """Run a file once, as a module, and return the scene that it defines. Its output is redirected to stderr.
+def load_scene(target: str, derivatives: Mapping[str, str] | None = None) -> SceneFile:
+    """Run a file once, or import a module, and return the scene that it defines. Its output is redirected to stderr.
 
     Parameters
     ----------
     target : str
-        ``FILE.py[:loss[:start]]``. The default name of the loss is `loss`, and the default name of the point
-        is `start` or `x`. If the loss takes several arguments, the point is the tuple of arguments. The file may also
-        define the dicts
+        ``FILE.py[:loss[:start]]`` or ``MODULE:loss[:start]``. The default name of the loss is `loss`, and the default
+        name of the point is `start` or `x`. If the loss takes several arguments, the point is the tuple of arguments.
+        If the point is a function, its result is the point. The file may also define the dicts
         `work_precision_options` (problem, methods, ...) and `stress_options` (ranges, step, ...).
+    derivatives : mapping, optional
+        Names in the file by what they are: "gradient", "vjp", "jvp", "jacobian" or "hessian".
 
     Raises
     ------
     ValueError
-        If the file does not exist or raises an error, or if a name is missing.
+        If the file or module does not exist or raises an error, or if a name is missing.
     """
     parts = re.fullmatch(r"(.+\.py)(?::([^:]+))?(?::([^:]+))?", target)
-    if parts is None:
-        raise ValueError(f"{target!r} names no scene; write FILE.py:loss, or FILE.py:loss:start")
+    module = re.fullmatch(r"([\w.]+):([^:]+)(?::([^:]+))?", target)
+    if parts is not None:
+        names = _run(Path(parts[1]))
+    elif module is not None:
+        parts = module
+        names = _import(module[1])
+    else:
+        raise ValueError(f"{target!r} names no scene; write FILE.py:loss, FILE.py:loss:start, or MODULE:loss")
     file = Path(parts[1])
     loss_name = parts[2] or "loss"
     point_names = (parts[3],) if parts[3] else POINT_NAMES
-    names = _run(file)
-    if not callable(names.get(loss_name)):
+    loss = names.get(loss_name)
+    if not callable(loss) and not hasattr(loss, "apply"):
         raise ValueError(f"{file} has no function {loss_name!r}; write {file}:NAME of the function to examine")
+    chosen = {}
+    for kind, name in (derivatives or {}).items():
+        if name not in names:
+            raise ValueError(f"{file} has no {name!r}; write --{kind} NAME with a name that it defines")
+        chosen[kind] = names[name]
     point_name = next((name for name in point_names if name in names), None)
     if point_name is None:
         expected = " or ".join(point_names)
@@ -89,12 +107,26 @@ def load_scene(target: str) -> SceneFile:
     else:
         name = f"{file.stem}-{loss_name}"
     point = names[point_name]
-    return SceneFile(name, _with_one_argument(names[loss_name], point), point, options)
+    if isinstance(point, FunctionType):
+        with errors_as_value_error(file=f"{file}:{point_name}"):
+            point = point()
+    return SceneFile(name, _with_one_argument(loss, point), point, chosen, options)
 
 
-def _with_one_argument(loss: Callable[..., Any], point: Any) -> Callable[[Any], Any]:
+def _import(module: str) -> dict[str, Any]:
+    """Import a module, from the current folder or an installed package, and return its global names."""
+    path = sys.path
+    sys.path = [os.getcwd(), *path]
+    try:
+        with errors_as_value_error(file=module):
+            return vars(importlib.import_module(module))
+    finally:
+        sys.path = path
+
+
+def _with_one_argument(loss: Any, point: Any) -> Any:
     """Return a loss as a function of one argument. A point that is a tuple is unpacked if the loss takes several."""
-    if not isinstance(point, tuple):
+    if not isinstance(point, tuple) or not callable(loss):
         return loss
     try:
         inspect.signature(loss).bind(None)

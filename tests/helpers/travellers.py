@@ -336,6 +336,7 @@ NOTHING_TO_CALL = {
     "eigenpairs",
     "check",
     "errors",
+    "testing",
     "report",
     "vjp",
     "jvp",

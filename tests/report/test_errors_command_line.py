@@ -176,8 +176,84 @@ def test_as_a_command(scene):
     assert done.returncode == 3 and "verdict: inconclusive" in done.stdout
 
 
+FOREIGN = """
+import numpy as np
+
+
+def start():
+    return np.linspace(1.0, 2.0, 5)
+
+
+def cube(u):
+    return u**3
+
+
+def cube_vjp(u, g):
+    return 3 * u**2 * g
+
+
+def cube_jvp(u, t):
+    return 3 * u * t
+
+
+def jacobian(u):
+    return np.diag(3 * u**2)
+
+
+def total(u):
+    return float(np.sum(u**3))
+
+
+def slope(u):
+    return 3 * u**2
+
+
+def bend(u, v):
+    return 6 * u * v
+
+
+class Simulator:
+    apply = staticmethod(cube)
+    vjp = staticmethod(cube_vjp)
+
+
+simulator = Simulator()
+"""
+FOREIGN_CHECKS = [
+    ("cube --vjp cube_vjp", "agrees"),
+    ("cube --jvp cube_jvp", "disagrees"),
+    ("cube --vjp cube_vjp --jvp cube_jvp", "disagrees"),
+    ("cube --jacobian jacobian", "agrees"),
+    ("total --gradient slope --quick", "agrees"),
+    ("total --hessian bend --gradient slope", "agrees"),
+    ("simulator", "agrees"),
+]
+
+
+@pytest.mark.parametrize("words, verdict", FOREIGN_CHECKS)
+def test_derivatives_of_functions_of_a_module(tmp_path, monkeypatch, capsys, words, verdict):
+    (tmp_path / "some_model.py").write_text(FOREIGN, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "some_model", raising=False)
+    name, *options = words.split()
+    assert main(["check", f"some_model:{name}", *options]) == {"agrees": 0, "disagrees": 1}[verdict]
+    assert f"verdict: {verdict}" in capsys.readouterr().out
+    assert main(["check", f"some_model.py:{name}", *options]) == {"agrees": 0, "disagrees": 1}[verdict]
+
+
+def test_a_derivative_that_is_not_there(tmp_path, monkeypatch, capsys):
+    (tmp_path / "some_model.py").write_text(FOREIGN, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    assert main(["check", "some_model.py:cube", "--vjp", "pull"]) == 2
+    assert "some_model.py has no 'pull'; write --vjp NAME with a name that it defines" in capsys.readouterr().err
+    assert main(["check", "no_model:cube"]) == 2
+    assert "no_model does not run: ModuleNotFoundError: No module named 'no_model'" in capsys.readouterr().err
+    assert main(["check", "some_model.py:cube", "--vjp", "cube_vjp", "--gradient", "slope"]) == 2
+    assert "one derivative is checked at a time, got gradient and vjp" in capsys.readouterr().err
+
+
 REFUSALS = [
-    ("poisson", "'poisson' names no scene; write FILE.py:loss, or FILE.py:loss:start"),
+    ("poisson", "'poisson' names no scene; write FILE.py:loss, FILE.py:loss:start, or MODULE:loss"),
     ("none.py", "there is no file none.py; name one that is there"),
     ("poisson.py:nothing", "poisson.py has no function 'nothing'; write poisson.py:NAME of the function to examine"),
     ("poisson.py:start", "poisson.py has no function 'start'; write poisson.py:NAME of the function to examine"),
@@ -400,7 +476,7 @@ LONG = "a" * 5000
 @pytest.mark.parametrize(
     "arguments, sentence",
     [
-        (["check", LONG], r"'a+\.\.\. names no scene; write FILE.py:loss, or FILE.py:loss:start"),
+        (["check", LONG], r"'a+\.\.\. names no scene; write FILE.py:loss, FILE.py:loss:start, or MODULE:loss"),
         (["check", f"{LONG}.py"], r"there is no file a+\.\.\. name one that is there"),
         (["check", f"scene.py:{LONG}"], r"scene.py has no function 'a+\.\.\. write scene.py:NAME of the function to e"),
         (["check", f"scene.py:loss:{LONG}"], r"scene.py has no 'a+\.\.\. the point; write scene.py:loss:NAME"),

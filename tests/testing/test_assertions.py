@@ -1,0 +1,107 @@
+"""`assert_gradient`, `assert_transpose` and the strategies, used by functions that know nothing of this library."""
+
+import autograd.numpy as anp
+import hypothesis
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from scipy.sparse.linalg import aslinearoperator
+
+import sparsedp as dp
+from sparsedp.testing import assert_gradient, assert_transpose, fields, grids
+
+X = np.linspace(1.0, 2.0, 5)
+
+
+def cube(u):
+    return np.sum(u**3)
+
+
+RIGHT = {
+    "loss on the tape": (lambda u: anp.sum(u**3), {}),
+    "gradient": (cube, {"gradient": lambda u: 3 * u**2}),
+    "value of the gradient": (cube, {"gradient": 3 * X**2}),
+    "vector function on the tape": (lambda u: u**3, {}),
+    "vjp": (np.exp, {"vjp": lambda u, g: np.exp(u) * g}),
+    "jvp": (np.exp, {"jvp": lambda u, t: np.exp(u) * t}),
+    "vjp and jvp": (np.exp, {"vjp": lambda u, g: np.exp(u) * g, "jvp": lambda u, t: np.exp(u) * t}),
+    "jacobian": (np.exp, {"jacobian": sp.diags_array(np.exp(X))}),
+    "hessian": (cube, {"hessian": np.diag(6 * X)}),
+    "gradient and hessian": (cube, {"gradient": lambda u: 3 * u**2, "hessian": lambda u, v: 6 * u * v}),
+}
+
+
+@pytest.mark.parametrize("name", RIGHT)
+def test_right_derivatives_pass(name):
+    f, derivatives = RIGHT[name]
+    assert assert_gradient(f, X, **derivatives)
+
+
+WRONG = {
+    "gradient": (cube, {"gradient": lambda u: 3.01 * u**2}),
+    "vjp": (np.exp, {"vjp": lambda u, g: u * g}),
+    "jvp": (np.exp, {"jvp": lambda u, t: u * t}),
+    "jacobian": (np.exp, {"jacobian": np.diag(X)}),
+    "hessian": (cube, {"hessian": np.diag(X)}),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_derivatives_are_named(name):
+    f, derivatives = WRONG[name]
+    with pytest.raises(AssertionError, match=f"^the {name} disagrees: "):
+        assert_gradient(f, X, **derivatives)
+
+
+def test_a_wrong_entry_is_named():
+    def gradient(u):
+        return np.where(np.arange(5) == 2, 0.9, 1.0) * 3 * u**2
+
+    with pytest.raises(AssertionError, match=r"\n  largest gap: x\[2\]: 6\.75 by differences, 6\.075 by the gradient$"):
+        assert_gradient(cube, X, gradient=gradient)
+    with pytest.raises(AssertionError, match="\n  direction .*\n(.*\n)*verdict: disagrees"):  # with the tables
+        assert_gradient(cube, X, gradient=gradient, quick=False)
+
+
+def test_an_inconclusive_check_fails_unless_it_is_allowed():
+    def loss(u):
+        return np.sum(np.abs(u))
+
+    with pytest.raises(AssertionError, match="^the gradient is inconclusive: along random 1: a kink: "):
+        assert_gradient(loss, np.zeros(3), gradient=np.sign)
+    result = assert_gradient(loss, np.zeros(3), gradient=np.sign, allow_inconclusive=True)
+    assert result.verdict == "inconclusive"
+    with pytest.raises(AssertionError, match="^the gradient disagrees"):  # a wrong one is not excused
+        assert_gradient(loss, X, gradient=lambda u: 2 * np.sign(u), allow_inconclusive=True)
+
+
+# ---- transposes ------------------------------------------------------------------------------------------------------
+
+
+def test_transposes_of_operators_and_functions():
+    matrix = np.arange(12.0).reshape(3, 4)
+    assert assert_transpose(dp.gradient(dp.Grid((3, 4)), dp.dirichlet))
+    assert assert_transpose(aslinearoperator(matrix))
+    assert assert_transpose(lambda u: matrix @ u, lambda g: matrix.T @ g, shape=4)
+    with pytest.raises(AssertionError, match="^the transpose disagrees: transpose, float64"):
+        assert_transpose(lambda u: matrix @ u, lambda g: 1.001 * (matrix.T @ g), shape=4)
+
+
+# ---- strategies ------------------------------------------------------------------------------------------------------
+
+
+@hypothesis.settings(max_examples=10)
+@hypothesis.given(grids(max_dimensions=2, max_cells=4, periodic=False), hypothesis.strategies.data())
+def test_strategies_with_an_operator(grid, data):
+    assert grid.periodic == (False,) * grid.dim and max(grid.shape) <= 4
+    field = data.draw(fields(grid.cells, max_magnitude=3.0))
+    assert field.shape == grid.shape and field.dtype == float and np.max(np.abs(field)) <= 3.0
+    constant = dp.gradient(grid, dp.neumann)(np.ones(grid.shape))
+    assert not np.any(constant)
+
+
+def test_simple_examples_come_first():
+    assert hypothesis.find(grids(), lambda grid: True) == dp.Grid(1, size=1.0)
+    assert not np.any(hypothesis.find(fields((2, 3)), lambda field: True))
+    field = hypothesis.find(fields(4, complex), lambda field: np.any(field.imag))
+    assert field.shape == (4,) and field.dtype == complex
