@@ -13,6 +13,9 @@ INLET = dp.patch([False, True, True, False, False], dp.inflow)
 OUTLET = dp.patch([True, True, False, False, False], dp.outflow)
 CEILING = dp.patch([False, False, True, False], dp.outflow, elsewhere=dp.free_slip)
 SIDES = {"x": (INLET, OUTLET), "y": (dp.no_slip, CEILING)}
+CLOSED_IN_PART = dp.patch([True, False, False, True], dp.inflow, elsewhere=dp.free_slip)
+CLOSED_OR_OPEN = dp.patch([False, True, True, False, False], dp.outflow, elsewhere=dp.free_slip)
+INLET_POINTS = np.array([0.0, 0.3, 0.5, 0.4, 0.0, 0.0])  # tangential velocities on the wall with the inlet
 # The condition of each face of each wall: i inflow, o outflow, n no_slip, f free_slip.
 WALLS = {(0, 0): "niinn", (0, 1): "oonnn", (1, 0): "nnnn", (1, 1): "ffof"}
 
@@ -184,9 +187,6 @@ def test_projection_by_transforms_knows_where_a_wall_is_open(rng):
     assert dp.check.operator(P)
 
 
-CLOSED_IN_PART = dp.patch([True, False, False, True], dp.inflow, elsewhere=dp.free_slip)
-
-
 def test_mass_that_enters_leaves_through_the_opening(rng):
     v = dp.projection(BOX, boundary=SIDES)(rng.standard_normal(BOX.faces.size))
     left, right = (BOX.split(v)[0][i] for i in (0, -1))
@@ -223,7 +223,6 @@ def test_rules_for_openings():
         dp.flow_step(BOX, 0.1, 0.01, boundary={"x": CLOSED_OR_OPEN, "y": dp.free_slip}, walls=np.ones(BOX.faces.size))
 
 
-CLOSED_OR_OPEN = dp.patch([False, True, True, False, False], dp.outflow, elsewhere=dp.free_slip)
 ROOM = dp.Grid((6, 6), size=1.0)
 ROOM_SIDES = {"x": (dp.patch((0.5, 0.85), dp.inflow), dp.patch((0.0, 0.35), dp.outflow))}
 HEATER = dp.patch((0.3, 0.7), dp.dirichlet)
@@ -299,9 +298,6 @@ def test_tangential_velocities_at_an_inlet_are_read_from_both_forms(rng):
     np.testing.assert_allclose(*results, rtol=1e-12, atol=1e-13)
     at_rest = dp.flow_step(BOX, 0.01, 0.01, boundary=SIDES)
     assert np.max(np.abs(at_rest(at_rest.start(v))["v"] - results[0])) > 1e-4
-
-
-INLET_POINTS = np.array([0.0, 0.3, 0.5, 0.4, 0.0, 0.0])
 
 
 def test_the_force_on_all_cells_is_the_momentum_that_enters_through_the_walls(rng):
