@@ -6,6 +6,9 @@ With A = shift - D diag(k) G and A x = b, one adjoint solve A^T y = g serves all
 
     cotangent of b: y,    of shift: -y * x (its sum where shift is one number),    of k: (D^T y) * (G x).
 
+In a batch of systems this holds for each entry, with one adjoint solve for each. The cotangent of an argument without
+the leading axis, which is the same for all entries, is the sum over the entries.
+
 A matrix with the entries k at the places (i, j) of a fixed pattern is of that form too: D = -R^T and G = C, where R
 and C pick the value at the row and at the column of each entry. The cotangent of an entry is -y_i x_j, and only the
 places of the pattern are visited.
