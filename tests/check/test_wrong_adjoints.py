@@ -1,0 +1,142 @@
+"""The collection of wrong and right derivatives: what is known of each, and the verdicts of `check.vjp`."""
+
+import re
+
+import numpy as np
+import pytest
+from true_derivatives import true_vjp
+
+import sparsedp as dp
+from benchmarks.wrong_adjoints import RIGHT, WRONG
+from sparsedp._utils.pytree import leaves, mapped
+
+SAMPLE = {
+    "cold walls",
+    "inflow",
+    "predators and prey",
+    "dense layer",
+    "linearized once",
+    "concentrations of many decades",
+    "large offset",
+    "results in one buffer",
+    "counts and rates",
+    "complex polynomial",
+}
+# Errors of right derivatives that are larger than those of rounding in double precision.
+TOLERANCES = {"diffusion in single precision": 1e-6, "fixed point at 1e 8": 1e-8, "bisection at 1e 8": 1e-8}
+
+
+def marked(cases):
+    """Return the parameters of a sample."""
+    return [pytest.param(case, id=case.name) for case in cases if case.name in SAMPLE]
+
+
+def moved(x, share):
+    """Return x with all floating entries changed by up to a share."""
+
+    def of_leaf(leaf):
+        array = np.array(leaf)
+        if array.dtype.kind not in "fc":
+            return array
+        factors = 1 + share * np.cos(np.arange(array.size)).reshape(array.shape)
+        return (array * factors).astype(array.dtype)
+
+    return mapped(of_leaf, x)
+
+
+def weights_of(y):
+    """Return random numbers in the structure of a result."""
+    rng = np.random.default_rng(0)
+
+    def of_leaf(leaf):
+        array = np.asarray(leaf)
+        weights = rng.normal(size=array.shape)
+        if array.dtype.kind == "c":
+            weights = weights + 1j * rng.normal(size=array.shape)
+        return weights.astype(array.dtype)
+
+    return mapped(of_leaf, y)
+
+
+def copies(tree):
+    return mapped(np.array, tree)
+
+
+def relative_errors(case):
+    """Return for each leaf of x the largest relative errors of the VJP at two points, after runs at other points."""
+    program = case.program()
+    errors = []
+    for x in (program.x, moved(program.x, 1e-3)):
+        g = weights_of(copies(program.f(x)))
+        program.f(moved(x, 2e-3))
+        if case.is_wrong:
+            program.vjp(x, copies(g))  # a buffer that is not cleared shows in the second run
+        found = leaves(copies(program.vjp(x, copies(g))))
+        right = true_vjp(case.name, program.f, x, g)
+        sizes = [np.maximum(np.abs(part), 1e-14 * np.max(np.abs(part), initial=0.0)) + 1e-307 for part in right]
+        errors.append([np.abs(a - b) / size for a, b, size in zip(found, right, sizes)])
+    return [np.maximum(first, second) for first, second in zip(*errors)]
+
+
+def wrong_entries(case, x):
+    """Return for each leaf of x whether its entries are wrong, as the collection says."""
+    masks = []
+    is_dict = isinstance(x, dict)
+    for name, leaf in x.items() if is_dict else [("", x)]:
+        mask = np.zeros(np.shape(leaf), dtype=bool)
+        index = case.entries.get(name, ()) if is_dict and case.entries is not ... else case.entries
+        if not (isinstance(index, tuple) and index == ()):
+            mask[index] = True
+        masks.append(mask)
+    return masks
+
+
+def test_there_are_fifty_of_each():
+    assert len(WRONG) == len(RIGHT) == 50
+    assert len({case.name for case in WRONG + RIGHT}) == 100
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("case", WRONG, ids=lambda case: case.name)
+def test_exactly_the_entries_of_the_collection_are_wrong(case):
+    with np.errstate(all="ignore"):
+        errors = relative_errors(case)
+    for error, mask in zip(errors, wrong_entries(case, case.program().x)):
+        np.testing.assert_array_equal(error > 1e-9, mask)
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("case", RIGHT, ids=lambda case: case.name)
+def test_right_derivatives_are_right_to_rounding(case):
+    with np.errstate(all="ignore"):
+        errors = relative_errors(case)
+    assert max(np.max(error, initial=0.0) for error in errors) <= TOLERANCES.get(case.name, 3e-14)
+
+
+def check(case):
+    program = case.program()
+    return dp.check.vjp(program.f, program.vjp, program.x)
+
+
+@pytest.mark.parametrize("case", marked(WRONG))
+def test_wrong_derivatives_disagree(case):
+    """The verdict comes with entries that are wrong."""
+    result = check(case)
+    assert result.verdict == "disagrees", result
+    x = case.program().x
+    masks = wrong_entries(case, x)
+    names = [f"x['{name}']" for name in x] if isinstance(x, dict) else ["x"]
+    assert bool(result.gaps) == any(map(np.any, masks))
+    for gap in result.gaps:
+        every, name, index = re.match(r"(every entry of )?(x(?:\['\w+'\])?)((?:\[[\d, ]+\])?)", gap).groups()
+        mask = masks[names.index(name)]
+        place = tuple(map(int, re.findall(r"\d+", index)))
+        assert np.all(mask[place]) if every is None else np.all(mask), gap
+
+
+@pytest.mark.parametrize("case", marked(RIGHT))
+def test_right_derivatives_agree(case):
+    """Some cannot be decided by values of f: there the collection says why, and "inconclusive" is right too."""
+    result = check(case)
+    allowed = ("agrees", "inconclusive") if case.undecidable else ("agrees",)
+    assert result.verdict in allowed, result
