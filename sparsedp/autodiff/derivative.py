@@ -75,7 +75,7 @@ __all__ = [
 # Exceptions of `pushforward` if a rule of this library or of autograd has no JVP.
 NO_JVP = (DerivativeError, NotImplementedError)
 # Advice for a gradient of the wrong shape.
-SPREAD = ": autograd's np.where does not add up what it spreads; multiply by the condition instead, a * c + b * (1 - c)"
+WRONG_SHAPE = "; in the defvjp of a function, add up the cotangents of an argument that broadcasting repeats"
 LARGE = 1e100  # a larger cotangent can overflow in a call whose own derivative is finite
 
 # ---- gradients -------------------------------------------------------------------------------------------------------
@@ -374,7 +374,7 @@ def gradient_of(leaf: Any, cotangent: Any) -> Any:
     """Convert a cotangent to the shape, dtype and type of a leaf; return zeros if the cotangent is None."""
     if cotangent is None:
         return _as_leaf(anp.zeros_like(sample(leaf)), leaf)
-    check_shape("the gradient", cotangent, np.shape(leaf), SPREAD)
+    check_shape("the gradient", cotangent, np.shape(leaf), WRONG_SHAPE)
     return _as_leaf(fit("the gradient", leaf, cotangent, cotangent), leaf)
 
 

@@ -131,16 +131,16 @@ def plain(value: Any) -> Any:
 
 
 # Function of autograd -> function whose derivatives are used instead of those of autograd, on traces of this module.
-underflow_safe: dict[Callable, Callable] = {}
+replaced_functions: dict[Callable, Callable] = {}
 
 
 def autograd_rules(function: Callable) -> tuple[Callable, Callable]:
     """Return the VJP maker and the JVP maker of a function of autograd."""
-    function = underflow_safe.get(function, function)
+    function = replaced_functions.get(function, function)
     return primitive_vjps[function], primitive_jvps[function]
 
 
-# ---- derivatives that divide by no square ----------------------------------------------------------------------------
+# ---- derivatives in place of those of autograd -----------------------------------------------------------------------
 
 
 def _replace_derivatives(*functions, slopes):
@@ -155,7 +155,7 @@ def _replace_derivatives(*functions, slopes):
         A function of autograd and its aliases.
     slopes : sequence of callables
         For each argument ``slope(g, ans, *args)``, which returns g times the derivative of the result `ans` with
-        respect to this argument.
+        respect to this argument; None for a derivative that is 0.
     """
 
     @primitive
@@ -163,15 +163,15 @@ def _replace_derivatives(*functions, slopes):
         return functions[0](*args)
 
     def vjp_in(num, slope):
-        return lambda ans, *args: unbroadcast_f(args[num], lambda g: slope(g, ans, *args))
+        return slope and (lambda ans, *args: unbroadcast_f(args[num], lambda g: slope(g, ans, *args)))
 
     def jvp_in(slope):
-        return lambda g, ans, *args: match_complex(ans, slope(g, ans, *args))
+        return slope and (lambda g, ans, *args: match_complex(ans, slope(g, ans, *args)))
 
     defvjp(replacement, *[vjp_in(num, slope) for num, slope in enumerate(slopes)])
     defjvp(replacement, *[jvp_in(slope) for slope in slopes])
     for function in functions:
-        underflow_safe[function] = replacement
+        replaced_functions[function] = replacement
 
 
 def _without_result(slope):
@@ -202,6 +202,14 @@ def _arctan2_second_slope(g, x, y):
     return g * (-x / r) / r
 
 
+def _chosen_slope(g, ans, condition, *operands):
+    return anp.where(condition, g, anp.zeros(np.shape(sample(ans)), dtype_of(g)))
+
+
+def _other_slope(g, ans, condition, *operands):
+    return anp.where(condition, anp.zeros(np.shape(sample(ans)), dtype_of(g)), g)
+
+
 _replace_derivatives(
     anp.true_divide,
     anp.divide,
@@ -214,6 +222,8 @@ _replace_derivatives(
     anp.arctan2,
     slopes=(_without_result(_arctan2_first_slope), _without_result(_arctan2_second_slope)),
 )
+# autograd's derivative of where does not add up the cotangents of an operand that is repeated, such as a number.
+_replace_derivatives(getattr(anp, "_original_where", anp.where), slopes=(None, _chosen_slope, _other_slope))
 
 # ---- traces ----------------------------------------------------------------------------------------------------------
 
@@ -352,7 +362,7 @@ class ReverseNode(VJPNode):
         """Set the pullback to that of a function of autograd, or of a rule."""
         if len(nums) < len(args) and function not in sparing:
             args = constant_args(args, nums)
-        known = underflow_safe.get(function, function)
+        known = replaced_functions.get(function, function)
         options = constant(options)
         if function not in (_primitive, _operator, through) and _is_program_level((value, *args)):
             self.vjp = _recorded_pullback_of_autograd(value, known, args, options, nums)
@@ -417,7 +427,7 @@ class ForwardNode(JVPNode):
                 formula = distributed_formula(function, value, args, nums)
         if formula is None:
             _kind(function, value, args, nums)
-            super().__init__(value, underflow_safe.get(function, function), args, options, nums, parents)
+            super().__init__(value, replaced_functions.get(function, function), args, options, nums, parents)
             return
         total: Any = None
         for num, parent in zip(nums, parents, strict=True):

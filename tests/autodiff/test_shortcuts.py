@@ -12,7 +12,7 @@ from autograd.tracer import getval
 
 import sparsedp as dp
 from sparsedp.autodiff.derivative import pushforward
-from sparsedp.autodiff.tape import primitive_jvps, primitive_vjps, underflow_safe
+from sparsedp.autodiff.tape import primitive_jvps, primitive_vjps, replaced_functions
 from sparsedp.errors import DerivativeError
 
 RNG = np.random.default_rng(3)
@@ -47,7 +47,7 @@ FORMULAS = {
 @pytest.fixture
 def scaled_quotients(monkeypatch):
     """Give autograd the derivatives of quotients that do not divide by squares, as the tape has them."""
-    for fun, scaled in underflow_safe.items():
+    for fun, scaled in replaced_functions.items():
         for rules in (primitive_vjps, primitive_jvps):
             monkeypatch.setitem(rules, fun, rules[scaled])
 
@@ -96,7 +96,7 @@ def test_derivatives_of_quotients_of_small_numbers(name):
 
 
 def test_quotients_keep_their_derivatives_for_other_users_of_autograd():
-    assert not any(primitive_vjps[fun] is primitive_vjps[scaled] for fun, scaled in underflow_safe.items())
+    assert not any(primitive_vjps[fun] is primitive_vjps[scaled] for fun, scaled in replaced_functions.items())
 
 
 def test_a_list_of_exponents():
@@ -291,3 +291,28 @@ def test_powers_have_the_bits_of_the_plain_ones():
                     lambda x, power=power, plain=plain: anp.sum(plain.append(getval(x**power)) or x**power)
                 )(x)
                 assert np.array_equal(plain[0], x**power)
+
+
+WHERE = {
+    "a number": (lambda s: anp.where(X > 0, s, X), lambda s: (X > 0) * s + (X <= 0) * X, 0.7),
+    "a number second": (lambda s: anp.where(X > 0, X, s**2), lambda s: (X > 0) * X + (X <= 0) * s**2, 0.7),
+    "both": (lambda s: anp.where(X > 0, s * X, s), lambda s: (X > 0) * s * X + (X <= 0) * s, 0.7),
+    "a row": (lambda s: anp.where(X > 0, s, 1.0), lambda s: (X > 0) * s + (X <= 0), X[0]),
+    "a column": (lambda s: anp.where(X[0] > 0, s, X), lambda s: (X[0] > 0) * s + (X[0] <= 0) * X, X[:, :1]),
+    "complex": (
+        lambda s: anp.real(1j * anp.where(X > 0, s, 1j * X)),
+        lambda s: anp.real(1j * ((X > 0) * s + (X <= 0) * 1j * X)),
+        0.3 + 0.2j,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WHERE)
+def test_where_of_operands_that_are_repeated(name):
+    """autograd does not add up their cotangents."""
+    chosen, product, s = WHERE[name]
+    loss, same = (lambda s, f=f: anp.sum(anp.sin(f(s)) * Y) for f in (chosen, product))
+    for derivative in (dp.grad, lambda f: dp.grad(dp.jit(f)), lambda f: lambda s: dp.jvp(f, s, 2.0 * s)[1]):
+        found, expected = derivative(loss)(s), derivative(same)(s)
+        assert np.shape(found) == np.shape(expected) and np.allclose(found, expected, rtol=1e-13, atol=1e-13)
+    assert np.allclose(dp.hvp(loss, s, s), dp.hvp(same, s, s), rtol=1e-13, atol=1e-13)
