@@ -646,6 +646,12 @@ BUGS = {
         "            if False:",
         "tests/trajectory/test_rollout_disk.py",
     ),
+    "a step whose measurements changed that continues an interrupted rollout": Bug(
+        "trajectory",
+        "                self._earlier_last = last",
+        "                pass",
+        "tests/trajectory/test_rollout_disk.py",
+    ),
     "a cotangent of the wrong dtype": Bug(
         "autodiff/tape.py",
         "    return cast(cotangent, precise)",

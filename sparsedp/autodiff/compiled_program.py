@@ -1164,7 +1164,12 @@ class _Translator:
         """Return the value whose entry k is the sum of the products of the entries in pairs[k]."""
         result = self._new_value(dtype, len(pairs))
         zero = ir.Constant(TYPES[dtype], 0.0)
-        if result.size <= UNROLLED and max(map(len, pairs)) <= UNROLLED:
+        longest = max(map(len, pairs), default=0)
+        if longest == 0:  # such as an operator without entries
+            result.entries = [zero]
+            result.places = np.zeros(result.size, np.int64)
+            return result
+        if result.size <= UNROLLED and longest <= UNROLLED:
             result.entries = []
             for row in pairs:
                 entries = []
@@ -1180,9 +1185,7 @@ class _Translator:
         if result.size <= UNROLLED:
             memory = _Value(dtype, result.size, self._position)
         shape = (result.size, len(pairs[0])) if len(lengths) == 1 and len(pairs[0]) else (len(flat),)
-        readers = [
-            self.reader(value, flat[:, side].reshape(shape)) for side, value in enumerate((first, second)) if len(flat)
-        ]
+        readers = [self.reader(value, flat[:, side].reshape(shape)) for side, value in enumerate((first, second))]
         self.new_region(memory)
 
         def product(*indices):

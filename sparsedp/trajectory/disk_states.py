@@ -20,6 +20,7 @@ import errno
 import hashlib
 import json
 import os
+import re
 import shutil
 import time
 import warnings
@@ -37,6 +38,7 @@ from sparsedp.autodiff.tape import isbox
 from sparsedp.errors import DiskWarning
 from sparsedp.io.atomic_files import UNFINISHED, load_tree, open_locked, path_errors, save_tree, write_file
 from sparsedp.io.fingerprint import fingerprint
+from sparsedp.trajectory.run_key import RunKey, run_key
 from sparsedp.trajectory.step_runner import State
 
 if TYPE_CHECKING:
@@ -50,7 +52,12 @@ __all__ = ["BackwardProgress", "DiskStates", "free_bytes", "state_digest"]
 
 FORMAT = "sparsedp rollout 1"
 PREFIX = "rollout-"
-LOCK = "lock"  # name of the lock file in the folder of a run
+LOCK = "lock"  # names of the files in the folder of a run; those of states are state-<index>
+LAST = "last"
+BACKWARD = "backward.npz"
+FOLDER_NAME = re.compile(PREFIX + "[0-9a-f]{32}-[0-9a-f]{8}")
+STATE_NAME = re.compile("state-([0-9]{12})")
+ATTEMPTS = 20  # to create a folder and to lock it; another process may lock a new folder first, to look into it
 FREE_SHARE = 0.5  # fraction of the free space of the disk that is used if the user gives no limit
 INTERVAL = 30.0  # least number of seconds between two writes of the cotangents
 SHARE = 0.05  # writing the cotangents may take at most this fraction of the time
@@ -88,25 +95,30 @@ class RunFolder:
             parent.mkdir(parents=True, exist_ok=True)
             self.path, lock = _unfinished_run(parent, key) or _new_run(parent, key)
         for file in self.path.glob(f"*{UNFINISHED}"):
-            file.unlink(missing_ok=True)
-        self._finalizer = weakref.finalize(self, _remove, self.path, lock)
+            with suppress(OSError):
+                file.unlink()
+        self._finalizer = weakref.finalize(self, _remove, self.path, lock, os.getpid())
 
     def remove(self) -> None:
-        """Remove the folder and all of its files; also called when this object is garbage-collected."""
+        """Remove the folder with its files; also called when this object is garbage-collected."""
         self._finalizer()
+
+    def clear(self) -> None:
+        """Remove all files except the lock."""
+        _remove_files(self.path)
 
     def preserve(self) -> None:
         """Unlock the folder, and do not remove it, so that a later run can continue from its files."""
         detached = self._finalizer.detach()
         if detached is not None:
-            _, _, (_, lock), _ = detached
+            _, _, (_, lock, _), _ = detached
             lock.close()
 
 
 def _new_run(parent: Path, key: str) -> tuple[Path, BinaryIO]:
     """Return a new folder and its locked file; warn if the folder above contains runs that did not end."""
     others = []
-    for folder in parent.glob(f"{PREFIX}*"):
+    for folder in _folders(parent, PREFIX):
         lock = open_locked(folder / LOCK)
         if lock is not None:
             others.append(sum(file.stat().st_size for file in folder.glob("*") if file.is_file()))
@@ -119,79 +131,60 @@ def _new_run(parent: Path, key: str) -> tuple[Path, BinaryIO]:
             ),
             stacklevel=frames_inside() + 1,
         )
-    while True:
+    for _ in range(ATTEMPTS):
         folder = parent / f"{PREFIX}{key}-{uuid4().hex[:8]}"
         folder.mkdir()
         lock = open_locked(folder / LOCK)
         if lock is not None:
             return folder, lock
+        with suppress(OSError):
+            (folder / LOCK).unlink(missing_ok=True)
+            folder.rmdir()
+    raise OSError(f"no file can be created and locked in {parent}; name a folder on a local disk with free space")
 
 
 def _unfinished_run(parent: Path, key: str) -> tuple[Path, BinaryIO] | None:
     """Return the folder of an interrupted run with the given key and its locked file, or None."""
-    for folder in sorted(parent.glob(f"{PREFIX}{key}-*")):
+    for folder in _folders(parent, f"{PREFIX}{key}-"):
         lock = open_locked(folder / LOCK)
         if lock is not None:
             return folder, lock
     return None
 
 
-def _remove(folder: Path, lock: BinaryIO) -> None:
-    """Remove the folder of a run. The lock file is removed last, so that no other run takes over a part."""
-    for file in folder.glob("*"):
-        if file.name != LOCK:
+def _folders(parent: Path, prefix: str) -> list[Path]:
+    """Return the folders of runs whose names begin with `prefix`; links and other names belong to the user."""
+    paths = sorted(parent.glob(f"{prefix}*"))
+    return [path for path in paths if FOLDER_NAME.fullmatch(path.name) and not path.is_symlink()]
+
+
+def _remove_files(folder: Path) -> None:
+    """Remove all files of a run, except the lock."""
+    for path in folder.glob("*"):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        elif path.name != LOCK:
             with suppress(OSError):
-                file.unlink()
+                path.unlink()
+
+
+def _remove(folder: Path, lock: BinaryIO, process: int) -> None:
+    """Remove the folder of a run, if this process created it. A forked process has a copy of the object only.
+
+    The lock file is removed last, so that no other run takes over a part. Another run may create a new one after that;
+    the folder then remains.
+    """
+    if os.getpid() != process:
+        lock.close()
+        return
+    _remove_files(folder)
     with suppress(OSError):
         (folder / LOCK).unlink()  # an open file cannot be removed on Windows
     lock.close()
-    shutil.rmtree(folder, ignore_errors=True)
-
-
-# ---- hash of a run ---------------------------------------------------------------------------------------------------
-
-
-def run_key(specification: RolloutSpecification, args: Sequence) -> str:
-    """Return a hash of the step, the arguments and the options of a rollout that is the same in every process.
-
-    Of the step it contains the name, the code, and the numbers and arrays that the function refers to by its defaults
-    and its enclosing functions. Global variables, and objects of other types, are not part of it.
-    """
-    statics = [form.statics for form in specification.forms]
-    settings = (FORMAT, specification.n, specification.truncate, specification.differentiated, statics)
-    texts = [fingerprint(settings), *map(fingerprint, args), *_step_texts(specification.step)]
-    return hashlib.sha256("\n".join(texts).encode()).hexdigest()[:32]
-
-
-def _step_texts(step: Any) -> list[str]:
-    """Return texts that describe a step."""
-    function = getattr(step, "function", step)  # the function that was jitted
-    texts = [fingerprint(function)]
-    function = getattr(function, "__func__", function)  # of a bound method
-    code = getattr(function, "__code__", None)
-    if code is None:
-        return texts
-    texts.append(_code_text(code))
-    values = list(getattr(function, "__defaults__", None) or ())
-    for cell in getattr(function, "__closure__", None) or ():
-        with suppress(ValueError):  # an empty cell
-            values.append(cell.cell_contents)
-    for value in values:
-        texts.append(fingerprint(value))
-    return texts
-
-
-def _code_text(code: Any) -> str:
-    """Return a text that describes the code of a function and is the same in every process."""
-    texts = [code.co_code.hex(), repr(code.co_names)]
-    for constant in code.co_consts:
-        if hasattr(constant, "co_code"):
-            texts.append(_code_text(constant))
-        elif isinstance(constant, frozenset):
-            texts.append(repr(sorted(map(repr, constant))))
-        else:
-            texts.append(repr(constant))
-    return " ".join(texts)
+    with suppress(OSError):
+        if os.name == "nt":
+            (folder / LOCK).unlink(missing_ok=True)
+        folder.rmdir()
 
 
 # ---- files of states -------------------------------------------------------------------------------------------------
@@ -319,8 +312,11 @@ class DiskStates:
         self._form = form
         self._plan = plan
         self._is_resumable = is_resumable and len(form.places) == len(form.statics)
-        key = run_key(specification, args) if self._is_resumable else uuid4().hex
-        self._folder = RunFolder(parent, key)
+        key = RunKey(uuid4().hex, True)
+        if self._is_resumable:
+            key = run_key(specification, args)
+        self._key_is_complete = key.is_complete
+        self._folder = RunFolder(parent, key.text)
         self._entries: list[State | FileState] = []
         self._popped: FileState | None = None  # its file is removed when the next state is appended or popped
         self._first_file: Path | None = None
@@ -328,6 +324,7 @@ class DiskStates:
         self._is_full = False
         self._disk_indices = plan.disk_indices()
         self._is_forward = True
+        self._earlier_last: State | None = None  # the last state of the interrupted run, if the steps must confirm it
         self._last_write_time = time.perf_counter()
         self._last_write_seconds = 0.0
         self._cotangents = ""
@@ -404,12 +401,12 @@ class DiskStates:
 
     def clear(self) -> None:
         """Remove all states."""
-        for file in self._folder.path.glob("*"):
-            if file.name != LOCK:
-                file.unlink(missing_ok=True)
+        self._folder.clear()
         self._entries.clear()
         self._popped = None
         self._first_file = None
+        self._earlier_last = None
+        self._is_forward = True
         self.in_memory = 0
         self.written = 0
         self.resumed_at = None
@@ -431,14 +428,15 @@ class DiskStates:
         """Append the states of an interrupted run; return the state from which the forward pass continues.
 
         The steps between the last two states in files are run again. If they give another state, the step has changed,
-        and the files are removed. The backward pass compares the other states when it runs their steps again.
+        and the files are removed. If the key does not cover everything that the step refers to, the steps after the
+        last state in a file are run again, too; see `finish_forward`. The backward pass compares the other states when
+        it runs their steps again.
         """
         entries = []
         last = None
         if self._is_resumable:
-            last = read_state(self._folder.path / "last", self._form, first.statics)
-            for path in sorted(self._folder.path.glob("state-*")):
-                entries.append(FileState(int(path.name.removeprefix("state-")), first.statics, path))
+            last = read_state(self._folder.path / LAST, self._form, first.statics)
+            entries = self._states_in_files(first.statics)
         newest = self._confirmed(entries, runner, first)
         self._entries.append(first)
         self.in_memory = 1
@@ -447,15 +445,29 @@ class DiskStates:
         self._entries += entries
         self._first_file = entries[0].path
         if last is not None and last.i == self._plan.n:
-            newest = last
+            if self._key_is_complete:
+                newest = last
+            else:
+                self._earlier_last = last
         self.resumed_at = newest.i
         return newest
+
+    def _states_in_files(self, statics: Sequence) -> list[FileState]:
+        """Return the states of which the folder has files, in ascending order."""
+        states = []
+        for path in sorted(self._folder.path.glob("state-*")):
+            match = STATE_NAME.fullmatch(path.name)
+            if match and 0 < int(match[1]) < self._plan.n and path.is_file():
+                states.append(FileState(int(match[1]), statics, path))
+        return states
 
     def _confirmed(self, entries: list[FileState], runner: StepRunner, first: State) -> State | None:
         """Return the last of the states in files if the steps before it give it again; else remove all files."""
         newest = None
         if entries:
             newest = read_state(entries[-1].path, self._form, first.statics)
+            if newest is not None and newest.i != entries[-1].i:
+                newest = None
             before = first
             if len(entries) > 1:
                 before = read_state(entries[-2].path, self._form, first.statics) or first
@@ -467,14 +479,21 @@ class DiskStates:
             self.clear()
         return newest
 
-    def finish_forward(self, last: State) -> None:
-        """Store the last state, so that an interrupted backward pass can be continued without the forward pass."""
+    def finish_forward(self, last: State) -> bool:
+        """Store the last state, so that an interrupted backward pass can be continued without the forward pass.
+
+        Return False if the interrupted run ended in another state: the step has changed, and all steps must be run.
+        """
+        if self._earlier_last is not None and state_digest(self._earlier_last.values) != state_digest(last.values):
+            self.clear()
+            return False
         self._is_forward = False
         if self._entries[-1].i != last.i:  # the interrupted run had ended its forward pass
             self._entries.append(last)
             self.in_memory += 1
         if self._is_resumable and not self._is_full:
-            self._written(self._folder.path / "last", last)
+            self._written(self._folder.path / LAST, last)
+        return True
 
     def saved_progress(self, cotangents: Sequence) -> BackwardProgress | None:
         """Return what an interrupted backward pass of the same cotangents has computed, or None."""
@@ -483,7 +502,7 @@ class DiskStates:
             self._is_resumable = False
             return None
         self._cotangents = fingerprint(list(cotangents))
-        path = self._folder.path / "backward.npz"
+        path = self._folder.path / BACKWARD
         if not path.exists():
             return None
         content = load_tree(path, FORMAT)
@@ -502,7 +521,7 @@ class DiskStates:
         begin = time.perf_counter()
         content = {"cotangents": self._cotangents, "progress": list(progress())}
         try:
-            save_tree(self._folder.path / "backward.npz", content, FORMAT)
+            save_tree(self._folder.path / BACKWARD, content, FORMAT)
         except OSError as error:
             if error.errno not in DISK_IS_FULL:
                 raise

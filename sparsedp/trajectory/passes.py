@@ -54,7 +54,8 @@ def run_forward(
 ) -> State:
     """Run all steps; return the last state, and append the states kept for the backward pass, with the last, to `kept`.
 
-    If an interrupted run left states in files, the steps up to the last one of them are not run.
+    If an interrupted run left states in files, the steps up to the last one of them are not run, unless the step has
+    changed.
     """
     is_differentiated = bool(runner.specification.differentiated)
     recorder = runner.recorder
@@ -93,8 +94,8 @@ def run_forward(
             if not is_taped and not outputs.holds_all_states:
                 state = state.owned()
             kept.append(state)
-    if isinstance(kept, DiskStates):
-        kept.finish_forward(state)
+    if isinstance(kept, DiskStates) and not kept.finish_forward(state):
+        return run_forward(runner, plan, outputs, stored, progress, kept)
     return state
 
 
@@ -205,7 +206,7 @@ def run_backward(
             norms.append((i, largest(total)))
         if outputs.enters_everywhere and i >= specification.first_traced:
             total = _sum(total, source(state))
-        if isinstance(kept, DiskStates) and total is not None:
+        if i and isinstance(kept, DiskStates) and total is not None:
             kept.save(partial(_progress, i, total, runner, sums, rows, norms, recomputed, state))
     if last is not None and state.i == 0:
         runner.check_drift(state, last)
@@ -308,12 +309,12 @@ def check_repeated(specification: RolloutSpecification, fingerprints: list, earl
 
 
 def release(kept: KeptStates, error: BaseException) -> None:
-    """Leave the files of states for a later run if Ctrl-C was pressed; remove them after another error."""
+    """Remove the files of states after an error; leave them for a later run after Ctrl-C or sys.exit()."""
     if isinstance(kept, DiskStates):
-        if isinstance(error, KeyboardInterrupt):
-            kept.preserve()
-        else:
+        if isinstance(error, Exception):
             kept.remove()
+        else:
+            kept.preserve()
 
 
 # ---- the rule --------------------------------------------------------------------------------------------------------
@@ -395,6 +396,8 @@ class RolloutRule(Rule):
                     raise
         for value in last.values:
             if not is_finite(value):
+                if isinstance(kept, DiskStates):
+                    kept.remove()
                 refuse_nonfinite_step(runner)
         runner.recorder.ended = True
         if specification.differentiated:

@@ -152,9 +152,11 @@ def rollout(
     again on a tape, it compares the next state with the one that it used before, by fingerprints of 64 bits. With
     memory="reverse" only the first state is compared, up to rounding.
 
-    With `disk`, an interrupted run is continued if the arguments and the step are the same. A step is the same if its
-    name, its code, and the numbers and arrays in its closure are; global variables are not compared, but the steps
-    between the last two states in files are run again, and must give the same state. States are written as the run
+    With `disk`, a run that was interrupted by Ctrl-C, ``sys.exit()`` or the end of the process is continued if the
+    arguments and the step are the same. A step is the same if its code is, and everything that it refers to: numbers,
+    arrays, functions and operators in its closure and in global variables. Objects of other classes and the content of
+    other modules are not compared. If a step refers to those, the steps after the last state in a file are run again,
+    too, and must give the same last state; the backward pass compares the other states. States are written as the run
     proceeds, and the cotangents of the backward pass at most every 30 seconds. Only keep="last", with a state of
     floating arrays, can be continued. Use a folder on a local disk; several runs may use it at the same time.
 
@@ -239,6 +241,7 @@ def _folder_and_limit(disk: Any) -> tuple[Any, int]:
         folder, limit = disk
     if not isinstance(folder, (str, os.PathLike)) or not os.fspath(folder):
         raise TypeError(f'disk of rollout must be a path or a pair (path, "20 GB"), got {disk!r}')
+    folder = os.path.abspath(folder)  # the backward pass may run in another working directory
     if limit is None:
         return folder, free_bytes(folder)
     return folder, bytes_of(limit, "disk")

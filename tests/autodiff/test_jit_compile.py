@@ -98,6 +98,19 @@ def test_more_random_functions(seed):
     test_random_functions(seed)
 
 
+def test_products_without_terms():
+    """An operator without entries, and matrices without columns."""
+    empty = dp.from_matrix(np.zeros((12, 12)))
+
+    def loss(u):
+        return anp.sum((empty(u) + u) ** 2) + anp.sum(anp.cos(np.zeros((12, 0)) @ u[:0]) * u)
+
+    jitted = dp.jit(loss, compile=True)
+    for x in (X, Y):
+        compare(loss, jitted, x)
+    assert not jitted.not_compiled
+
+
 @pytest.mark.whole
 def test_single_precision_and_booleans():
     def function(u):

@@ -6,17 +6,21 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
+from functools import partial
 from pathlib import Path
 
 import autograd.numpy as anp
 import numpy as np
 import pytest
+import scipy.sparse as sp
 
 import sparsedp as dp
 from sparsedp._utils.pytree import leaves
 from sparsedp.errors import DiskWarning
 from sparsedp.trajectory import disk_states
 from sparsedp.trajectory.checkpoint_plan import CheckpointPlan
+from sparsedp.trajectory.run_key import run_key
 
 N = 30
 U = np.random.default_rng(0).random(40)
@@ -36,15 +40,16 @@ def push(u, p, force):
 class Interrupted:
     """A step that is interrupted at one of its calls."""
 
-    def __init__(self, step=bend, at=None):
+    def __init__(self, step=bend, at=None, error=KeyboardInterrupt):
         self.step = step
         self.at = at
+        self.error = error
         self.calls = 0
 
     def __call__(self, *args):
         self.calls += 1
         if self.calls == self.at:
-            raise KeyboardInterrupt
+            raise self.error
         return self.step(*args)
 
 
@@ -110,6 +115,13 @@ def test_files_disappear_after_an_error_of_the_step(tmp_path):
     with pytest.raises(ZeroDivisionError):
         gradient(tmp_path, step)
     assert not os.listdir(tmp_path)
+
+
+def test_files_disappear_after_a_state_that_is_not_finite(tmp_path):
+    growing = lambda u, p: np.inf * u
+    with pytest.raises(dp.errors.NonFiniteError) as caught:
+        gradient(tmp_path, growing)
+    assert caught.traceback and not os.listdir(tmp_path)  # although the traceback refers to the run
 
 
 STATES = {
@@ -190,9 +202,46 @@ def test_a_second_interruption_and_another_cotangent(tmp_path, monkeypatch):
     assert not os.listdir(tmp_path)
 
 
-def test_a_changed_step_does_not_continue_the_old_run(tmp_path):
-    step = Interrupted()
-    step.at = N + 10
+def test_an_interruption_after_the_last_step(tmp_path, monkeypatch):
+    monkeypatch.setattr(disk_states, "INTERVAL", 0.0)
+    monkeypatch.setattr(disk_states, "SHARE", np.inf)
+    monkeypatch.setattr(os, "fsync", lambda handle: None)  # slow, and this test stops no machine
+    save = Interrupted(disk_states.save_tree)
+    monkeypatch.setattr(disk_states, "save_tree", save)
+    gradient(tmp_path)
+    save.calls, save.at = 0, save.calls
+    with pytest.raises(KeyboardInterrupt):
+        gradient(tmp_path)
+    assert same(gradient(tmp_path), WANTED)
+    assert not os.listdir(tmp_path)
+
+
+def test_a_run_that_exits_continues(tmp_path):
+    step = Interrupted(at=20, error=SystemExit)
+    with pytest.raises(SystemExit):
+        gradient(tmp_path, step)
+    step.at = None
+    records = []
+    assert same(gradient(tmp_path, step, record=records.append), WANTED)
+    assert records[0].resumed_at > 10
+    assert not os.listdir(tmp_path)
+
+
+def test_a_run_continues_with_its_last_state(tmp_path, monkeypatch):
+    """If the key of the run covers the step, no step of the forward pass is run again."""
+    with monkeypatch.context() as patched:
+        patched.setattr(disk_states.DiskStates, "saved_progress", Interrupted(at=1))
+        with pytest.raises(KeyboardInterrupt):
+            gradient(tmp_path)
+    records = []
+    assert same(gradient(tmp_path, record=records.append), WANTED)
+    assert records[0].resumed_at == N
+    assert not os.listdir(tmp_path)
+
+
+@pytest.mark.parametrize("at", [20, N + 10])
+def test_a_changed_step_does_not_continue_the_old_run(tmp_path, at):
+    step = Interrupted(at=at)
     with pytest.raises(KeyboardInterrupt):
         gradient(tmp_path, step)
     step.at = None
@@ -202,11 +251,90 @@ def test_a_changed_step_does_not_continue_the_old_run(tmp_path):
     assert not os.listdir(tmp_path)
 
 
-def test_code_and_closure_belong_to_the_run(tmp_path):
+class Measured:
+    """A step with measurements, one row for each step; the key of a run cannot cover objects of such a class."""
+
+    def __init__(self, rows):
+        self.rows = rows
+
+    def __call__(self, state, p):
+        u, i = state
+        return bend(u, p) + self.rows[int(value_of(i))], i + 1.0
+
+
+def value_of(number):
+    return getattr(number, "_value", number)
+
+
+def with_method(rows):
+    return Measured(rows).__call__
+
+
+def with_inner_function(rows):
+    row = lambda i: rows[int(value_of(i))]
+    return lambda state, p: (bend(state[0], p) + row(state[1]), state[1] + 1.0)
+
+
+def with_argument(rows):
+    return partial(lambda rows, state, p: (bend(state[0], p) + rows[int(value_of(state[1]))], state[1] + 1.0), rows)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        Measured,
+        with_argument,
+        *(pytest.param(make, marks=pytest.mark.whole) for make in (with_method, with_inner_function)),
+    ],
+)
+def test_measurements_that_change_late_do_not_continue_the_old_run(tmp_path, make, monkeypatch):
+    """The steps before the change give the same states; those after it have been differentiated."""
+    monkeypatch.setattr(disk_states, "INTERVAL", 0.0)
+    monkeypatch.setattr(disk_states, "SHARE", np.inf)
+    monkeypatch.setattr(os, "fsync", lambda handle: None)  # slow, and this test stops no machine
+    save_tree = disk_states.save_tree
+    is_interrupted = True
+
+    def save(path, content, kind):
+        if is_interrupted and content["progress"][0] == 12:
+            save_tree(path, content, kind)
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(disk_states, "save_tree", save)
+
+    def slope(rows, **options):
+        run = lambda u: dp.rollout(make(rows), (u, 0.0), P, N, **options)[0]
+        return dp.value_and_grad(lambda u: anp.sum(run(u)))(U)  # linear: with the same cotangents for both runs
+
+    on_disk = {"memory": 13 * U.nbytes, "disk": tmp_path}
+    rows = np.zeros((N, 40))
+    with pytest.raises(KeyboardInterrupt):
+        slope(rows, **on_disk)
+    is_interrupted = False
+    assert len(list(tmp_path.glob("rollout-*/backward.npz"))) == 1
+    other = rows.copy()
+    other[-2] = 1.0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DiskWarning)  # of the files of the first run, if it has another key
+        assert same(slope(other, **on_disk), slope(other))
+    records = []
+    assert same(slope(rows, record=records.append, **on_disk), slope(rows))
+    assert (records[0].resumed_at is None) == (make in (Measured, with_method))  # the others have two keys
+    assert not os.listdir(tmp_path)
+
+
+GAIN = 1.0
+
+
+def amplified(u):
+    return GAIN * u
+
+
+def test_what_the_step_refers_to_belongs_to_the_run(monkeypatch):
     specification = lambda step: type(
         "S", (), {"step": step, "n": 1, "truncate": None, "differentiated": [0], "forms": []}
     )
-    key = lambda step: disk_states.run_key(specification(step), [U])
+    key = lambda step: run_key(specification(step), [U])
 
     def make(factor):
         return lambda u, p: factor * u
@@ -216,6 +344,21 @@ def test_code_and_closure_belong_to_the_run(tmp_path):
 
     assert key(make(1.0)) == key(make(1.0)) == key(dp.jit(make(1.0)))
     assert len({key(make(1.0)), key(make(2.0)), key(make(U)), key(other(1.0))}) == 4
+    grid = dp.Grid(8)
+    diffusion = lambda dt: dp.inverse(dp.identity(grid.cells) - dt * dp.laplacian(grid))
+    using = lambda solve: lambda u, p: solve(amplified(u))
+    solve = diffusion(0.1)
+    wanted = key(using(solve))
+    solve(np.ones(8))  # records of solves are no part of it
+    assert wanted == key(using(solve)) == key(using(diffusion(0.1))) and wanted.is_complete
+    assert wanted != key(using(diffusion(0.2)))
+    monkeypatch.setitem(globals(), "GAIN", 2.0)
+    assert wanted != key(using(solve))
+    assert key(dp.stepper("rk4", make(1.0), 0.1)) != key(dp.stepper("rk4", make(1.0), 0.2))
+    matrix = lambda factor: factor * sp.eye_array(3, format="csr")
+    assert len({key(make(matrix(1.0))), key(make(matrix(2.0))), key(make({1.0})), key(make({"a": 1.0}))}) == 4
+    assert not key(Measured(U)).is_complete and not key(make(np.random.default_rng(0))).is_complete
+    assert key(make(os)).is_complete and not key(make(pytest)).is_complete
 
 
 def test_files_of_other_arguments_are_kept_and_reported(tmp_path):
@@ -230,6 +373,70 @@ def test_files_of_other_arguments_are_kept_and_reported(tmp_path):
     ):
         gradient(tmp_path, step, n=N - 1)
     assert os.listdir(tmp_path) == before
+
+
+def test_a_relative_path_is_that_of_the_call(tmp_path, monkeypatch):
+    for name in ("begin", "end"):
+        (tmp_path / name).mkdir()
+    monkeypatch.chdir(tmp_path / "begin")
+    end, pull = dp.vjp(lambda u: dp.rollout(bend, u, P, N, memory=MEMORY, disk="states"), U)
+    monkeypatch.chdir(tmp_path / "end")
+    wanted = pull(end)
+    assert np.array_equal(pull(end), wanted)  # runs the forward pass again
+    assert os.listdir(tmp_path / "begin") == ["states"] and not os.listdir("../begin/states")
+    assert not os.listdir(tmp_path / "end")
+
+
+def test_folders_of_the_user_are_not_touched(tmp_path):
+    link = f"rollout-{'0' * 32}-{'0' * 8}"
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "lock").write_text("mine")
+    (tmp_path / link).symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "rollout-results").mkdir()
+    (tmp_path / "rollout-notes").write_text("mine")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert same(gradient(tmp_path), WANTED)
+    assert sorted(os.listdir(tmp_path)) == sorted(["elsewhere", link, "rollout-notes", "rollout-results"])
+    assert not os.listdir(tmp_path / "rollout-results") and os.listdir(tmp_path / "elsewhere") == ["lock"]
+
+
+def test_other_files_in_the_folder_of_a_run(tmp_path):
+    step = Interrupted(at=25)
+    with pytest.raises(KeyboardInterrupt):
+        gradient(tmp_path, step)
+    [folder] = tmp_path.iterdir()
+    for name in ("state-", "state-000000000005 (copy)", "state-000000000099", "notes"):
+        (folder / name).write_text("")
+    (folder / "state-000000000028").mkdir()
+    step.at = None
+    records = []
+    assert same(gradient(tmp_path, step, record=records.append), WANTED)
+    assert records[0].resumed_at > 10
+    assert not os.listdir(tmp_path)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX locks")
+def test_a_disk_without_locks_is_an_error(tmp_path, monkeypatch):
+    monkeypatch.setattr("fcntl.flock", lambda *args: (_ for _ in ()).throw(OSError(errno.ENOLCK, "no locks")))
+    with pytest.raises(
+        OSError, match="no file can be created and locked in .*; name a folder on a local disk with free space"
+    ):
+        gradient(tmp_path)
+    assert not os.listdir(tmp_path)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs os.fork")
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_forked_process_does_not_remove_the_files(tmp_path):
+    end, pull = dp.vjp(lambda u: dp.rollout(bend, u, P, N, memory=MEMORY, disk=tmp_path), U)
+    child = os.fork()
+    if child == 0:
+        del pull
+        os._exit(0)
+    os.waitpid(child, 0)
+    assert np.array_equal(pull(end), dp.vjp(lambda u: dp.rollout(bend, u, P, N), U)[1](end))
+    assert not os.listdir(tmp_path)
 
 
 def test_two_runs_with_the_same_arguments_at_the_same_time(tmp_path):
