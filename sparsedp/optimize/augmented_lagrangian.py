@@ -142,16 +142,18 @@ class AugmentedLagrangian(ConstrainedMethod):
 
         y c + p c^2 / 2  for  c == 0,    (max(0, y + p c)^2 - y^2) / (2 p)  for  c <= 0.
 
-    Its gradient is that of the Lagrangian with the multipliers y + p c (at least 0 for inequalities). L-BFGS with
-    bounds minimizes it to an accuracy that increases; then y is set to these multipliers. An iteration is one step of
-    L-BFGS. It takes one gradient of the loss and one backward pass for each constraint function, which may return an
-    array of any length.
+    Its gradient is that of the Lagrangian, g + J^T t with the gradient g of the loss, the Jacobian J of the constraints
+    and the multipliers t = y + p c (at least 0 for inequalities). L-BFGS with bounds minimizes it to an accuracy that
+    increases; then y is set to t. An iteration is one step of L-BFGS. It takes one gradient of the loss and one
+    backward pass for each constraint function, which returns its part of J^T t for an array of any length.
 
     References
     ----------
-    R. Andreani, E. G. Birgin, J. M. Martinez, M. L. Schuverdt, On augmented Lagrangian methods with general lower-level
-    constraints, SIAM J. Optim. 18, 2007; A. R. Conn, N. I. M. Gould, P. L. Toint, A globally convergent augmented
-    Lagrangian algorithm for optimization with general constraints and simple bounds, SIAM J. Numer. Anal. 28, 1991.
+    M. R. Hestenes, Multiplier and gradient methods, J. Optim. Theory Appl. 4, 1969; J. Nocedal, S. J. Wright, Numerical
+    Optimization, Springer, 2006, chapter 17; R. Andreani, E. G. Birgin, J. M. Martinez, M. L. Schuverdt, On augmented
+    Lagrangian methods with general lower-level constraints, SIAM J. Optim. 18, 2007; A. R. Conn, N. I. M. Gould, P. L.
+    Toint, A globally convergent augmented Lagrangian algorithm for optimization with general constraints and simple
+    bounds, SIAM J. Numer. Anal. 28, 1991.
     """
 
     name: ClassVar[str] = "augmented_lagrangian"
@@ -258,7 +260,7 @@ class AugmentedLagrangian(ConstrainedMethod):
         The penalty grows only if two minimizers of augmented Lagrangians, the last with a violation, differ too little.
         It stays
 
-        - if the step limit has ended the inner minimization: the violation of a point on the way tells nothing,
+        - if the step limit has ended the inner minimization, because further steps may reduce the violation,
         - after the first violation: before, no constraint was active, and their multipliers were 0,
         - if the violation is below the inaccuracy of the inner minimization, which a larger one would make slower.
         """

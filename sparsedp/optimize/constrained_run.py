@@ -226,7 +226,7 @@ class ConstrainedRun:
                 f"({reason})"
             )
 
-    def _explained_violation(self, best):
+    def _least_violation(self, best):
         """Return the result of a run without a feasible point, and its message.
 
         Unless the user has stopped the run, the sum of the squares of the violations is minimized from the best point.
@@ -258,7 +258,7 @@ class ConstrainedRun:
     def explain_violation(self) -> None:
         """Complete the message of a run that has ended without a feasible point."""
         if not self.converged and self.best.point.violation > self.feasible:
-            self.best, self.message = self._explained_violation(self.best)
+            self.best, self.message = self._least_violation(self.best)
 
     def minimum(self, resumed: str) -> Minimum:
         """Return the result of the run; `resumed` says whether it continued from a checkpoint."""
@@ -282,10 +282,24 @@ class ConstrainedRun:
 
 
 class _Stored(NamedTuple):
-    """The content of a checkpoint: the last point, the state of the method, and the point of the smallest residual."""
+    """The state of a run in a checkpoint, in addition to its history and its best point.
+
+    Attributes
+    ----------
+    current : Evaluation
+        The last point; see `CheckpointFunctions.of_point`.
+    state : state
+        The state of the method at this point.
+    best_multipliers : (m,) array
+        The multipliers of the best point.
+    closest : (n,) array
+        The point of the smallest residual.
+    closest_multipliers : (m,) array
+    """
 
     current: Evaluation
     state: Any
+    best_multipliers: np.ndarray
     closest: np.ndarray
     closest_multipliers: np.ndarray
 
@@ -302,7 +316,7 @@ class CheckpointFunctions:
     count : int
         Number of evaluations.
     best : Evaluation
-        The best point; its gradient is replaced by the multipliers.
+        The best point.
     """
 
     best: Evaluation
@@ -466,15 +480,20 @@ def _run(problem, method, run, checkpoints):
     functions = CheckpointFunctions(problem, multipliers)
     template = None
     if state is not None:
-        template = _Stored(functions.of_point(problem.start), state, problem.start.z, multipliers)
+        start = functions.of_point(problem.start)
+        template = _Stored(start, state, multipliers, problem.start.evaluation.point, multipliers)
     resumed = checkpoints.resume(template, functions, run)
 
     def save(state):
         functions.count = problem.objective.count
-        best = run.best
-        functions.best = best.point.evaluation._replace(gradient=best.multipliers)
-        closest = run.closest.point.evaluation.point
-        stored = _Stored(functions.of_point(run.last), state, closest, run.closest.multipliers)
+        functions.best = run.best.point.evaluation
+        stored = _Stored(
+            current=functions.of_point(run.last),
+            state=state,
+            best_multipliers=run.best.multipliers,
+            closest=run.closest.point.evaluation.point,
+            closest_multipliers=run.closest.multipliers,
+        )
         checkpoints.save(stored, functions, run)
 
     try:
@@ -482,7 +501,7 @@ def _run(problem, method, run, checkpoints):
             run.record(problem.start, multipliers)
         else:
             state = resumed.state
-            best = _best(problem, functions.best.point, functions.best.gradient)
+            best = _best(problem, functions.best.point, resumed.best_multipliers)
             closest = _best(problem, resumed.closest, resumed.closest_multipliers)
             last = _best(problem, resumed.current.point, method.multipliers_of(state, problem))
             problem.objective.count = functions.count

@@ -353,6 +353,7 @@ class Constraints:
     count : int
         Number of rows m. It is known after `begin`.
     equality : (m,) array of bool
+    functions : list of ConstraintFunction
     unit : (m,) array
         The unit of each row, a power of two. It is the same for all rows of one function.
 
@@ -377,7 +378,7 @@ class Constraints:
             _check_no_dict_of_scipy(given)
             entries, self._build = flatten(given)
             names = labels(given, "constraints")
-        self._functions = [_constraint_function(entry, packing, name) for entry, name in zip(entries, names)]
+        self.functions = [_constraint_function(entry, packing, name) for entry, name in zip(entries, names)]
         self.count = 0
         self.equality = np.zeros(0, dtype=bool)
         self.unit = np.zeros(0)
@@ -393,7 +394,7 @@ class Constraints:
             The unit of each entry of the vector.
         """
         units = []
-        for function in self._functions:
+        for function in self.functions:
             linearized = function.at(vector)
             rows = function.rows_of(linearized.flat)
             probe = np.cos(np.arange(1.0, 1.0 + linearized.flat.size))
@@ -402,17 +403,17 @@ class Constraints:
             units.append(np.full(rows.size, power_of_two(size)))
             self._parts.append(slice(self.count, self.count + rows.size))
             self.count += rows.size
-        if self._functions:
+        if self.functions:
             self.unit = np.concatenate(units)
-            self.equality = np.concatenate([function.equality for function in self._functions])
+            self.equality = np.concatenate([function.equality for function in self.functions])
 
     def at(self, vector: NDArray[np.float64]) -> ConstraintValues:
         """Return the rows at a point, with their derivatives."""
-        return ConstraintValues(self, [function.at(vector) for function in self._functions])
+        return ConstraintValues(self, [function.at(vector) for function in self.functions])
 
     def split(self, rows: NDArray[np.float64]) -> list[tuple[ConstraintFunction, NDArray[np.float64]]]:
         """Return each function with its part of an array of all rows."""
-        return [(function, rows[part]) for function, part in zip(self._functions, self._parts)]
+        return [(function, rows[part]) for function, part in zip(self.functions, self._parts)]
 
     def multipliers(self, rows: NDArray[np.float64]) -> Any:
         """Return multipliers in the structure of the argument `constraints`, given those of the rows in units.
@@ -435,15 +436,13 @@ class Constraints:
         entries = paired(multipliers, self._tree, "multipliers", advice="; write them as best.multipliers has them")
         names = labels(self._tree, "multipliers")
         parts = [
-            function.rows_of_multiplier(entry, name) for function, entry, name in zip(self._functions, entries, names)
+            function.rows_of_multiplier(entry, name) for function, entry, name in zip(self.functions, entries, names)
         ]
         return joined(parts) * self.unit if parts else np.zeros(0)
 
     def values(self, at_point: ConstraintValues) -> Any:
         """Return the values y at a point in the structure of the argument `constraints`."""
-        return self._in_structure(
-            [function.in_shape(flat) for function, flat in zip(self._functions, at_point.outputs)]
-        )
+        return self._in_structure([function.in_shape(flat) for function, flat in zip(self.functions, at_point.outputs)])
 
     def _in_structure(self, values):
         if self._build is None:
@@ -465,7 +464,7 @@ class ConstraintValues:
         self._constraints = constraints
         self._linearized = linearized
         self.outputs = [one.flat for one in linearized]
-        functions = constraints._functions
+        functions = constraints.functions
         parts = [function.rows_of(y) for function, y in zip(functions, self.outputs)]
         self.rows = joined(parts) / constraints.unit if parts else np.zeros(0)
 

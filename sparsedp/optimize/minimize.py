@@ -272,6 +272,16 @@ def minimize(
     inverse of M is set up once, by `inverse`. gd needs one solve with M in an iteration, lbfgs up to three, newton_cg
     one for each Hessian product. Test vectors check that M is symmetric and positive definite.
     With `project` the search directions are those of M^-1 times the gradient of loss(project(x)).
+    Constraints: at a solution the Lagrangian loss + sum(y * c) of the constraints c and the multipliers y has the
+    gradient 0 in the unknowns that no bound holds, with y >= 0 and y * c = 0 for inequalities (Karush-Kuhn-Tucker
+    conditions). Its gradient is g + J^T y with the Jacobian J of the constraints. One backward pass of each function,
+    with its part of y as cotangent, gives J^T y: augmented_lagrangian forms no Jacobian. The other methods compute J by
+    one backward pass for each entry of a constraint, or by one forward pass for each unknown if these are fewer.
+
+    References
+    ----------
+    J. Nocedal, S. J. Wright, Numerical Optimization, Springer, 2006: L-BFGS (chapter 7), least squares (10), conditions
+    of optimality (12), augmented Lagrangian methods (17), sequential quadratic programming (18).
 
     Examples
     --------
