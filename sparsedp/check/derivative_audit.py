@@ -344,11 +344,11 @@ class DerivativeAudit:
         return slope * (shares / (shares @ shares)) / units
 
     def _measure_noise(self, line: Line) -> None:
-        """Measure the noise of a functional along a line."""
+        """Measure the noise of a functional along a line. It is not smaller than that along other lines."""
         noise, deviation = measure_noise(line, NOISE_POINTS)
         evaluations = line.evaluations
-        evaluations.noise = max(noise, self.options.noise / evaluations.eps)
-        evaluations.deviation = max(deviation, self.options.noise * abs(line.base))
+        evaluations.noise = max(evaluations.noise, noise, self.options.noise / evaluations.eps)
+        evaluations.deviation = max(evaluations.deviation, deviation, self.options.noise * abs(line.base))
 
     # ---------------------------------------------------------------- the second direction
 

@@ -17,7 +17,10 @@ __all__ = ["review"]
 WRONG = ("disagrees", "outside")
 UNDECIDED = ("few", "noise", "rough", "masked", "constant")
 ABSOLUTE = "absolute"  # name of directions with steps relative to a whole leaf, if there are relative ones too
-NOT_LINEAR = 1e-2  # a larger gap of a linear combination is an error; a smaller one may be that of an inexact solve
+NOT_LINEAR = (
+    5e-4  # a larger gap of a linear combination is an error; that of a solve with a tolerance of 1e-4 is smaller
+)
+INEXACT_SOLVE = 1e-2  # a gap of linearity up to this value is likely to be the tolerance of a solve
 INEXACT_SHARES = 1e3  # a gap up to this multiple of the gap of linearity may be due to the same inexact solve
 LEAST_INEXACT = 1e-13  # gaps of linearity below this value are rounding errors
 SINGLE_EPS = float(np.finfo(np.float32).eps)
@@ -92,17 +95,25 @@ def _review_linearity(audit: Any) -> None:
     if zero:
         audit.findings.append(("broken", f"{name} is not linear: for a vector of zeros it does not return zeros"))
         return
+    argument = {"vjp": "g", "jvp": "t"}[name]
     roughness = _roughness(audit)
-    if roughness > ROUGH_SHARE:
+    if roughness is None and gap > NOT_LINEAR:
+        audit.findings.append(
+            ("broken", f"{name} is a staircase of {argument}: some of its numbers are rounded, maybe to integers")
+        )
+        return
+    if roughness is None or roughness > ROUGH_SHARE:
         if gap > allowed:
             reason = f"{name} has rounding errors of {gap:.1e}: the problem is too ill-conditioned to tell"
             audit.findings.append(("unsound", reason))
         elif suspects:
             audit.findings.append(("note", f"{name} has the rounding errors of single precision, {gap:.0e}"))
         return
-    if gap > NOT_LINEAR:
-        argument = {"vjp": "g", "jvp": "t"}[name]
-        audit.findings.append(("broken", f"{name} is not linear in {argument}: it is off by {gap:.1e}"))
+    if gap > max(NOT_LINEAR, allowed):
+        reason = f"{name} is not linear in {argument}: it is off by {gap:.1e}"
+        if gap <= INEXACT_SOLVE:
+            reason += "; if this is the tolerance of a solve, tighten it, or write noise=..."
+        audit.findings.append(("broken", reason))
         return
     for direction in suspects:
         direction.word = "noise"
@@ -114,10 +125,11 @@ def _review_linearity(audit: Any) -> None:
         audit.findings.append(("note", f"{name} is linear only to {gap:.0e}: a solve in it may be inexact"))
 
 
-def _roughness(audit: Any) -> float:
+def _roughness(audit: Any) -> float | None:
     """Return the relative size of the second difference of the derivative for a tiny change of its vector.
 
-    It is about 0 for a smooth function of the vector, and about 1 if the results are rounding errors.
+    It is about 0 for a smooth function of the vector, and about 1 if the results are rounding errors. It is None if
+    the results do not change.
     """
     if max(audit.point.eps, audit.program.result.eps) > SINGLE_EPS / 2:
         return 0.0  # every change is rounded
@@ -127,7 +139,7 @@ def _roughness(audit: Any) -> float:
     ahead = audit.derivative(vector + change) - middle
     behind = audit.derivative(vector - change) - middle
     size = max(norm(ahead), norm(behind))
-    return norm(ahead + behind) / size if size else 1.0
+    return norm(ahead + behind) / size if size else None
 
 
 def _drop_absolute_steps(audit: Any) -> None:

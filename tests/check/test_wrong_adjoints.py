@@ -27,8 +27,8 @@ TOLERANCES = {"diffusion in single precision": 1e-6, "fixed point at 1e 8": 1e-8
 
 
 def marked(cases):
-    """Return the parameters of a sample."""
-    return [pytest.param(case, id=case.name) for case in cases if case.name in SAMPLE]
+    """Return parameters: a sample for the default suite, all others with the marker `whole`."""
+    return [pytest.param(case, id=case.name, marks=[] if case.name in SAMPLE else pytest.mark.whole) for case in cases]
 
 
 def moved(x, share):
