@@ -163,7 +163,8 @@ def laplace(
     backend_of(leaves(x)).check("laplace")
     if any(map(isbox, leaves(x))):
         raise DerivativeError(
-            "laplace cannot be differentiated or recorded; call it with plain arrays, outside of the function that is"
+            "laplace has no derivatives and cannot be recorded; call it outside of the differentiated or recorded "
+            "function"
         )
     packing = Packing(x, "x")
     if packing.complex:
@@ -185,7 +186,7 @@ def laplace(
         reason = f"there are more than rank={rank}"
         advice = "increase rank"
         if pairs.lost_in_rounding:
-            reason = "they are lost in rounding beside the largest one"
+            reason = "they are below the rounding errors of the largest one"
             advice = "give data with larger standard deviations, or a prior with smaller ones"
         message = NOT_COMPLETE.format(pairs.neglected, reason, 1 + pairs.neglected, advice)
         warnings.warn(message, PosteriorWarning, stacklevel=frames_inside() + 1)
@@ -243,7 +244,8 @@ def _hessian(misfit, packing, vector, rank):
     backend_of([value]).check("a misfit of laplace")
     if not is_field(value):
         raise DerivativeError(
-            f"the misfit must return an array of residuals or one number, got {type(value).__name__}; join it"
+            f"the misfit must return an array of residuals or one number, got {type(value).__name__}; write "
+            "np.concatenate of its flattened parts"
         )
     if np.ndim(value) == 0:
         return _hessian_of_loss(misfit, packing, vector)

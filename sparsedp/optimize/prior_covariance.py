@@ -38,7 +38,7 @@ ROOT_STEPS = 400  # largest dimension of this Krylov space
 ROOT_INTERVAL = 10  # steps between two comparisons
 
 ADVICE = "; write an Operator for the array x, one for the flattened x, or a tree of them like x"
-SINGULAR = "{} is singular: {}; add a small multiple of dp.identity, and make known unknowns constants of the function"
+SINGULAR = "{} is singular: {}; add a small multiple of dp.identity, and remove known entries from x"
 INDEFINITE = "{} has negative eigenvalues, down to {:.1e}; a covariance is positive definite"
 NOT_SYMMETRIC = (
     "{} is not symmetric (relative difference {:.1e}); for a power of an operator on a stretched grid write "
@@ -406,7 +406,10 @@ def _checked_root(root, shape):
     check_type("prior_root", root, Operator, "an Operator", "prior_root=R, with R @ R.T equal to the prior")
     check_operator("laplace", root)
     if not _fits(root.codomain, shape):
-        raise ShapeError(f"prior_root maps to {root.codomain}, but the unknowns have shape {shape}")
+        raise ShapeError(
+            f"prior_root maps to {root.codomain}, but the unknowns have shape {shape}; write R with R @ R.T equal to "
+            "the prior"
+        )
     _check_real("prior_root", root)
     return root
 

@@ -554,7 +554,7 @@ def _projected_minres(pencil, value, values, vectors, largest):
         if not residual <= max(100 * pencil.rtol, 1e-8) * size:
             raise ConvergenceError(
                 f"the adjoint solve of eigenpairs ended with a relative residual of {residual / size:.1e}; "
-                "ask for more pairs, so that the gap behind the last one is larger",
+                "increase k, so that the gap behind the last pair is larger",
                 info=failure("max_iterations"),
             )
         solution = complement(x) - numbers @ vectors

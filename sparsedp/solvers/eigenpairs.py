@@ -309,10 +309,10 @@ def _general(problem, pencil):
             "eigenpairs with symmetric=False has no derivatives; a symmetric operator has them with symmetric=True"
         )
 
-    return GeneralValues(Rule("eigenpairs", forward, refused, refused)(*problem.coefficients))
+    return GeneralEigenvalues(Rule("eigenpairs", forward, refused, refused)(*problem.coefficients))
 
 
-class GeneralValues(Frozen):
+class GeneralEigenvalues(Frozen):
     """The eigenvalues of an operator that need not be symmetric.
 
     Attributes

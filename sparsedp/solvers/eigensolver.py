@@ -389,7 +389,7 @@ class Pencil:
         if self.unknowns > INERTIA_UP_TO:
             raise ConvergenceError(
                 f"eigenpairs cannot find the end of the spectrum of {self.name}, whose rows do not show that it "
-                "has no negative eigenvalue; give the shift: which=-1.0, below or near to the wanted eigenvalues",
+                "has no negative eigenvalue; write a number below or near the wanted eigenvalues, such as which=-1.0",
                 info=failure("setup_failed"),
             )
         if not self.count_below(sigma):
@@ -481,7 +481,7 @@ def _chosen_method(pencil, settings):
         if 5 * (k + 1) > n:
             raise ValueError(f"method lobpcg takes k up to a fifth of the {n} unknowns, got {k}; write method='dense'")
     if method == "arpack" and k + 1 >= n:
-        raise ValueError(f"method arpack takes k below the {n} unknowns - 1, got {k}; write method='dense'")
+        raise ValueError(f"method arpack takes k < {n - 1} for {n} unknowns, got {k}; write method='dense'")
     if method != "auto":
         return method
     if n <= DENSE_UP_TO or (LARGE_SHARE * (k + 1) > n and n <= DENSE_AT_MOST):
@@ -597,8 +597,8 @@ def _arpack_errors(count: int) -> Iterator[None]:
         yield
     except ArpackNoConvergence as error:
         raise ConvergenceError(
-            f"eigenpairs found {len(error.eigenvalues)} of {count} pairs; increase maxiter, or give a shift near to "
-            "them by which",
+            f"eigenpairs found {len(error.eigenvalues)} of {count} pairs; increase maxiter, or write a number near "
+            "them as which",
             info=failure("max_iterations"),
         ) from None
 
@@ -798,7 +798,7 @@ def _advice(pencil, method):
             "rtol"
         )
     if method == "arpack":
-        return "give a shift near to it by which, or increase maxiter"
+        return "write a number near it as which, or increase maxiter"
     return "write method='arpack', or a larger rtol"
 
 
@@ -871,8 +871,8 @@ def _general_by_arpack(pencil, k, which, maxiter):
         options.update(sigma=sigma, OPinv=LinearOperator(shape, solve, dtype=dtype))
     elif pencil.mass is not None:
         raise ValueError(
-            "eigenpairs of a large operator that is not symmetric and a mass takes a shift, got "
-            f"which={which!r}; write a number"
+            "method arpack for an operator that is not symmetric, with a mass, needs a shift, got "
+            f"which={which!r}; write a number as which"
         )
     mass_op = None if pencil.mass is None else LinearOperator(shape, pencil.apply_mass, dtype=dtype)
     with _arpack_errors(k):

@@ -353,7 +353,7 @@ class EllipticSolver(ParametricSolver):
         k, solver, n_k = self._coefficient_and_solver(k)
         if n_k is not None:
             raise ShapeError(
-                f"eigenpairs takes one k, got a batch of {n_k}; call it for each entry along the first axis"
+                f"eigenpairs takes one coefficient k, got a batch of {n_k}; call it for each entry along the first axis"
             )
         return solver, (k, shift)
 

@@ -16,7 +16,7 @@ C = dp.matrix_power(HEAT, -2)
 LINE = dp.Grid(1100)
 STRETCHED = dp.Grid(4, spacing=np.array([1.0, 2.0, 3.0, 4.0]))
 ADVICE = "; write an Operator for the array x, one for the flattened x, or a tree of them like x"
-SINGULAR = "; add a small multiple of dp.identity, and make known unknowns constants of the function"
+SINGULAR = "; add a small multiple of dp.identity, and remove known entries from x"
 
 
 def of_matrix(matrix):
@@ -67,12 +67,13 @@ WRONG = [
     (
         lambda: dp.grad(lambda x: anp.sum(run(x=x)().variance()))(np.zeros((4, 3))),
         DerivativeError,
-        "laplace cannot be differentiated or recorded; call it with plain arrays, outside of the function that is",
+        "laplace has no derivatives and cannot be recorded; call it outside of the differentiated or recorded function",
     ),
     (
         run(misfit=lambda x: (x, x)),
         DerivativeError,
-        "the misfit must return an array of residuals or one number, got tuple; join it",
+        "the misfit must return an array of residuals or one number, got tuple; write np.concatenate of its flattened "
+        "parts",
     ),
     (
         run(misfit=lambda x: anp.log(-x - 1.0)),
@@ -129,8 +130,8 @@ WRONG = [
     (
         on(0.0 * C),
         ValueError,
-        "the prior is singular: it maps test vectors to 0; add a small multiple of dp.identity, and make known "
-        "unknowns constants of the function",
+        "the prior is singular: it maps test vectors to 0; add a small multiple of dp.identity, and remove known "
+        "entries from x",
     ),
     (
         on(dp.inverse(-dp.laplacian(LINE), "direct")),
@@ -150,7 +151,7 @@ WRONG = [
     (
         run(prior_root=of_matrix(np.eye(3))),
         ShapeError,
-        "prior_root maps to space(3), but the unknowns have shape (4, 3)",
+        "prior_root maps to space(3), but the unknowns have shape (4, 3); write R with R @ R.T equal to the prior",
     ),
     (
         run(prior_mean=np.zeros(3)),
@@ -236,8 +237,8 @@ def test_too_small_rank_is_reported():
 def test_loss_of_precision_is_reported():
     rows = np.array([[1e14, 0.0, 0.0], [0.0, 1.0, 0.0]])
     message = (
-        "eigenvalues of the misfit up to about 4.9e+02 are neglected, because they are lost in rounding beside the "
-        "largest one: variances are too large, by a factor of up to 494; give data with larger standard "
+        "eigenvalues of the misfit up to about 4.9e+02 are neglected, because they are below the rounding errors of "
+        "the largest one: variances are too large, by a factor of up to 494; give data with larger standard "
         "deviations, or a prior with smaller ones"
     )
     with pytest.warns(PosteriorWarning, match=re.escape(message)):

@@ -108,7 +108,7 @@ TABLE = [
     (
         pairs(SOLVE, coefficients=np.array([FACES, FACES])),
         SHAPE,
-        "eigenpairs takes one k, got a batch of 2; call it for each entry along the first axis",
+        "eigenpairs takes one coefficient k, got a batch of 2; call it for each entry along the first axis",
     ),
     (
         pairs(TWO, coefficients=1.0),
@@ -149,7 +149,7 @@ TABLE = [
     (
         pairs(TWO, 2, method="arpack"),
         VALUE,
-        "method arpack takes k below the 2 unknowns - 1, got 2; write method='dense'",
+        "method arpack takes k < 1 for 2 unknowns, got 2; write method='dense'",
     ),
     (
         pairs(LINE, 1, 1.0),
@@ -165,19 +165,19 @@ TABLE = [
     (
         pairs(LONG, mass=2.0, method="arpack", symmetric=False),
         VALUE,
-        "eigenpairs of a large operator that is not symmetric and a mass takes a shift, got which='smallest'; write a "
-        "number",
+        "method arpack for an operator that is not symmetric, with a mass, needs a shift, got which='smallest'; write "
+        "a number as which",
     ),
     (
         pairs(LONG, 3, method="arpack", symmetric=False, maxiter=1),
         FAILED,
-        "eigenpairs found 0 of 3 pairs; increase maxiter, or give a shift near to them by which",
+        "eigenpairs found 0 of 3 pairs; increase maxiter, or write a number near them as which",
     ),
     (
         lambda: dp.eigenpairs(WIND, symmetric=False).vectors,
         AttributeError,
-        "GeneralValues has no attribute 'vectors'; write eigenpairs(op, k) of a symmetric operator: symmetric=False "
-        "gives values only",
+        "GeneralEigenvalues has no attribute 'vectors'; write eigenpairs(op, k) of a symmetric operator: "
+        "symmetric=False gives values only",
     ),
     (
         lambda: grad(lambda m: anp.real(dp.eigenpairs(WIND, mass=m, symmetric=False).values[0]))(1.0),
@@ -256,13 +256,13 @@ def test_messages_of_failures(monkeypatch):
     monkeypatch.setattr(eigensolver, "INERTIA_UP_TO", 10)
     message = (
         "eigenpairs cannot find the end of the spectrum of .*, whose rows do not show that it has no negative "
-        "eigenvalue; give the shift: which=-1.0, below or near to the wanted eigenvalues"
+        "eigenvalue; write a number below or near the wanted eigenvalues, such as which=-1.0"
     )
     with pytest.raises(FAILED, match=message):
         dp.eigenpairs(biharmonic, method="arpack")
     monkeypatch.setattr(eigensolver, "AT_ROUNDOFF", 0.0)
     message = (
-        "pair 0 of eigenpairs has a relative residual of .*, more than .*; give a shift near to it by which, or "
+        "pair 0 of eigenpairs has a relative residual of .*, more than .*; write a number near it as which, or "
         "increase maxiter"
     )
     with pytest.raises(FAILED, match=message):
@@ -283,8 +283,8 @@ def test_messages_of_failures(monkeypatch):
     monkeypatch.setattr(eigen_rules, "BORDERED_LU_UP_TO", 0)
     monkeypatch.setattr(eigen_rules, "MOST_ITERATIONS", 1)
     message = (
-        "the adjoint solve of eigenpairs ended with a relative residual of .*; ask for more pairs, so that the gap "
-        "behind the last one is larger"
+        "the adjoint solve of eigenpairs ended with a relative residual of .*; increase k, so that the gap behind "
+        "the last pair is larger"
     )
     with pytest.raises(FAILED, match=message):
         slope(lambda pairs: anp.sum(pairs.vectors[0] ** 3), 1)()
