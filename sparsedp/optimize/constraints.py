@@ -131,6 +131,8 @@ class ConstraintFunction:
         self._outputs = outputs
         self._packing = packing
         self._name = name
+        for limit in (lower, upper):
+            check_kind(f"a limit of {name}", np.asarray(limit).dtype, "real numbers")
         self._limits = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
         self._user_jacobian = jacobian
         self.shape: Any = None
@@ -140,6 +142,8 @@ class ConstraintFunction:
         self._limit: Any = None
         if np.any(np.isnan(self._limits[0])) or np.any(np.isnan(self._limits[1])):
             raise ValueError(f"{name}: lb and ub must not be NaN; write -np.inf or np.inf for none")
+        if np.any(self._limits[0] == np.inf) or np.any(self._limits[1] == -np.inf):
+            raise ValueError(f"{name}: no value is >= lb=inf or <= ub=-inf; write lb=-np.inf or ub=np.inf for none")
 
     def at(self, vector: NDArray[np.float64]) -> LinearizedOutputs:
         """Return y at a point, with its derivatives. The first call determines the shape and the rows."""
@@ -534,6 +538,11 @@ def _constraint_of_scipy(entry, packing, name):
         return lambda x: function(packing.traced(x))
 
     if hasattr(entry, "A"):
+        if packing.complex:
+            raise TypeError(
+                f"{name}: a LinearConstraint takes real unknowns, got complex ones; write a function, such as "
+                "lambda x: np.real(np.sum(x)) - 1.0"
+            )
         matrix = entry.A if sp.issparse(entry.A) else np.atleast_2d(np.asarray(entry.A, dtype=float))
         if matrix.shape[1] != packing.size:
             raise ShapeError(

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 __all__ = ["SLSQP"]
 
 ACCURACY = 1e-30  # SciPy's own test of convergence, which is replaced by that of `minimize`
+DEPENDENT = "Singular matrix C", "More equality constraints than"  # in SciPy's messages about dependent equalities
 UNLIMITED = 2**31 - 1  # number of iterations in SciPy, which are counted by `minimize`
 
 
@@ -60,4 +61,7 @@ class SLSQP(ConstrainedMethod):
             callback=lambda z: run.record(problem.functions(z).usable),
             options={"ftol": ACCURACY, "maxiter": UNLIMITED},
         )
-        return f"SciPy's SLSQP ended ({result.message})"
+        reason = f"SciPy's SLSQP ended ({result.message})"
+        if any(cause in result.message for cause in DEPENDENT):
+            reason += "; for equalities that depend on each other write method='augmented_lagrangian'"
+        return reason

@@ -66,6 +66,12 @@ class TrustConstr(ConstrainedMethod):
         moving = lower < upper  # a barrier needs an interior
         if not moving.any():
             return "the bounds allow one point only"
+        equalities = int(np.count_nonzero(problem.equality))
+        if equalities > np.count_nonzero(moving):
+            return (
+                f"there are more equalities ({equalities}) than unknowns ({np.count_nonzero(moving)}); write "
+                "method='augmented_lagrangian'"
+            )
         start = whole_start[moving]
         lower = lower[moving]
         upper = upper[moving]

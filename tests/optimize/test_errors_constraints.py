@@ -112,6 +112,27 @@ WRONG = [
         "constraints: lb and ub must not be NaN; write -np.inf or np.inf for none",
     ),
     (
+        run(NonlinearConstraint(lambda x: x, np.inf, np.inf)),
+        ValueError,
+        "constraints: no value is >= lb=inf or <= ub=-inf; write lb=-np.inf or ub=np.inf for none",
+    ),
+    (
+        run(NonlinearConstraint(lambda x: x, 0.0, np.array([1.0, -np.inf]))),
+        ValueError,
+        "constraints: no value is >= lb=inf or <= ub=-inf; write lb=-np.inf or ub=np.inf for none",
+    ),
+    (
+        run(NonlinearConstraint(lambda x: x, 0.0, 1j)),
+        TypeError,
+        "a limit of constraints must hold real numbers, got dtype complex128",
+    ),
+    (
+        run(LinearConstraint([[1.0, 1.0]], 0.0, 1.0), start=(0.5j, 0.5)),
+        TypeError,
+        "constraints: a LinearConstraint takes real unknowns, got complex ones; write a function, such as "
+        "lambda x: np.real(np.sum(x)) - 1.0",
+    ),
+    (
         run(NonlinearConstraint(lambda x: x, np.zeros(3), np.ones(3))),
         ShapeError,
         "constraints: lb and ub of shapes (3,) and (3,) do not fit a value of shape (2,)",

@@ -2,6 +2,7 @@
 
 import functools
 import importlib.util
+import re
 import sys
 from types import ModuleType
 from typing import Any
@@ -604,6 +605,20 @@ def test_dependent_constraints_have_multipliers_too():
     best = dp.minimize(lambda x: anp.sum((x - 2.0) ** 2), np.zeros(2), "slsqp", constraints=constraints)
     first, second = best.multipliers
     assert best.converged and min(first, second) >= 0 and np.isclose(first + 2 * second, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("method", "reason"),
+    [
+        ("slsqp", r"More equality constraints than independent variables\); for equalities that depend on each other"),
+        ("trust_constr", r"there are more equalities \(2\) than unknowns \(1\)"),
+    ],
+)
+def test_dependent_equalities_name_the_method_that_takes_them(method, reason):
+    constraints = dp.equal(lambda x: np.array([1.0, 2.0]) * (x - 1.0))
+    best = dp.minimize(lambda x: (x - 3.0) ** 2, 0.0, method, constraints=constraints)
+    assert not best.converged and re.search(f"{reason}.* write method='augmented_lagrangian'", best.message)
+    assert dp.minimize(lambda x: (x - 3.0) ** 2, 0.0, "augmented_lagrangian", constraints=constraints).converged
 
 
 def test_a_table_and_a_page_show_the_violation():
