@@ -24,8 +24,8 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp._utils.base_classes import Value
-from sparsedp._utils.validation import check_number, check_type
-from sparsedp.autodiff.tape import dtype_of, isbox
+from sparsedp._utils.validation import check_kind, check_number, check_type
+from sparsedp.autodiff.tape import dtype_of, isbox, sample
 from sparsedp.errors import DerivativeError, NonFiniteError, ShapeError
 from sparsedp.grid.grid import AXES, Grid
 
@@ -466,6 +466,8 @@ class Patch(Value):
             If an array has another shape than the wall.
         ValueError
             If the patch covers no face.
+        TypeError
+            If a value holds no numbers.
 
         Examples
         --------
@@ -477,6 +479,7 @@ class Patch(Value):
         number = grid.axis(axis)
         faces = _faces_of(grid, number, f"the wall of {grid.axes[number]}", self)
         for name, value in (("inside", inside), ("elsewhere", elsewhere)):
+            check_kind(f"{name} of patch.values", np.asarray(sample(value)).dtype, "numbers")
             if np.shape(value) not in ((), faces.shape):
                 raise ShapeError(
                     f"values of a patch takes {name} as a number or an array of shape {faces.shape}, one entry for "

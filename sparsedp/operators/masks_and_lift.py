@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sparsedp._utils.validation import check_finite, check_kind, check_on, check_plain, check_type
-from sparsedp.autodiff.tape import isbox
+from sparsedp.autodiff.tape import isbox, sample
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.grid.boundary_conditions import SIDES, MixedWall, describe_patches, resolve, walls_of
 from sparsedp.grid.grid import Grid, check_grid
@@ -119,7 +119,7 @@ class MixedWalls(Space):
         if len(parts) == len(self.parts):
             for number, name in self.mixed.items():
                 part = parts[number]
-                if np.shape(part) == () and (isbox(part) or part != 0):
+                if np.size(sample(part)) == 1 and (isbox(part) or np.any(part != 0)):
                     raise ValueError(
                         f"{name} has several conditions, and one number does not say which of them it belongs to; "
                         f"write patch.values(grid, {name[0]!r}, number), or one entry for each face"

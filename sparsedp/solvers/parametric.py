@@ -445,7 +445,10 @@ class Batch:
                 error.args = (f"entry {i} of the batch: {error}", *error.args[1:])
                 raise
         if not solutions:
-            return np.empty((0, *space.shape), np.result_type(b, np.float32))
+            dtype = np.result_type(b, np.float32)
+            if np.iscomplexobj(k) or np.iscomplexobj(shift):
+                dtype = np.result_type(dtype, np.complex64)
+            return np.empty((0, *space.shape), dtype)
         return np.array(solutions)
 
     def _inverses(self, k, shift) -> list[Inverse]:

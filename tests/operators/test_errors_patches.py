@@ -148,6 +148,23 @@ TABLE = [
         "the wall, got shape (3,)",
     ),
     (
+        lambda: WALL.values(BOX, "x", None),
+        TYPE,
+        "inside of patch.values must hold numbers, got dtype object",
+    ),
+    *(
+        (
+            call,
+            VALUE,
+            "x-lower has several conditions, and one number does not say which of them it belongs to; write "
+            "patch.values(grid, 'x', number), or one entry for each face",
+        )
+        for call in (
+            lambda: LIFT.domain.join(np.array([20.0]), 0.0, 0.0, 0.0),
+            lambda: dp.grad(lambda value: anp.sum(LIFT.domain.join(value, 0.0, 0.0, 0.0)))(np.zeros((1, 1))),
+        )
+    ),
+    (
         lambda: LIFT.domain.join(20.0, 0.0, 0.0, 0.0),
         VALUE,
         "x-lower has several conditions, and one number does not say which of them it belongs to; write "

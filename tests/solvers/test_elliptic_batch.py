@@ -106,6 +106,9 @@ def test_kinds_of_numbers():
     assert solve(FACES[:0], RIGHT[:0]).shape == (0, *GRID.shape)
     assert solve(FACES[:1], RIGHT[0]).shape == (1, *GRID.shape)
     assert solve(FACES[:0], RIGHT[0]).shape == (0, *GRID.shape)
+    single = RIGHT[0].astype(np.float32)
+    assert solve(FACES[:0] + 0.1j, single).dtype == solve(FACES + 0.1j, single).dtype == np.complex64
+    assert solve(1.0, RIGHT[0], np.zeros((0, *GRID.shape), complex)).dtype == complex
 
 
 def test_one_dimension_and_one_cell():
