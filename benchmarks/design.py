@@ -2,14 +2,14 @@
 
 Run ``python -m benchmarks.design [cells ...] [--gradients N]`` in the root of the repository; 16, 64 and 256 cells an
 axis by default. The scene is that of examples/volume_to_point.py: a plate heated everywhere, cold at an opening, 40 %
-filled, with the same filter (radius 0.05) and the same penalty (SIMP, power 3) for all methods.
+filled, with the same filter (radius 0.05) and the same penalty (SIMP, exponent 3) for all methods.
 
 - First table: filter and penalty without projection; each method may use N gradients of the loss (200 by default).
 - Second table: five stages of projection with steepness 1 to 16, N / 5 gradients each. Optimality criteria need a
   small move there: with 0.2 they oscillate. The augmented Lagrangian is shown with the multipliers 0 at the begin of
   each stage, and with those of the stage before.
 
-A row: compliance (the mean temperature), share of the plate that is filled, how grey the design is (0: full and empty
+A row: compliance (the mean temperature), volume fraction, the measure of non-discreteness `grey` (0: full and empty
 cells only), gradients of the loss, and seconds. SLSQP forms dense matrices: it runs up to 16^2 cells.
 Seconds are of the processor, on one thread.
 """
@@ -22,7 +22,7 @@ import autograd.numpy as np
 
 import sparsedp as dp
 
-SHARE = 0.4
+VOLUME_FRACTION = 0.4
 POOR_CONDUCTIVITY = 1e-3
 RADIUS = 0.05
 STEEPNESS = (1.0, 2.0, 4.0, 8.0, 16.0)
@@ -38,13 +38,13 @@ class Plate:
         slopes = dp.gradient(grid, {"y": (opening, dp.neumann)})
         self.solve = dp.elliptic_solver(dp.divergence(grid), slopes)
         self.to_faces = dp.harmonic_average(grid)
-        self.soften = dp.inverse(dp.identity(grid.cells) - RADIUS**2 / 12 * dp.laplacian(grid))
+        self.smooth = dp.inverse(dp.identity(grid.cells) - RADIUS**2 / 12 * dp.laplacian(grid))
         self.heat = np.ones(grid.shape)
-        self.even = np.full(grid.shape, SHARE)
+        self.uniform = np.full(grid.shape, VOLUME_FRACTION)
 
     def density(self, z, steepness):
         """Return the filtered and, unless the steepness is None, projected unknowns."""
-        s = self.soften(z)
+        s = self.smooth(z)
         if steepness is None:
             return s
         edge = np.tanh(0.5 * steepness)
@@ -56,7 +56,7 @@ class Plate:
         return np.mean(self.heat * self.solve(self.to_faces(k), self.heat))
 
     def volume(self, z, steepness):
-        """Return the share of the plate that is filled."""
+        """Return the volume fraction."""
         return np.mean(self.density(z, steepness))
 
 
@@ -71,7 +71,7 @@ def optimality_criteria(plate, z, steepness, gradients, multipliers, move):
         while upper > (1.0 + 1e-6) * lower:
             multiplier = np.sqrt(lower * upper)
             new = np.clip(z * ratio / np.sqrt(multiplier), lowest, highest)
-            if plate.volume(new, steepness) > SHARE:
+            if plate.volume(new, steepness) > VOLUME_FRACTION:
                 lower = multiplier
             else:
                 upper = multiplier
@@ -90,7 +90,7 @@ def by_minimize(plate, z, steepness, gradients, multipliers, method, continues=F
         lambda z: plate.compliance(z, steepness),
         z,
         method,
-        constraints=lambda z: plate.volume(z, steepness) - SHARE,
+        constraints=lambda z: plate.volume(z, steepness) - VOLUME_FRACTION,
         bounds=(0.0, 1.0),
         maxiter=gradients,
         callback=lambda record, x: record.evaluations >= gradients,
@@ -116,7 +116,7 @@ def searches(n, in_stages):
 def row(n, label, stages, gradients, search):
     """Run the stages of one method, and print a row."""
     plate = Plate(n)
-    z = plate.even
+    z = plate.uniform
     dp.value_and_grad(lambda z: plate.compliance(z, stages[0]))(z)  # compiling is no part of a search
     used = 0
     multipliers = None
