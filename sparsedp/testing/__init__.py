@@ -1,9 +1,8 @@
 """Assertions about derivatives and transposes for test suites, and strategies of hypothesis for grids and fields.
 
-assert_gradient, assert_transpose   assertions.py
-grids, fields                       strategies.py; they need hypothesis
-plugin.py                           the plugin of pytest: fixtures of the same names, and the options ``--gradients``
-                                    and ``--gradients-annotations``
+`assert_gradient` and `assert_transpose` are in assertions.py, `grids` and `fields` in strategies.py; these two need
+hypothesis. plugin.py is the plugin of pytest: fixtures of the same names, and the options ``--gradients`` and
+``--gradients-annotations``.
 
 The functions work in projects that use no other part of sparsedp. Each is imported when it is first used, because
 pytest imports the plugin, and with it this file, in every project of an environment in which sparsedp is installed.
