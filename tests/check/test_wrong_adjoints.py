@@ -4,12 +4,15 @@ import re
 
 import numpy as np
 import pytest
+from sources import ROOT
 from true_derivatives import true_vjp
 
 import sparsedp as dp
 from benchmarks.wrong_adjoints import RIGHT, WRONG
+from benchmarks.wrong_adjoints.other_checks import check_grads, gradcheck, taylor
 from sparsedp._utils.pytree import leaves, mapped
 
+PAGE = ROOT / "docs" / "wrong_adjoints.md"
 SAMPLE = {
     "cold walls",
     "inflow",
@@ -94,6 +97,25 @@ def wrong_entries(case, x):
 def test_there_are_fifty_of_each():
     assert len(WRONG) == len(RIGHT) == 50
     assert len({case.name for case in WRONG + RIGHT}) == 100
+
+
+def test_the_page_has_a_row_for_every_program():
+    rows = re.findall(
+        r"^\| ([\w ]+) \| ([^|]+) \| (agrees|disagrees|inconclusive) \|", PAGE.read_text("utf-8"), re.MULTILINE
+    )
+    assert [(name, kind) for name, kind, _ in rows] == [(case.name, case.kind) for case in WRONG + RIGHT]
+    assert {verdict for _, _, verdict in rows[: len(WRONG)]} == {"disagrees"}
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("check", [check_grads, gradcheck, taylor])
+def test_checks_of_other_libraries(check):
+    """They see an error of a size in the order of the derivative, in complex fields and trees too."""
+    cases = {case.name: case.program() for case in WRONG + RIGHT}
+    for name in ("cold walls", "inflow", "intensity of light"):
+        assert check(cases[name]) == "disagrees"
+    for name in ("one number", "nested results", "counts and rates", "complex polynomial"):
+        assert check(cases[name]) == "agrees"
 
 
 @pytest.mark.whole
