@@ -29,10 +29,10 @@ from sparsedp.check.balanced_directions import (
     has_wide_leaves,
     hidden_entries,
 )
+from sparsedp.check.derivative_places import Places, diagnosis_of, places_of
 from sparsedp.check.derivative_review import review
 from sparsedp.check.direction_evidence import CONFIRMING_WORDS, DirectionEvidence, weigh
 from sparsedp.check.directions import SHIFT, SHIFT_SEED, examine_line
-from sparsedp.check.entries import MOST_ENTRIES, gaps_along_entries, listed
 from sparsedp.check.evaluations import EVALUATION_ERRORS, Evaluations, Line
 from sparsedp.check.functionals import FunctionalEvaluations, Functionals, balanced_weights, leaf_weights
 from sparsedp.check.loss_noise import measure_noise, noise_of_entries, noise_steps
@@ -60,6 +60,8 @@ HIDDEN_EPS = 1e3  # a derivative that changes f(x) by less than this multiple of
 ARGUMENTS = {"vjp": "g", "jvp": "t"}
 ACCEPTED_SHARE = 1e-4  # an undecided direction is accepted if gap and error bar are below this share of the derivative
 MOST_HIDDEN_PARTS = 3
+SMALL_SHARE = 1e-6  # a gap below this share may be the rounding error of an ill-conditioned solve,
+SMALL_ENTRY_SHARE = 1e-5  # if it is spread over x and no entry is off by more than this share
 
 
 def examined(line: Line, search_ripples: bool = False) -> DirectionEvidence:
@@ -127,6 +129,8 @@ class DerivativeAudit:
         The derivative under test.
     both : bool
         Whether VJP and JVP are also compared with each other.
+    title : str
+        Name of the derivative in sentences. Default: its kind.
 
     Attributes
     ----------
@@ -146,10 +150,11 @@ class DerivativeAudit:
         Relative gap between the derivative of a linear combination of them and the combination of the derivatives.
     """
 
-    def __init__(self, program: Program, options: Options, kind: str, both: bool = False) -> None:
+    def __init__(self, program: Program, options: Options, kind: str, both: bool = False, title: str = "") -> None:
         self.program = program
         self.options = options
         self.kind = kind
+        self.title = title or kind
         self.both = both
         self.groups: list[Group] = []
         self.findings: list[tuple[str, str]] = []
@@ -157,6 +162,7 @@ class DerivativeAudit:
         self.verdict = ""
         self.reason = ""
         self.gaps: tuple[str, ...] = ()
+        self.culprit: str | None = None
         self.worst: tuple[Group, DirectionEvidence] | None = None
         self.base: NDArray[Any] = np.empty(0)
         self.pairs: list[tuple[NDArray[Any], NDArray[Any]]] = []
@@ -186,7 +192,7 @@ class DerivativeAudit:
                     self.findings.append(("broken", str(error)))
             self.decide()
             if self.verdict == "disagrees" and self.worst is not None:
-                self.find_entries()
+                self.find_places()
 
     def _steps(self) -> tuple[float, ...]:
         """Return the step sizes of a sweep."""
@@ -412,6 +418,8 @@ class DerivativeAudit:
         """Return directions, by name, in the entries whose errors are hidden along a direction."""
         parts: dict[str, NDArray[Any]] = {}
         hidden = hidden_entries(point, slope, direction)
+        for group in self.groups[:-1]:  # with other weights: a small entry of J^T w is often small by chance
+            hidden &= hidden_entries(point, group.evaluations.slopes, direction)
         while np.any(hidden) and len(parts) < MOST_HIDDEN_PARTS:
             part = np.zeros(direction.size)
             part[hidden] = balanced_direction(point, np.where(hidden, slope, 0.0), self.options.rng)[hidden]
@@ -557,13 +565,18 @@ class DerivativeAudit:
                     if self.worst is None or share > self.worst[1].share:
                         self.worst = group, direction
 
-    # ---------------------------------------------------------------- places
-
-    def find_entries(self) -> None:
-        """Find the entries of x in which the derivative is wrong."""
+    def find_places(self) -> None:
+        """Find the entries in which the derivative is wrong, and the kind of the mistake."""
+        self.culprit = diagnosis_of(self)
+        places = self.places()
+        self.gaps = tuple(places.sentences)
         assert self.worst is not None
-        group, _ = self.worst
-        if self.kind == "vjp":
-            found = gaps_along_entries(group.evaluations, group.directions, MOST_ENTRIES)
-            point = group.evaluations.point
-            self.gaps = tuple(listed(found, point, group.evaluations.slopes, self.options.spaces, self.kind))
+        is_small = self.worst[1].share <= SMALL_SHARE and places.relative_gap <= SMALL_ENTRY_SHARE
+        is_explained = self.culprit is not None or self.findings or not places.is_spread
+        if self.kind == "vjp" and is_small and not is_explained:
+            self.verdict = "inconclusive"
+            self.reason += ": all entries are off by so little that rounding errors of an ill-conditioned f may do it"
+
+    def places(self) -> Places:
+        """Return the entries in which the derivative is wrong."""
+        return places_of(self)

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 
 from sparsedp._utils.validation import check_choice, check_function, check_number, check_whole
+from sparsedp.check.chain import Chain
 from sparsedp.check.derivative_audit import DerivativeAudit, Options
 from sparsedp.check.direction_evidence import CONFIRMING_WORDS
 from sparsedp.check.gradient_check import FEWEST_STEPS, Audit
 from sparsedp.check.hessian_audit import GradientHessianAudit, LossHessianAudit
 from sparsedp.check.matrices import Products, flattened, unflattened
 from sparsedp.check.point import audit_generator
-from sparsedp.check.programs import CONVENTIONS, Program
+from sparsedp.check.programs import CONVENTIONS, Program, library_of
 from sparsedp.check.table import Table
 from sparsedp.grid.grid import Grid
 from sparsedp.grid.space import Space
@@ -25,6 +26,7 @@ from sparsedp.operators.operator import Operator
 
 __all__ = ["DerivativeCheck", "hessian", "jacobian", "jvp", "vjp"]
 
+DERIVATIVES = ("vjp", "jvp")
 EXAMPLES = {"vjp": "lambda x, g: ...", "jvp": "lambda x, t: ..."}
 
 
@@ -41,6 +43,7 @@ def vjp(
     noise: float = 0.0,
     convention: str | None = None,
     beside: bool = True,
+    stages: Sequence[Any] | None = None,
 ) -> DerivativeCheck:
     """Check the vector-Jacobian product of any program against finite differences.
 
@@ -49,7 +52,8 @@ def vjp(
     f : callable or object
         ``f(x)`` returns an array, or a tree (tuple, list, dict) of arrays. It may be a NumPy function, a torch function
         or module, a JAX function, an Operator, a SciPy LinearOperator, or an object with the methods ``apply(x)`` and
-        ``vjp(x, g)``.
+        ``vjp(x, g)``. For a torch module, the point is ``{"x": x, "parameters": {...}}``, so that the derivatives in
+        its parameters are checked, too.
     vjp : callable, optional
         ``vjp(x, g)`` returns the cotangent of `x`, as a tree like `x`, for a cotangent `g` of the result. Default: the
         method of `f`, or the derivative of the library of `f`: torch, JAX, or the tape of this library.
@@ -74,6 +78,10 @@ def vjp(
         library of `f`.
     beside : bool
         Whether a second direction starts at a point near `x`. False for a VJP that is valid at `x` only.
+    stages : sequence, optional
+        The stages of `f` in the order in which they run: pairs ``(f_i, vjp_i)``, triples ``(name, f_i, vjp_i)``, or
+        objects with ``apply`` and ``vjp``. If the verdict is "disagrees", each stage is checked, and `.culprit` is the
+        first one that is wrong. With stages, `f` and `vjp` may be None: they are composed of the stages.
 
     Returns
     -------
@@ -93,6 +101,10 @@ def vjp(
     'disagrees'
     """
     options = _options("check.vjp", directions, steps, rng, grid, noise, beside)
+    if stages is not None:
+        chain = Chain(stages, "vjp")
+        f, vjp = chain.completed(f, vjp)
+        return _with_stage(_checked("vjp", f, vjp, jvp, x, options, convention), chain, x, options, convention)
     return _checked("vjp", f, vjp, jvp, x, options, convention)
 
 
@@ -109,6 +121,7 @@ def jvp(
     noise: float = 0.0,
     convention: str | None = None,
     beside: bool = True,
+    stages: Sequence[Any] | None = None,
 ) -> DerivativeCheck:
     """Check the Jacobian-vector product of any program against finite differences.
 
@@ -125,6 +138,8 @@ def jvp(
         ``vjp(x, g)``. If it is given, it is compared with the JVP by <g, J t> = <J^T g, t>.
     directions, steps, rng, grid, noise, convention, beside
         As for `check.vjp`.
+    stages : sequence, optional
+        As for `check.vjp`, with ``jvp_i`` in place of ``vjp_i``.
 
     Returns
     -------
@@ -142,6 +157,10 @@ def jvp(
     'agrees'
     """
     options = _options("check.jvp", directions, steps, rng, grid, noise, beside)
+    if stages is not None:
+        chain = Chain(stages, "jvp")
+        f, jvp = chain.completed(f, jvp)
+        return _with_stage(_checked("jvp", f, vjp, jvp, x, options, convention), chain, x, options, convention)
     return _checked("jvp", f, vjp, jvp, x, options, convention)
 
 
@@ -205,7 +224,7 @@ def jacobian(
 
     program = Program(f, x, pull, push, "transpose")
     program.takes_arrays = True
-    return _audited(DerivativeAudit(program, options, "vjp", both=True), "jacobian")
+    return _audited(DerivativeAudit(program, options, "vjp", True, "the Jacobian"), "jacobian")
 
 
 def hessian(
@@ -285,7 +304,7 @@ def hessian(
         raise TypeError("check.hessian takes real x, got complex numbers; split them into real and imaginary parts")
     if gradient is None:
         return _audited(LossHessianAudit(program, options), "hessian")
-    return _audited(GradientHessianAudit(program, options, "jvp"), "hessian")
+    return _audited(GradientHessianAudit(program, options, "jvp", False, "the Hessian"), "hessian")
 
 
 def _takes_vector(H: Any) -> bool:
@@ -345,6 +364,38 @@ def _audited(audit: DerivativeAudit, title: str) -> DerivativeCheck:
     return _result(audit, title, time.perf_counter() - start)
 
 
+def _with_stage(
+    result: DerivativeCheck, chain: Chain, x: Any, options: Options, convention: str | None
+) -> DerivativeCheck:
+    """Return the result of a check, with the first stage that is wrong if the whole is wrong."""
+    if result.verdict != "disagrees":
+        return result
+    for stage, point in chain.inputs(x):
+        function, derivative = stage.function, stage.derivative
+        derivatives = {"vjp": None, "jvp": None, chain.kind: derivative}
+        found = _checked(chain.kind, function, derivatives["vjp"], derivatives["jvp"], point, options, convention)
+        if found.verdict == "disagrees":
+            gaps = tuple(f"{stage.name}: {gap}" for gap in found.gaps)
+            note = f"{stage.name}: {found.reason}"
+            if found.culprit:
+                note += f"; {found.culprit}"
+            return _changed(result, culprit=stage.name, gaps=gaps, notes=(f"culprit: {note}", *_gap_notes(gaps)))
+    note = "culprit: no stage is wrong; the stages may be put together wrongly"
+    return _changed(result, culprit=None, notes=(note, *_gap_notes(result.gaps)))
+
+
+def _changed(result: DerivativeCheck, **values: Any) -> DerivativeCheck:
+    """Return a result with other values of some attributes."""
+    return DerivativeCheck(**(vars(result) | values))
+
+
+def _gap_notes(gaps: Sequence[str]) -> list[str]:
+    """Return the note about entries."""
+    if gaps:
+        return [f"largest gaps: {'; '.join(gaps)}"]
+    return []
+
+
 def _checked_steps(steps: Sequence[float] | None) -> tuple[float, ...]:
     """Return the steps of a sweep; raise an error if there are too few."""
     if steps is None:
@@ -381,13 +432,22 @@ def _function_and_point(
     elif hasattr(f, "matvec") and hasattr(f, "shape"):
         f, x, methods = _linear_operator(f, x, rng)
         convention = convention or "adjoint"
-    elif not callable(f) and hasattr(f, "apply"):
-        methods = {word: getattr(f, word) for word in ("vjp", "jvp") if hasattr(f, word)}
-        f = f.apply
+    elif library_of(f).name == "torch" and hasattr(f, "named_parameters"):
+        f, x = library_of(f).with_parameters(f, x)
+    elif _is_simulator(f):
+        methods = {word: getattr(f, word) for word in DERIVATIVES if hasattr(f, word)}
+        f = getattr(f, "apply", f)
     check_function(name, f, f"dp.{name}(f, x=x) with a function or an object with apply and vjp")
     if x is None:
         raise TypeError(f"{name} needs the point x at which the derivative is checked; write x=...")
     return f, x, methods, convention
+
+
+def _is_simulator(f: Any) -> bool:
+    """Return whether a program is an object of other code with the methods ``apply`` or ``vjp``."""
+    if type(f).__module__.partition(".")[0] in ("sparsedp", "jax", "jaxlib", "torch", "functools", "builtins"):
+        return False
+    return any(hasattr(f, word) for word in (*DERIVATIVES, "apply")) and not isinstance(f, type)
 
 
 def _linear_operator(op: Any, x: Any, rng: np.random.Generator) -> tuple[Any, Any, dict[str, Any]]:
@@ -419,14 +479,15 @@ def _result(audit: DerivativeAudit, title: str, seconds: float) -> DerivativeChe
     if audit.verdict == "agrees":
         digits = min(int(line.digits) for line in lines if line.word in CONFIRMING_WORDS)
     notes = [note for word, note in audit.findings if word == "note"]
-    if audit.gaps:
-        notes.append(f"largest gaps: {'; '.join(audit.gaps)}")
+    if audit.culprit:
+        notes.append(f"culprit: {audit.culprit}")
+    notes += _gap_notes(audit.gaps)
     return DerivativeCheck(
         kind=title,
         verdict=audit.verdict,
         reason=audit.reason,
         digits=digits,
-        culprit=None,
+        culprit=audit.culprit,
         hessian=None,
         gaps=audit.gaps,
         value=float(np.linalg.norm(audit.base)),
@@ -457,7 +518,7 @@ class DerivativeCheck(Audit):
     gaps : tuple of str
         If the verdict is "disagrees": the entries with the largest gaps between derivative and finite differences.
     culprit : str or None
-        The stage whose derivative is wrong.
+        The stage whose derivative is wrong, or the kind of the mistake if it is known, such as a missing conjugate.
     identities : tuple of Row
         The tested identities: linearity, equal results of equal calls, <g, J t> = <J^T g, t>.
     runs : dict

@@ -7,9 +7,9 @@ Bisection along one axis after the other therefore finds an entry with a large g
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from math import inf, isnan
+from math import inf, isinf, isnan, nan
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,6 +36,10 @@ __all__ = [
 MOST_ENTRIES = 3  # default number of entries that are searched for
 NEGLIGIBLE_SHARE = 0.05  # a part of a gap below this share counts as 0
 REMAINDER_SHARE = 0.01  # the search stops when the other entries together have less than this share of the largest gap
+SLAB_PARTS = 4  # a region is divided into this number of parts, each of which must have a gap
+NOISE_RATIO = 3.0  # a gap that was measured along a direction exceeds the noise by this factor
+FACTOR_DIRECTIONS = 3  # a common factor of all entries is measured along this number of directions
+FACTOR_SHARE = 0.02  # it may differ between them by this share of its distance from 1
 DEFAULT_STEP = 2.0**-11  # used if the sweep found no plateau
 CLEAR_OF_NOISE = 4.0  # a gap has to be this many times the noise of its measurement
 
@@ -54,13 +58,20 @@ class EntryGap(NamedTuple):
     gap : float
         Finite difference minus the derivative under test; NaN if the block is not a single entry.
     region : tuple of slice or None
-        A larger block that contains the whole gap of the leaf, such as all cells at one wall.
+        A larger block of wrong entries, such as all cells at one wall.
+    is_whole : bool
+        Whether the region contains the whole gap of the leaf.
+    factor : float
+        The derivative under test divided by the right one, if this ratio is the same for all entries of the region; NaN
+        if it is not, or if it was not measured.
     """
 
     leaf: int
     block: Block
     gap: float
     region: Block | None = None
+    is_whole: bool = True
+    factor: float = nan
 
     @property
     def sort_key(self) -> float:
@@ -79,8 +90,9 @@ def largest_gaps(
     shapes: Sequence[tuple[int, ...]],
     most: int = MOST_ENTRIES,
     noise: float = 0.0,
+    slope_along: Callable[[Sequence[NDArray[Any]]], float] | None = None,
 ) -> list[EntryGap]:
-    """Find entries with large gaps.
+    """Find entries with large gaps, and the regions of wrong entries around them.
 
     Parameters
     ----------
@@ -92,13 +104,16 @@ def largest_gaps(
         Largest number of entries to find.
     noise : float
         A gap below this value counts as 0.
+    slope_along : callable, optional
+        ``slope_along(weights)`` returns the derivative under test along a direction. If it is given, the factor by
+        which all entries of a leaf or region are wrong is measured.
 
     Returns
     -------
     list of EntryGap
         The largest gap first.
     """
-    search = _Search(gap_along, shapes, noise)
+    search = _Search(gap_along, shapes, noise, slope_along)
     entries: list[EntryGap] = []
     with suppress(_NotMeasured):
         while len(entries) < most:
@@ -139,8 +154,11 @@ class _Search:
         gap_along: Callable[[Sequence[NDArray[Any]]], float],
         shapes: Sequence[tuple[int, ...]],
         noise: float,
+        slope_along: Callable[[Sequence[NDArray[Any]]], float] | None = None,
     ) -> None:
         rng = np.random.default_rng(0)
+        self.rng = rng
+        self.slope_along = slope_along
         self.gap_along = gap_along
         self.shapes = shapes
         self.noise = noise
@@ -154,11 +172,44 @@ class _Search:
         """Return the gap of all entries that have not been found yet."""
         return self.gap_along(self.weights)
 
-    def block_gap(self, leaf: int, block: Block) -> float:
-        """Return the gap of a block of one leaf."""
+    def block_weights(self, leaf: int, block: Block) -> list[NDArray[Any]]:
+        """Return the weights of the entries in a block of one leaf, and zeros for all others."""
         weights = [np.zeros(shape) for shape in self.shapes]
         weights[leaf][block] = self.weights[leaf][block]
-        return self.gap_along(weights)
+        return weights
+
+    def block_gap(self, leaf: int, block: Block) -> float:
+        """Return the gap of a block of one leaf."""
+        return self.gap_along(self.block_weights(leaf, block))
+
+    def factor(self, leaf: int, block: Block) -> float:
+        """Return the derivative under test divided by the right one if it is the same in all entries of a block.
+
+        The ratio is measured along three directions. It is NaN if they differ.
+        """
+        if self.slope_along is None:
+            return nan
+        weights = self.block_weights(leaf, block)
+        entries = np.flatnonzero(weights[leaf])
+        if entries.size < 2:
+            return nan
+        shares = []
+        for number in range(FACTOR_DIRECTIONS):
+            gap = self.gap_along(weights)
+            slope = self.slope_along(weights)
+            if slope == 0 and abs(gap) > self.noise:
+                shares.append(0.0)
+            elif abs(gap) > FACTOR_SHARE * abs(slope) + self.noise or slope:
+                shares.append(slope / (slope + gap) if slope + gap else inf)
+            else:
+                return nan
+            if not _is_same_error(shares[0], shares[-1]):
+                return nan
+            if number + 1 < FACTOR_DIRECTIONS:
+                signs = self.rng.choice([-1.0, 1.0], entries.size) * self.rng.uniform(0.2, 1.8, entries.size)
+                weights = [weight.copy() for weight in weights]
+                weights[leaf].reshape(-1)[entries] = signs
+        return float(np.median(shares))
 
     def leaves_gap(self, low: int, high: int) -> float:
         """Return the gap of the leaves low, ..., high - 1."""
@@ -173,6 +224,12 @@ class _Search:
         """
         leaf, _, gap_of_leaf, _ = self._bisect(len(self.shapes), self.leaves_gap, total)
         gap = gap_of_leaf
+        everything = tuple(slice(None) for _ in self.shapes[leaf])
+        factor = self.factor(leaf, everything)
+        if not isnan(factor):
+            self.largest = max(self.largest, abs(gap))
+            self.weights[leaf][everything] = 0.0
+            return EntryGap(leaf, everything, nan, everything, True, factor)
         block = [slice(None)] * len(self.shapes[leaf])
         certain_axes = []  # axes along which the gap is concentrated at one position
         for axis, length in enumerate(self.shapes[leaf]):
@@ -185,15 +242,55 @@ class _Search:
             if beside <= NEGLIGIBLE_SHARE * abs(gap):
                 certain_axes.append(axis)
         self.largest = max(self.largest, abs(gap))
-        region = self._region(leaf, block, certain_axes, gap_of_leaf)
         weight = self.weights[leaf][tuple(block)]
         if not np.any(weight):
             return None
+        region = self._region(leaf, block, certain_axes, gap_of_leaf)
+        is_whole = region is not None and bool(np.all(self.weights[leaf]))  # no other gap was found in this leaf before
+        if region is not None and not is_whole:
+            visible = max(NEGLIGIBLE_SHARE * abs(gap), self.noise)
+            if not all(abs(part) > visible for part in self._part_gaps(leaf, region)):
+                region = None
+        if region is None and len(certain_axes) < len(block):
+            region = self._slab(leaf, block, gap)
         value = np.nan
         if np.size(weight) == 1:
             value = gap / float(np.reshape(weight, -1)[0])
+        if region is not None:
+            factor = self.factor(leaf, region)
         self.weights[leaf][tuple(block) if region is None else region] = 0.0
-        return EntryGap(leaf, tuple(block), value, region)
+        return EntryGap(leaf, tuple(block), value, region, is_whole, factor)
+
+    def _slab(self, leaf: int, block: list[slice], gap: float) -> Block | None:
+        """Return the block of all entries at the same position along one axis, if the gap is in all parts of it."""
+        for axis, length in enumerate(self.shapes[leaf]):
+            position = block[axis].start
+            if len(block) < 2 or length < 2 or block[axis].stop - position != 1:
+                continue
+            others = [slice(None)] * len(block)
+
+            def slab(at: int, axis: int = axis, others: list[slice] = others) -> Block:
+                return (*others[:axis], slice(at, at + 1), *others[axis + 1 :])
+
+            remainder = self.block_gap(leaf, slab(position)) - gap
+            visible = max(NEGLIGIBLE_SHARE * max(abs(gap), abs(remainder)), self.noise)
+            if abs(remainder) <= visible:
+                continue
+            neighbours = [at for at in (position - 1, position + 1) if 0 <= at < length]
+            if all(abs(self.block_gap(leaf, slab(at))) <= visible for at in neighbours):
+                if all(abs(part) > visible for part in self._part_gaps(leaf, slab(position))):
+                    return slab(position)
+        return None
+
+    def _part_gaps(self, leaf: int, block: Block) -> Iterator[float]:
+        """Yield the gaps of disjoint parts of a block, each with entries from all over it."""
+        weights = self.block_weights(leaf, block)
+        entries = np.flatnonzero(weights[leaf])
+        for start in range(min(SLAB_PARTS, entries.size)):
+            part = [np.zeros(shape) for shape in self.shapes]
+            chosen = entries[start::SLAB_PARTS]
+            part[leaf].reshape(-1)[chosen] = weights[leaf].reshape(-1)[chosen]
+            yield self.gap_along(part)
 
     def _region(self, leaf: int, block: list[slice], certain_axes: list[int], gap_of_leaf: float) -> Block | None:
         """Return the block of all entries at the same position along `certain_axes`, if it contains the whole gap."""
@@ -201,9 +298,16 @@ class _Search:
             return None
         region = tuple(part if axis in certain_axes else slice(None) for axis, part in enumerate(block))
         gap = self.block_gap(leaf, region)
-        if abs(gap_of_leaf - gap) <= NEGLIGIBLE_SHARE * abs(gap_of_leaf):
-            return region
-        return None
+        if abs(gap_of_leaf - gap) > NEGLIGIBLE_SHARE * abs(gap_of_leaf):
+            return None
+        # The gaps of the entries outside may have cancelled, so they are measured again with other weights.
+        outside = [np.zeros(shape) for shape in self.shapes]
+        signs = self.rng.choice([-1.0, 1.0], self.shapes[leaf])
+        outside[leaf][...] = self.weights[leaf] * signs
+        outside[leaf][region] = 0.0
+        if abs(self.gap_along(outside)) > max(NEGLIGIBLE_SHARE * abs(gap_of_leaf), self.noise):
+            return None
+        return region
 
     def _bisect(self, length: int, gap_between: Callable[[int, int], float], gap: float) -> _Bisection:
         """Halve a range repeatedly, and keep the half with the larger gap each time."""
@@ -226,12 +330,35 @@ class _Search:
         return _Bisection(low, high, gap, beside)
 
 
+def _is_same_error(first: float, second: float) -> bool:
+    """Return whether two ratios of a derivative to the right one show the same error."""
+    if first == second:
+        return True
+    return abs(first - second) <= FACTOR_SHARE * abs(first - 1) and abs(first - second) <= abs(first)
+
+
 def gaps_along_entries(
-    evaluations: Evaluations, directions: Sequence[DirectionEvidence], most: int = MOST_ENTRIES
+    evaluations: Evaluations,
+    directions: Sequence[DirectionEvidence],
+    most: int = MOST_ENTRIES,
+    slope_along: Callable[[NDArray[Any]], float] | None = None,
+    units: NDArray[Any] | None = None,
 ) -> list[EntryGap]:
     """Find the entries with the largest gaps between gradient and finite difference.
 
     The differences use the step of the direction with the largest gap.
+
+    Parameters
+    ----------
+    evaluations : Evaluations
+    directions : list of DirectionEvidence
+    most : int
+        Largest number of entries to find.
+    slope_along : callable, optional
+        ``slope_along(direction)`` returns the derivative under test along a direction. Default: by the gradient under
+        test.
+    units : ndarray, optional
+        The unit of each entry. Default: those of the point.
 
     Returns
     -------
@@ -242,6 +369,8 @@ def gaps_along_entries(
     wrong = [direction for direction in directions if direction.word in ("disagrees", "outside")]
     if point.entries < 2 or not wrong:
         return []
+    if units is None:
+        units = point.units
     worst = max(wrong, key=lambda direction: 0.0 if isnan(direction.share) else direction.share)
     if worst.step > 0:
         step = worst.step
@@ -253,7 +382,7 @@ def gaps_along_entries(
         jitter = 0.0
     noise = CLEAR_OF_NOISE * max(2.0, jitter) * evaluations.eps * abs(evaluations.base) / step
 
-    def gap_along(weights: Sequence[NDArray[Any]]) -> float:
+    def displacement(weights: Sequence[NDArray[Any]]) -> NDArray[Any]:
         parts = []
         for weight, x in zip(weights, point.values, strict=True):
             if np.iscomplexobj(x):
@@ -261,17 +390,40 @@ def gaps_along_entries(
             else:
                 part = weight
             parts.append(np.ravel(part).view(float))
-        direction = point.units * np.concatenate(parts)
+        return units * np.concatenate(parts)
+
+    def slope_of(weights: Sequence[NDArray[Any]]) -> float:
+        direction = displacement(weights)
+        if slope_along is None:
+            return float(evaluations.slopes @ direction)
+        return slope_along(direction)
+
+    def gap_along(weights: Sequence[NDArray[Any]]) -> float:
+        direction = displacement(weights)
         if not np.any(direction):
             return 0.0
         level = Line("entries", direction, evaluations).level(step)
         if level.note and level.note != UNCHANGED:
             raise _NotMeasured(level.note)
-        return level.difference - level.slope
+        if slope_along is None:
+            return level.difference - level.slope
+        return level.difference - slope_along(direction)
 
-    entries = largest_gaps(gap_along, [x.shape for x in point.values], most, noise)
-    units = [float(part[0]) if part.size else 1.0 for part in point.split(point.units)]
-    return [entry._replace(gap=entry.gap / units[entry.leaf]) for entry in entries]
+    if worst.size > 0:
+        noise = min(noise, worst.size / NOISE_RATIO)  # the gap was measured along a direction, so it is no noise
+    entries = largest_gaps(gap_along, [x.shape for x in point.values], most, noise, slope_of)
+    parts = point.split(units)
+    return [entry._replace(gap=entry.gap / _unit_of(entry, parts, point.values)) for entry in entries]
+
+
+def _unit_of(entry: EntryGap, units: Sequence[NDArray[Any]], values: Sequence[NDArray[Any]]) -> float:
+    """Return the unit of the first entry of a block."""
+    shape = values[entry.leaf].shape
+    of_leaf = units[entry.leaf]
+    if np.iscomplexobj(values[entry.leaf]):
+        of_leaf = of_leaf[::2]
+    of_block = np.reshape(of_leaf, shape)[entry.block]
+    return float(np.reshape(of_block, -1)[0]) if np.size(of_block) else 1.0
 
 
 # ------------------------------------------------------------ in words
@@ -320,6 +472,9 @@ def listed(
         name = point.names[entry.leaf]
         x = point.values[entry.leaf]
         slope = slopes[entry.leaf]
+        if entry.block == entry.region:
+            sentences.append(f"every entry of {name}: {source} {_factor_in_words(entry.factor)}")
+            continue
         words = f"{name}{subscript(entry.block, x.shape)}{where(entry.block, x.shape, spaces)}"
         if not isnan(entry.gap) and slope is not None and not np.iscomplexobj(x):
             derivative = float(np.reshape(slope, x.shape)[entry.block].reshape(-1)[0])
@@ -328,9 +483,27 @@ def listed(
             words += f": {by_differences:.{digits}g} by differences, {derivative:.{digits}g} by {source}"
         if entry.region is not None:
             region = f"{name}{subscript(entry.region, x.shape)}{where(entry.region, x.shape, spaces)}"
-            words += f" (all of the gap in {name} lies in {region})"
+            what = f"all of the gap in {name} lies in" if entry.is_whole else "as in all of"
+            factor = "" if isnan(entry.factor) else f", where {source} {_factor_in_words(entry.factor)}"
+            words += f" ({what} {region}{factor})"
         sentences.append(words)
     return sentences
+
+
+def _factor_in_words(factor: float) -> str:
+    """Return a phrase about a factor by which a derivative is wrong."""
+    if factor == 0:
+        return "is 0"
+    if isinf(factor):
+        return "should be 0"
+    if abs(factor + 1) < FACTOR_SHARE:
+        return "has the wrong sign"
+    if abs(factor) >= 1:
+        size = "too large"
+    else:
+        size = "too small"
+    digits = int(np.clip(3 - np.floor(np.log10(abs(factor - 1) or 1.0)), 3, 12))
+    return f"is {size}, by a factor of {factor:.{digits}g}"
 
 
 def _digits(gap: float, derivative: float) -> int:

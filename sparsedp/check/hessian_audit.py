@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from sparsedp._utils.pytree import norm
 from sparsedp.check.balanced_directions import balanced_direction
 from sparsedp.check.derivative_audit import DerivativeAudit, Group, Options
+from sparsedp.check.derivative_places import Places
 from sparsedp.check.directions import examine_line
+from sparsedp.check.entries import MOST_ENTRIES, largest_gaps, listed
 from sparsedp.check.evaluations import Evaluations, Level, Line
 from sparsedp.check.functionals import FunctionalEvaluations
 from sparsedp.check.point import Point
@@ -21,6 +23,7 @@ __all__ = ["GradientHessianAudit", "LossHessianAudit"]
 
 SYMMETRY_SHARE = 1e-8  # a larger relative gap between <u, H v> and <v, H u> is an error
 STEPS = tuple(2.0**-exponent for exponent in range(1, 28, 2))  # second differences need more of the coarse steps
+NOISE_FACTOR = 10.0  # a gap of an entry has to be this many times the rounding error of its measurement
 EVEN_EPS = 4.0  # rounding error of f(x + t d) + f(x - t d) - 2 f(x), in units of eps |f|
 
 
@@ -76,7 +79,7 @@ class LossHessianAudit(DerivativeAudit):
     """The audit of a Hessian by second differences of the loss. The program is the loss."""
 
     def __init__(self, program: Program, options: Options) -> None:
-        super().__init__(program, options, "jvp")
+        super().__init__(program, options, "jvp", False, "the Hessian")
 
     def _steps(self) -> tuple[float, ...]:
         """Return the step sizes of a sweep."""
@@ -124,3 +127,29 @@ class LossHessianAudit(DerivativeAudit):
     def products(self, point: Point, direction: NDArray[Any]) -> NDArray[Any]:
         """Return H d at a point by the products under test."""
         return self.program.push(point.fresh(), self.tangent(direction))
+
+    def places(self) -> Places:
+        """Return the entries in which the Hessian is wrong: those of v with the largest gaps of <u, H v>.
+
+        By second differences, <u, H v> is a quarter of the difference between the second derivatives along u + v and
+        u - v.
+        """
+        assert self.worst is not None
+        group, worst = self.worst
+        line = worst.line
+        point = group.evaluations.point
+        units = point.units
+        step = worst.step
+        product = self.products(point, line.direction)
+
+        def gap_along(weights: Any) -> float:
+            v = units * np.concatenate([np.ravel(weight) for weight in weights])
+            bends = []
+            for direction in (line.direction + v, line.direction - v):
+                level = SecondDifferences("entries", direction, group.evaluations, product).level(step)
+                bends.append(level.plus / step)
+            return (bends[0] - bends[1]) / 4 - float(product @ v)
+
+        noise = NOISE_FACTOR * float(line.rounding(np.array([step]), np.zeros((2, 1)))[0]) / step
+        found = largest_gaps(gap_along, [x.shape for x in point.values], MOST_ENTRIES, noise)
+        return Places(listed(found, point, None, self.options.spaces), False, 0.0)

@@ -32,6 +32,11 @@ class WrongResult(Exception):
     """A derivative returned something that cannot be a derivative: a wrong structure, shape or dtype."""
 
 
+def _no_parameters(f: Any, x: Any) -> tuple[Any, Any]:
+    """Return a function and its point unchanged."""
+    return f, x
+
+
 class Library(NamedTuple):
     """How a library stores arrays, and its convention for complex cotangents.
 
@@ -47,6 +52,8 @@ class Library(NamedTuple):
     convention : "transpose" or "adjoint"
         The derivative of a real loss along dz is Re(sum(g * dz)) for "transpose", and Re(sum(conj(g) * dz)) for
         "adjoint".
+    with_parameters : callable
+        ``with_parameters(module, x)`` returns a function of input and parameters, and the tree of both.
     """
 
     name: str
@@ -55,6 +62,7 @@ class Library(NamedTuple):
     vjp: Callable[[Any, Any, Any], Any]
     jvp: Callable[[Any, Any, Any], Any]
     convention: str
+    with_parameters: Callable[[Any, Any], tuple[Any, Any]] = _no_parameters
 
 
 def _unchanged(thing: Any) -> Any:
@@ -87,7 +95,8 @@ def _torch() -> Library:
     from sparsedp.interop import torch_bridge
 
     bridge = torch_bridge
-    return Library("torch", bridge.as_arrays, bridge.as_tensors, bridge.vjp_of, bridge.jvp_of, "adjoint")
+    functions = bridge.as_arrays, bridge.as_tensors, bridge.vjp_of, bridge.jvp_of
+    return Library("torch", *functions, "adjoint", bridge.with_parameters)
 
 
 def _jax() -> Library:

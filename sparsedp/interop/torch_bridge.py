@@ -422,6 +422,18 @@ def as_arrays(tree: Any) -> Any:
     return mapped(array, tree)
 
 
+def with_parameters(module: Any, x: Any) -> tuple[Callable, Any]:
+    """Return a module as a function of its input and its parameters, and the tree of both."""
+    parameters = {name: tensor.detach() for name, tensor in module.named_parameters()}
+    if x is None or not parameters:
+        return module, x
+
+    def call(tree: Any) -> Any:
+        return torch.func.functional_call(module, tree["parameters"], (tree["x"],))
+
+    return call, {"x": x, "parameters": parameters}
+
+
 def _is_floating(tensor: Any) -> bool:
     """Return whether a tensor has a real or complex floating dtype."""
     return tensor.is_floating_point() or tensor.is_complex()

@@ -125,6 +125,18 @@ def test_few_measurements():
     assert len(measured) <= 2 * 12 + 6
 
 
+def test_two_wrong_entries_are_no_region():
+    """Nor are they if both lie in one row; a row whose entries are all wrong is one, beside other wrong entries."""
+    error = np.zeros((16, 12))
+    error[3, 2] = error[3, 9] = 1.0
+    error[9, 9] = 0.5
+    found = largest_gaps(lambda weights: float(np.sum(error * weights[0])), [error.shape])
+    assert [one.region for one in found] == [None, None, None]
+    error[3] = np.linspace(1.0, 2.0, 12)
+    first = largest_gaps(lambda weights: float(np.sum(error * weights[0])), [error.shape])[0]
+    assert first.region == (slice(3, 4), slice(None)) and not first.is_whole
+
+
 def test_places_on_periodic_axes_nodes_and_batches():
     grid = dp.Grid((4, 3), size=(4.0, 3.0), periodic=(True, False))
     block = (slice(0, 1), slice(2, 3))

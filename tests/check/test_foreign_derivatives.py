@@ -1,5 +1,7 @@
 """Derivatives that other code computes: right ones agree, wrong ones disagree, within 40 runs of a right program."""
 
+import time
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -150,6 +152,175 @@ def test_a_function_that_changes_its_argument():
 
     result = VJP(doubled, lambda u, g: 2 * g, X)
     assert result.verdict == "disagrees" and "f(x) changes x in place" in result.reason
+
+
+# ---- places --------------------------------------------------------------------------------------------------------
+
+GRID = dp.Grid((4, 5))
+FIELD = np.sin(np.arange(20.0)).reshape(4, 5) + 2.0
+
+
+def scaled_where(place, factor):
+    """The VJP of a cube, times a factor at some entries."""
+
+    def pull(u, g):
+        slope = 3 * u**2 * g
+        slope[place] *= factor
+        return slope
+
+    return pull
+
+
+@pytest.mark.parametrize(
+    ("place", "factor", "words"),
+    [
+        ((0,), -1.0, "lies in x[0, :], at the lower x wall, where vjp has the wrong sign"),
+        ((slice(None), 4), 0.0, "lies in x[:, 4], at the upper y wall, where vjp is 0"),
+        ((..., [0, 4]), 1.1, "(as in all of x[:, 0], at the lower y wall, where vjp is too large, by a factor of 1.1)"),
+        ((...,), 2.0, "every entry of x: vjp is too large, by a factor of 2"),
+        ((...,), -1.0, "every entry of x: vjp has the wrong sign"),
+        ((2, 3), 1.01, "x[2, 3], at x = 2.5, y = 3.5: "),
+    ],
+)
+def test_the_wrong_entries_are_grouped(place, factor, words):
+    result = VJP(cube, scaled_where(place, factor), FIELD, grid=GRID)
+    assert result.verdict == "disagrees" and words in "; ".join(result.gaps), result.gaps
+
+
+def test_places_in_the_result_and_of_a_jvp():
+    def push(u, t):
+        product = 3 * u**2 * t
+        product[3] *= 0.5
+        return product
+
+    result = JVP(cube, push, FIELD, grid=GRID)
+    assert any(
+        "f(x)[3, :], at the upper x wall, where jvp is too small, by a factor of 0.5" in gap for gap in result.gaps
+    )
+    leaf = VJP(wave, lambda u, g: {**wave_vjp(u, g), "q": 0.0}, WAVE_POINT)
+    assert leaf.gaps[0].startswith("x['q']: ")
+
+
+def test_gaps_of_check_gradient_are_grouped():
+    slope = 2 * FIELD
+    slope[0] *= -1
+    loss = lambda u: np.sum(u**2)
+    (gap,) = dp.check.gradient(loss, FIELD, gradient=slope, quick=True).gaps
+    assert "lies in x[0, :], where the gradient has the wrong sign" in gap
+    (gap,) = dp.check.gradient(loss, FIELD, gradient=lambda u: 4 * u, quick=True).gaps
+    assert gap == "every entry of x: the gradient is too large, by a factor of 2"
+
+
+def test_mistakes_with_a_name():
+    shift = np.eye(12, k=1) + 2 * np.eye(12)
+    assert VJP(lambda u: shift @ u, lambda u, g: shift @ g, X).culprit == (
+        "it multiplies by the Jacobian instead of its transpose"
+    )
+    assert "uses a stored value" in VJP(cube, lambda u, g: cube_vjp(X, g), X).culprit
+    z = X + 0.5j
+    assert "convention='adjoint'" in VJP(lambda z: z**2, lambda z, g: np.conj(2 * z) * g, z).culprit
+    assert "a conjugate is missing" in VJP(lambda z: z**2, lambda z, g: 2 * z * np.conj(g), z).culprit
+
+
+def test_the_stage_that_is_wrong():
+    def smooth(u):
+        return u + 0.1 * np.roll(u, 1, 0)
+
+    def wrong_wall(u, g):
+        back = g + 0.1 * np.roll(g, -1, 0)
+        back[0] = -back[0]
+        return back
+
+    right = lambda u, g: g + 0.1 * np.roll(g, -1, 0)
+    stages = [(cube, cube_vjp), ("blur", smooth, wrong_wall), (np.sin, lambda u, g: np.cos(u) * g)]
+    result = VJP(None, x=FIELD, stages=stages, grid=GRID)
+    assert result.culprit == "stage 2 (blur)"
+    assert result.gaps[0].startswith("stage 2 (blur): x[0, ") and "at the lower x wall" in result.gaps[0]
+    stages[1] = (smooth, right)
+    assert VJP(None, x=FIELD, stages=stages).verdict == "agrees"
+    assert JVP(None, x=FIELD, stages=[(cube, lambda u, t: 3 * u**2 * t), (np.sin, lambda u, t: np.cos(u) * t)])
+    other = VJP(lambda u: 2 * np.sin(smooth(cube(u))), x=FIELD, stages=stages)
+    assert other.culprit is None and "no stage is wrong" in str(other)
+    with pytest.raises(
+        ValueError, match=r"^stages must have at least one stage, got none; write stages=\[\(f, vjp\)\]$"
+    ):
+        VJP(None, x=FIELD, stages=[])
+    with pytest.raises(TypeError, match=r"^stage 1 must be a pair of functions; write \(f, vjp\)$"):
+        VJP(None, x=FIELD, stages=[(cube, 3)])
+
+
+# ---- hard programs -------------------------------------------------------------------------------------------------
+
+
+def truncated_solve(b, tolerance):
+    """Conjugate gradients with a loose tolerance, as many codes have them."""
+    A = 2.1 * np.eye(b.size) - np.eye(b.size, k=1) - np.eye(b.size, k=-1)
+    x = np.zeros_like(b)
+    r = p = b
+    while r @ r > tolerance**2 * (b @ b):
+        a = (r @ r) / (p @ A @ p)
+        x = x + a * p
+        old = r
+        r = r - a * (A @ p)
+        p = r + (r @ r) / (old @ old) * p
+    return x
+
+
+WIDE = np.logspace(-12.0, 12.0, 40)
+SINGLE = np.linspace(1.0, 2.0, 30, dtype=np.float32)
+HARD = {
+    "entries of 24 decades": (np.log, lambda u, g: g / u, WIDE, "agrees"),
+    "results of 24 decades": (lambda u: WIDE * np.sin(u), lambda u, g: WIDE * np.cos(u) * g, np.ones(40), "agrees"),
+    "single precision": (np.sin, lambda u, g: np.cos(u) * g, SINGLE, "agrees"),
+    "kinks near x": (np.abs, lambda u, g: np.sign(u) * g, np.linspace(-1.0, 1.0, 30), "agrees"),
+    "an inexact solve": (
+        lambda u: truncated_solve(u**2, 1e-4),
+        lambda u, g: 2 * u * truncated_solve(g, 1e-4),
+        np.linspace(1.0, 2.0, 30),
+        "inconclusive",
+    ),
+    "a staircase": (lambda u: np.round(u, 3), lambda u, g: 0 * u, X, "inconclusive"),
+    "a constant": (lambda u: np.ones(3), lambda u, g: 0 * u, X, "inconclusive"),
+    "a kink at x": (lambda u: np.abs(u - X), lambda u, g: np.sign(u - X) * g, X, "inconclusive"),
+}
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_right_but_hard_programs(name):
+    f, pull, x, verdict = HARD[name]
+    assert VJP(f, pull, x).verdict == verdict
+
+
+def test_small_entries_hide_no_error():
+    wrong = 1 + 0.1 * (np.arange(40) == 3)
+    assert "x[3]" in VJP(np.square, lambda u, g: 2 * u * g * wrong, WIDE).gaps[0]
+    assert (
+        VJP(lambda u: WIDE * np.sin(u), lambda u, g: WIDE * np.cos(u) * g * wrong, np.ones(40)).verdict == "disagrees"
+    )
+    two = lambda p: 1e8 * p["a"] ** 2 + np.sum(p["b"] ** 2)
+    pull = lambda p, g: {"a": 2e8 * p["a"] * g, "b": np.sum(g) * p["b"]}
+    result = VJP(two, pull, {"a": X, "b": X[:3]})
+    assert result.gaps == ("every entry of x['b']: vjp is too small, by a factor of 0.5",)
+    tail = np.exp(-(np.linspace(-8.0, 8.0, 40) ** 2))
+    wall = np.ones(40)
+    wall[0] = 0.0
+    assert VJP(lambda u: u + u**2, lambda u, g: (1 + 2 * u) * g * wall, tail).verdict == "disagrees"
+
+
+@pytest.mark.slow
+def test_the_seconds_of_a_simulator_of_1e5_unknowns():
+    """Forty runs of 0.1 seconds; the rest of the work takes less than they do."""
+
+    def run(u):
+        time.sleep(0.1)
+        return u + 0.1 * np.roll(u, 1) * u - 0.05 * u**3
+
+    def pull(u, g):
+        time.sleep(0.1)
+        return 0.1 * np.roll(u, 1) * g + g - 0.15 * u**2 * g + np.roll(0.1 * u * g, -1)
+
+    result = VJP(run, pull, np.random.default_rng(0).standard_normal(10**5))
+    assert result and result.evaluations <= 40 and result.seconds < 8.0
 
 
 # ---- matrices ------------------------------------------------------------------------------------------------------
