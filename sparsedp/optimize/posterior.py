@@ -390,9 +390,12 @@ def _newton_step(residual, pairs, prior):
 
 
 def _estimated_diagonal(block, vectors, probes):
-    """Return an estimate of the diagonal of C - sum of v v^T, and its standard errors, by the XDiag method.
+    """Return an estimate of the diagonal of B = C - sum of v v^T, and its standard errors, by the XDiag method.
 
-    Each random vector is tested with a low-rank approximation that was computed from the other vectors.
+    With random signs w_i, the estimate is the mean over i of diag(P_i B) + w_i * (B - P_i B) w_i, where P_i projects on
+    the span of the products of B with all signs except w_i. The first term is exact, and the second estimates the
+    diagonal of the remainder. From B [w_1 ... w_m] = Q R follows P_i = Q (1 - s_i s_i^T) Q^T, where s_i is column i of
+    R^-T, normalized.
     """
     signs = np.random.default_rng(3).choice([-1.0, 1.0], (probes, block.size))
 

@@ -143,12 +143,17 @@ class PriorBlock(Uncached):
         return np.array([self._krylov_root(row) for row in normal])
 
     def _krylov_root(self, normal):
-        """Return C^(1/2) z by Lanczos iteration.
+        """Return C^(1/2) z by Lanczos iteration: |z| V T^(1/2) e_1, with the basis V and the tridiagonal matrix T.
 
         Raises
         ------
         ConvergenceError
             If the result still changes after ROOT_STEPS products.
+
+        References
+        ----------
+        E. Chow, Y. Saad, Preconditioned Krylov subspace methods for sampling multivariate Gaussian distributions, SIAM
+        J. Sci. Comput. 36, 2014.
         """
         size = np.linalg.norm(normal)
         previous = None

@@ -341,6 +341,9 @@ class Eigenpairs:
 
     Attributes
     ----------
+    values : array, shape (k,)
+        Ascending.
+    vectors : array, shape (k, *domain.shape)
     clusters : tuple of range
         The numbers of the pairs of each cluster; a simple eigenvalue is a cluster of one.
     cut : tuple of bool
