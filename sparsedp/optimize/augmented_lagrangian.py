@@ -30,8 +30,8 @@ LEAST_ACCURACY = 1e-12
 SUFFICIENT_DECREASE = 0.25  # the penalty grows unless the violation falls to this fraction
 LARGEST_PENALTY = 1e12
 LARGEST_MULTIPLIER = 1e12
-FARTHEST = 10.0  # a violation beyond this multiple of 1, or of that at the start, shows that the penalty is too small
-FRUITLESS = 3  # successive inner minimizations without a step after which the method ends
+LARGEST_VIOLATION = 10.0  # in units of 1 or of that at the start, whichever is larger; beyond it, the penalty grows
+MOST_FRUITLESS = 3  # successive inner minimizations without a step after which the method ends
 
 
 class AugmentedState(NamedTuple):
@@ -221,17 +221,17 @@ class AugmentedLagrangian(ConstrainedMethod):
             function: Any = self.function(state, problem)
             if self._inaccuracy(state, problem) <= state.accuracy or state.steps >= self.inner:
                 state = self._updated(state, problem)
-                if state.fruitless > FRUITLESS:
+                if state.fruitless > MOST_FRUITLESS:
                     raise NoStepFound("updates of the multipliers allow no further step")
                 continue
             try:
                 inner = self._lbfgs.advance(state.inner, function)
             except NoStepFound:
-                if state.fruitless >= FRUITLESS:
+                if state.fruitless >= MOST_FRUITLESS:
                     raise
                 state = self._updated(state, problem)
                 continue
-            if problem.at(inner.current.point).violation > FARTHEST * max(1.0, problem.start.violation):
+            if problem.at(inner.current.point).violation > LARGEST_VIOLATION * max(1.0, problem.start.violation):
                 state = self._restarted(state, problem)
                 continue
             return state._replace(inner=inner, steps=state.steps + 1, fruitless=0)

@@ -30,7 +30,7 @@ NEAR_BOUND = 1e-4  # entries of z that are closer to a bound are first assumed t
 REFINEMENTS = 5  # number of corrections of the set of entries at bounds when multipliers are estimated
 STORED_POINTS = 2
 LARGEST_ROWS = 20  # number of rows, those with the largest violations, with which the gradient of all is compared
-INFEASIBLE = 1e-3  # ratio of |J^T c| to the largest |J_i c_i| below which no step reduces the violation
+STATIONARY_VIOLATION = 1e-3  # ratio of |J^T c| to the largest |J_i c_i| below which no step reduces the violation
 
 
 class Point:
@@ -301,7 +301,7 @@ class ConstrainedProblem:
             of_row = np.zeros(signed.size)
             of_row[row] = signed[row]
             by_row.append(norm(point.vjp(of_row)))
-        return norm(gradient) <= INFEASIBLE * max(by_row, default=0.0)
+        return norm(gradient) <= STATIONARY_VIOLATION * max(by_row, default=0.0)
 
 
 class Violation:

@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 
 __all__ = ["ConstrainedMethod", "ConstrainedRun", "RunEnded", "minimize_constrained"]
 
-NEARLY = 1e-6  # feasibility and optimality that count as converged if the method finds no better point
+NEARLY_CONVERGED = 1e-6  # feasibility and optimality that count as converged if the method finds no better point
 ROUNDINGS = 30  # the same for the feasibility in single precision, in multiples of its machine epsilon
-MOST_RESTORING = 100  # largest number of steps that reduce the violation after a run without a feasible point
+MOST_RESTORATION_STEPS = 100  # largest number of steps that reduce the violation after a run without a feasible point
 
 
 class RunEnded(Exception):
@@ -103,7 +103,7 @@ class ConstrainedRun:
         self.message = ""
         self.converged = False
         self.stopped_by_user = False
-        self._nearly = max(NEARLY, ROUNDINGS * problem.packing.eps)
+        self._nearly = max(NEARLY_CONVERGED, ROUNDINGS * problem.packing.eps)
 
     @property
     def feasible(self) -> float:
@@ -217,7 +217,8 @@ class ConstrainedRun:
             last = failures[-1]
             reason = f"{reason}, {len(failures)} points refused ({last.error}: {last.message})"
         self.message = f"stopped: {reason}; dp.check.gradient(loss, x) tells whether the gradient is right"
-        stationary = max(NEARLY, np.sqrt(self.problem.packing.eps))  # rounding of the loss hides smaller gradients
+        # Rounding errors of the loss hide smaller gradients.
+        stationary = max(NEARLY_CONVERGED, np.sqrt(self.problem.packing.eps))
         if best.point.violation <= self._nearly and best.optimality <= stationary:
             self.best = best
             self.converged = True
@@ -239,7 +240,7 @@ class ConstrainedRun:
         lbfgs = LBFGS()
         state = lbfgs.begin(violation.of_point(best.point))
         point = best.point
-        for _ in range(min(self.maxiter, MOST_RESTORING)):
+        for _ in range(min(self.maxiter, MOST_RESTORATION_STEPS)):
             try:
                 state = lbfgs.advance(state, violation)
             except NoStepFound:

@@ -43,9 +43,9 @@ __all__ = ["RESCALE", "MisfitEigenpairs", "eigenpairs_of_jacobian", "eigenpairs_
 
 BLOCK = 10  # random samples, and vectors in a block of the Krylov space
 FIRST_BLOCKS = 2  # convergence is not tested before the space has this number of blocks
-ROOM = 6  # blocks beyond two vectors for each eigenpair, in the largest Krylov space
+SPARE_BLOCKS = 6  # blocks beyond two vectors for each eigenpair, in the largest Krylov space
 SHARE_OF_RESIDUALS = 0.1  # share of the tolerance for the residuals of the eigenpairs
-CLEARLY = 1 + 1e-6  # eigenvalues above a threshold by this factor are not equal to it
+CLEARLY_ABOVE = 1 + 1e-6  # eigenvalues above a threshold by this factor are not equal to it
 SAFETY = 10.0  # the norm of a matrix is rarely larger than this multiple of its products with random vectors
 FIRST_GROUP = 1e-4  # roots of eigenvalues above this multiple of the largest are taken from one matrix J C J^T
 ROUNDING = 1e3 * EPS  # eigenvalues below this multiple of the largest are lost in rounding of products with H
@@ -246,7 +246,7 @@ class KrylovSpace:
         self._prior = prior
         self._tolerance = tolerance
         self._rank = rank
-        self._most = min(prior.size, 2 * rank + ROOM * BLOCK)  # largest dimension
+        self._most = min(prior.size, 2 * rank + SPARE_BLOCKS * BLOCK)  # largest dimension
         self._blocks: list[Block] = []
         self._next = Block(np.zeros((0, prior.size)), np.zeros((0, prior.size)))  # extends the space
         self._continues = False  # whether the next block has the components of the last one outside of the space
@@ -279,12 +279,12 @@ class KrylovSpace:
 
     def count_above(self, threshold: float) -> int:
         """Return the number of Ritz values whose magnitude is clearly above a threshold."""
-        return int(np.count_nonzero(np.abs(self.values) > CLEARLY * threshold))
+        return int(np.count_nonzero(np.abs(self.values) > CLEARLY_ABOVE * threshold))
 
     @property
     def has_converged(self) -> bool:
         """Whether all eigenpairs above the threshold have converged."""
-        wanted = np.abs(self.values) > CLEARLY * self.threshold
+        wanted = np.abs(self.values) > CLEARLY_ABOVE * self.threshold
         # Each start leaves the components outside of the last space as they are, so the next one has a looser goal.
         count = max(1, int(np.count_nonzero(wanted)))
         goal = self._starts * SHARE_OF_RESIDUALS * self._tolerance / np.sqrt(count)
