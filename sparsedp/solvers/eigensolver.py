@@ -61,6 +61,8 @@ LARGEST_EXPONENT = 200  # an operator or a mass beyond this power of two is scal
 AT_ROUNDOFF = 128 * EPS  # residuals below this share of the terms are rounding errors
 ZERO = 4 * EPS  # lambda M v below this share of the terms of A v is 0
 LARGE_CONTRAST = 1e6  # of the mass; beyond it, errors name it as the reason
+COUNTED_UP_TO = 20_000  # unknowns up to which a factorisation tests that lobpcg missed no eigenvalue
+CLOSE = 1e-8  # relative distance below the last eigenvalue from which others are counted
 INNER = 1e-11  # relative tolerance of the solves inside of ARPACK
 TIGHT = 1e-11  # tolerance of ARPACK; a step of inverse iteration follows
 LOOSE = 1e-6  # tolerance of the search for missing copies
@@ -687,8 +689,7 @@ def _polished(pencil, solve, vectors, count):
 
 def _rayleigh_ritz(pencil, vectors):
     """Return the pairs of the pencil on the space of some vectors."""
-    norms = [np.sqrt(np.real(np.vdot(vector, pencil.apply_mass(vector)))) for vector in vectors]
-    vectors = vectors / np.array(norms)[:, None]
+    vectors = _orthonormal(pencil, vectors)
     images = np.array([pencil.apply_stiffness(vector) for vector in vectors])
     masses = np.array([pencil.apply_mass(vector) for vector in vectors])
     stiffness = vectors.conj() @ images.T
@@ -698,6 +699,27 @@ def _rayleigh_ritz(pencil, vectors):
     except la.LinAlgError:
         raise _mass_error(pencil) from None
     return values, combinations.T @ vectors
+
+
+def _orthonormal(pencil, vectors):
+    """Return vectors with the products v_i . M v_j = delta_ij, which span the same space, by the Gram-Schmidt process.
+
+    Solutions with a shift near an eigenvalue are almost parallel, so that a Cholesky factorisation of their products
+    would fail.
+    """
+    basis = np.zeros((0, pencil.size), vectors.dtype)
+    images = basis
+    for vector in vectors:
+        for _ in range(2):  # the first time leaves rounding errors of the components that it removes
+            vector = vector / np.linalg.norm(vector)
+            vector = vector - (images.conj() @ vector) @ basis
+        image = pencil.apply_mass(vector)
+        square = float(np.real(np.vdot(vector, image)))
+        if not square > 0:
+            raise _mass_error(pencil)
+        basis = np.concatenate([basis, vector[None] / np.sqrt(square)])
+        images = np.concatenate([images, image[None] / np.sqrt(square)])
+    return basis
 
 
 def _by_lobpcg(pencil, k, maxiter):
@@ -721,7 +743,6 @@ def _by_lobpcg(pencil, k, maxiter):
     block = np.array([pencil.masked(line) for line in block])
     for _ in range(2):
         block = np.array([solve(pencil.apply_mass(line)) for line in block])
-        block = la.qr(block.T, mode="economic")[0].T  # near a null vector the solutions are almost parallel
         bounds, block = _rayleigh_ritz(pencil, block)  # upper bounds of the eigenvalues
     if pencil.is_positive:  # a preconditioner that is nearly singular would favour one vector
         precondition = pencil.shifted_inverse(min(sigma, -0.1 * bounds[k]), 1e-2, True)
@@ -739,7 +760,22 @@ def _by_lobpcg(pencil, k, maxiter):
             maxiter=maxiter or 200,
             largest=False,
         )[:2]
-    return _polished(pencil, solve, vectors.T, k)
+    values, vectors = _polished(pencil, solve, vectors.T, k)
+    if pencil.op.structure.has_entries and pencil.unknowns <= COUNTED_UP_TO:
+        _check_complete(pencil, values, k)
+    return values, vectors
+
+
+def _check_complete(pencil, values, k):
+    """Raise ConvergenceError if there are more eigenvalues below the k-th than were found."""
+    distance = CLOSE * max(abs(values[k - 1]), CLOSE * pencil.scale)
+    missing = pencil.count_below(values[k - 1] - distance) - int(np.count_nonzero(values < values[k - 1] - distance))
+    if missing > 0:
+        raise ConvergenceError(
+            f"eigenpairs by lobpcg missed {missing} eigenvalues below {np.ldexp(values[k - 1], pencil.exponent):.6g}; "
+            "write method='arpack'",
+            info=failure("stagnated"),
+        )
 
 
 class PairResidual(NamedTuple):

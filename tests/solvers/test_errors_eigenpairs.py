@@ -80,6 +80,11 @@ TABLE = [
         "that rounding errors of the largest eigenvalues are large beside this one; write which='smallest' with "
         "method='arpack', a mass that varies less, or a larger rtol",
     ),
+    (
+        pairs(dp.from_matrix(np.diag(np.logspace(-12, 12, 30))), 4, method="lobpcg"),
+        FAILED,
+        "eigenpairs by lobpcg missed 8 eigenvalues below 0.00126896; write method='arpack'",
+    ),
     (pairs(TWO, 3), VALUE, "eigenpairs got k=3, but one has 2 unknowns; write a smaller k"),
     (pairs(TWO, 0), VALUE, "k of eigenpairs must be a whole number >= 1, got 0"),
     (
