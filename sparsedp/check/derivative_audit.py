@@ -496,8 +496,9 @@ class DerivativeAudit:
 
     def _test_repetition(self, weights: NDArray[Any], direction: NDArray[Any]) -> None:
         """Compare f(x) and its derivative with their first results, after runs at other points."""
-        tree = self.point.fresh()
-        again = self.program.value(tree)
+        vector = weights if self.kind == "vjp" else self.tangent(direction)
+        slopes = self.derivative(vector)  # before f runs at x again, so that values of the last run are those beside x
+        again = self.program.value(self.point.fresh())
         size = norm(self.base)
         gap = norm(again - self.base) / (size or 1.0)
         allowed = REPEATED_EPS * self.program.result.eps
@@ -507,9 +508,8 @@ class DerivativeAudit:
         for name, what in self.program.changed.items():
             call = {"f": "f(x)", "vjp": "vjp(x, g)", "jvp": "jvp(x, t)"}[name]
             self.findings.append(("broken", f"{call} changes {what} in place"))
-        vector = weights if self.kind == "vjp" else self.tangent(direction)
         first = self.groups[0].evaluations.slopes * self.point.units if self.kind == "vjp" else self._first_product
-        gap = self.relative_gap(self.derivative(vector), [first], vector)
+        gap = self.relative_gap(slopes, [first], vector)
         allowed = self.allowed(REPEATED_SHARE)
         self.rows.append(Row(f"{self.kind} twice", gap, allowed, gap <= allowed))
         if not gap <= allowed:

@@ -367,9 +367,13 @@ def _audited(audit: DerivativeAudit, title: str) -> DerivativeCheck:
 def _with_stage(
     result: DerivativeCheck, chain: Chain, x: Any, options: Options, convention: str | None
 ) -> DerivativeCheck:
-    """Return the result of a check, with the first stage that is wrong if the whole is wrong."""
+    """Return the result of a check, with the first stage that is wrong if the whole is wrong.
+
+    If no stage is found wrong, it is the only one that does not agree.
+    """
     if result.verdict != "disagrees":
         return result
+    undecided = []
     for stage, point in chain.inputs(x):
         function, derivative = stage.function, stage.derivative
         derivatives = {"vjp": None, "jvp": None, chain.kind: derivative}
@@ -380,6 +384,12 @@ def _with_stage(
             if found.culprit:
                 note += f"; {found.culprit}"
             return _changed(result, culprit=stage.name, gaps=gaps, notes=(f"culprit: {note}", *_gap_notes(gaps)))
+        if found.verdict == "inconclusive":
+            undecided.append((stage.name, found.reason))
+    if len(undecided) == 1:
+        name, reason = undecided[0]
+        note = f"culprit: {name}, as all other stages agree: {reason}"
+        return _changed(result, culprit=name, notes=(note, *_gap_notes(result.gaps)))
     note = "culprit: no stage is wrong; the stages may be put together wrongly"
     return _changed(result, culprit=None, notes=(note, *_gap_notes(result.gaps)))
 
