@@ -4,14 +4,19 @@ Notes
 -----
 Three methods: LAPACK on the full matrix, ARPACK in shift-invert mode, whose solves are those of `inverse`, and LOBPCG,
 whose preconditioner is an approximate solve. ARPACK and LOBPCG start from a fixed vector, so that results are
-reproducible. Four things happen after each of them:
+reproducible. The results are completed and tested:
 
 1. Missing copies: a Krylov space that starts from one vector contains one copy of a multiple eigenvalue; others enter
-   by rounding errors, or never. So the iteration is repeated on the complement of the vectors that are known, until
-   nothing nearer is found.
-2. One step of inverse iteration and a Rayleigh-Ritz projection bring residuals to the level of rounding errors.
+   by rounding errors, or never. So ARPACK is repeated in the complement of the known vectors, until it finds no nearer
+   eigenvalue. After LOBPCG, the negative pivots of A - sigma M count the eigenvalues below the last one.
+2. Steps of inverse iteration with a Rayleigh-Ritz projection bring residuals of ARPACK and LOBPCG to the level of
+   rounding errors. ARPACK follows LAPACK if the residuals of LAPACK are too large.
 3. The residual of every pair is computed and tested.
 4. The sign of a vector is fixed: its first large entry is positive.
+
+References
+----------
+B. N. Parlett, The symmetric eigenvalue problem, SIAM, 1998: shift-invert, inertia counts, Rayleigh-Ritz projections.
 """
 
 from __future__ import annotations
@@ -341,7 +346,7 @@ class Pencil:
         return solved
 
     def count_below(self, sigma: float) -> int:
-        """Return the number of eigenvalues below a shift: the number of negative pivots of A - sigma M."""
+        """Return the number of eigenvalues below a shift: that of negative pivots of A - sigma M (Sylvester's law)."""
         from scipy.sparse.linalg import splu
 
         stiffness, mass = self.matrices
