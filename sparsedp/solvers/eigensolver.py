@@ -321,7 +321,7 @@ class Pencil:
         return Operator(shifted.structure, self.op.domain, self.op.domain, f"shift of {self.name}")
 
     def shifted_inverse(self, sigma: float, rtol: float, definite: bool) -> Callable:
-        """Return the function b -> x with diag(w) (A - sigma M) x = b.
+        """Return the function that maps b to the solution x of diag(w) (A - sigma M) x = b.
 
         Parameters
         ----------
