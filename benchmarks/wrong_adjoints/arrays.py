@@ -126,7 +126,7 @@ def checkpoints_in_single_precision():
             g = (2 - 2 * state) * g
         return g
 
-    return f, vjp, np.linspace(1.35, 1.45, 6)
+    return f, vjp, np.linspace(1.6, 1.85, 6)
 
 
 @wrong("single precision")

@@ -30,7 +30,7 @@ from sparsedp.check.balanced_directions import (
     hidden_entries,
 )
 from sparsedp.check.derivative_places import Places, diagnosis_of, places_of
-from sparsedp.check.derivative_review import review
+from sparsedp.check.derivative_review import review, rounds_in_single_precision
 from sparsedp.check.direction_evidence import CONFIRMING_WORDS, DirectionEvidence, weigh
 from sparsedp.check.directions import SHIFT, SHIFT_SEED, examine_line
 from sparsedp.check.evaluations import EVALUATION_ERRORS, Evaluations, Line
@@ -42,7 +42,7 @@ from sparsedp.check.programs import Program, WrongResult
 from sparsedp.check.step_sizes import STEPS_BETWEEN, default_steps
 from sparsedp.check.summary import Row
 
-__all__ = ["DerivativeAudit", "Options"]
+__all__ = ["DerivativeAudit", "Group", "Options", "accept"]
 
 # Nine steps over eight decades. Single precision has the default steps.
 STEPS = tuple(2.0**-exponent for exponent in (2, 6, 10, 14, 17, 20, 23, 26, 29))
@@ -75,11 +75,16 @@ def examined(line: Line, search_ripples: bool = False) -> DirectionEvidence:
         finer = weigh(line)
         if finer.resolution < evidence.resolution or finer.word not in UNDECIDED:
             evidence = finer
+    accept(evidence)
+    return evidence
+
+
+def accept(evidence: DirectionEvidence) -> None:
+    """Accept a direction without a Taylor order if its gap is small on several neighbouring steps."""
     if evidence.word in UNDECIDED and evidence.is_close:
         if evidence.size + evidence.bar <= ACCEPTED_SHARE * evidence.scale:
             evidence.note = f"accepted with {evidence.digits:.1f} digits, although {evidence.note}"
             evidence.word = "agrees"
-    return evidence
 
 
 @dataclass
@@ -162,6 +167,7 @@ class DerivativeAudit:
         self.verdict = ""
         self.reason = ""
         self.gaps: tuple[str, ...] = ()
+        self.result_gaps: tuple[str, ...] = ()
         self.culprit: str | None = None
         self.worst: tuple[Group, DirectionEvidence] | None = None
         self.base: NDArray[Any] = np.empty(0)
@@ -179,7 +185,10 @@ class DerivativeAudit:
             controlled = thread.controlled
             self.base = self.program.start()
             self.point = self.program.point
-            if not np.all(np.isfinite(self.base)):
+            if not self.point.size or not self.base.size:
+                empty = "f(x)" if self.point.size else "x"
+                self.findings.append(("unsound", f"{empty} has no entries, so there is no derivative to check"))
+            elif not np.all(np.isfinite(self.base)):
                 self.findings.append(("unsound", self._non_finite("f(x)", self.base)))
             else:
                 self.like = Evaluations(self.program.value, self.point, None, self._steps())
@@ -495,9 +504,18 @@ class DerivativeAudit:
         self.rows.append(Row(f"linear in {argument}", self.linear_gap, allowed, self.linear_gap <= allowed))
 
     def _test_repetition(self, weights: NDArray[Any], direction: NDArray[Any]) -> None:
-        """Compare f(x) and its derivative with their first results, after runs at other points."""
+        """Compare f(x) and its derivative with their first results, after runs at other points.
+
+        The derivative comes first: if it uses a state of the last run of f, that was a run at another point.
+        """
         vector = weights if self.kind == "vjp" else self.tangent(direction)
-        slopes = self.derivative(vector)  # before f runs at x again, so that values of the last run are those beside x
+        first = self.groups[0].evaluations.slopes * self.point.units if self.kind == "vjp" else self._first_product
+        gap = self.relative_gap(self.derivative(vector), [first], vector)
+        allowed = self.allowed(REPEATED_SHARE)
+        self.rows.append(Row(f"{self.kind} twice", gap, allowed, gap <= allowed))
+        if not gap <= allowed:
+            reason = f"two runs of {self.kind} at x differ by {gap:.1e}: it keeps a state of other runs, or is random"
+            self.findings.insert(0, ("broken", reason))  # it explains why the VJP is not linear either
         again = self.program.value(self.point.fresh())
         size = norm(self.base)
         gap = norm(again - self.base) / (size or 1.0)
@@ -508,13 +526,6 @@ class DerivativeAudit:
         for name, what in self.program.changed.items():
             call = {"f": "f(x)", "vjp": "vjp(x, g)", "jvp": "jvp(x, t)"}[name]
             self.findings.append(("broken", f"{call} changes {what} in place"))
-        first = self.groups[0].evaluations.slopes * self.point.units if self.kind == "vjp" else self._first_product
-        gap = self.relative_gap(slopes, [first], vector)
-        allowed = self.allowed(REPEATED_SHARE)
-        self.rows.append(Row(f"{self.kind} twice", gap, allowed, gap <= allowed))
-        if not gap <= allowed:
-            reason = f"two runs of {self.kind} at x differ by {gap:.1e}: it keeps a state of other runs, or is random"
-            self.findings.insert(0, ("broken", reason))  # it explains why the VJP is not linear either
 
     def _test_duality(self, weights: NDArray[Any], direction: NDArray[Any]) -> None:
         """Compare <w, J d> by the JVP with <J^T w, d> by the VJP."""
@@ -569,11 +580,14 @@ class DerivativeAudit:
         """Find the entries in which the derivative is wrong, and the kind of the mistake."""
         self.culprit = diagnosis_of(self)
         places = self.places()
-        self.gaps = tuple(places.sentences)
+        self.gaps = tuple(places.in_argument)
+        self.result_gaps = tuple(places.in_result)
         assert self.worst is not None
         is_small = self.worst[1].share <= SMALL_SHARE and places.relative_gap <= SMALL_ENTRY_SHARE
         is_explained = self.culprit is not None or self.findings or not places.is_spread
-        if self.kind == "vjp" and is_small and not is_explained:
+        if self.kind == "vjp" and is_small and not is_explained and rounds_in_single_precision(self):
+            self.culprit = "it rounds values to single precision"
+        elif self.kind == "vjp" and is_small and not is_explained:
             self.verdict = "inconclusive"
             self.reason += ": all entries are off by so little that rounding errors of an ill-conditioned f may do it"
 

@@ -34,15 +34,16 @@ class Places(NamedTuple):
 
     Attributes
     ----------
-    sentences : list of str
-        One for each entry or region of x, and of f(x).
+    in_argument, in_result : list of str
+        A sentence for each entry or region of x, and of f(x).
     is_spread : bool
         Whether the gaps are at separate entries of x, without a region or a common factor.
     relative_gap : float
         The largest gap of these entries relative to the derivative there.
     """
 
-    sentences: list[str]
+    in_argument: list[str]
+    in_result: list[str]
     is_spread: bool
     relative_gap: float
 
@@ -66,9 +67,8 @@ def places_of(audit: Any) -> Places:
     slopes = None
     if audit.kind == "vjp":
         slopes = group.evaluations.slopes
-    sentences = listed(in_argument, point, slopes, audit.options.spaces, audit.title)
-    if not (in_argument and in_result and all(_is_everything(entry) for entry in in_argument + in_result)):
-        sentences += listed(in_result, audit.program.result, None, audit.options.spaces, audit.title)
+    argument_sentences = listed(in_argument, point, slopes, audit.options.spaces, audit.title)
+    result_sentences = listed(in_result, audit.program.result, None, audit.options.spaces, audit.title)
     is_spread = len(in_argument) > 1 and all(entry.region is None for entry in in_argument)
     relative_gap = 0.0
     if is_spread and slopes is not None:
@@ -76,12 +76,7 @@ def places_of(audit: Any) -> Places:
             slope = np.reshape(point.split(slopes)[entry.leaf], -1)
             size = float(np.max(np.abs(slope), initial=0.0))
             relative_gap = max(relative_gap, abs(entry.gap) / size if size else inf)
-    return Places(sentences, is_spread, relative_gap)
-
-
-def _is_everything(entry: EntryGap) -> bool:
-    """Return whether a gap is in every entry of a leaf, with a common factor."""
-    return entry.block == entry.region
+    return Places(argument_sentences, result_sentences, is_spread, relative_gap)
 
 
 def _clear(entries: list[EntryGap]) -> list[EntryGap]:
@@ -215,5 +210,5 @@ def _stored_value(audit: Any) -> str | None:
         if group.weights is last.weights and first is not None:
             slopes = group.evaluations.slopes
             if _is_curved(first) and np.any(slopes) and np.array_equal(slopes, last.evaluations.slopes):
-                return "it returns the same cotangent at x and beside x: a value is stored, or a term is missing"
+                return "it returns the same cotangent at x and beside x: it uses a stored value instead of x"
     return None

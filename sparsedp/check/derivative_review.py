@@ -12,7 +12,7 @@ from sparsedp.check.direction_evidence import CONFIRMING_WORDS, DirectionEvidenc
 from sparsedp.check.directions import reclassify_kinks
 from sparsedp.check.evaluations import UNCHANGED
 
-__all__ = ["review"]
+__all__ = ["review", "rounds_in_single_precision"]
 
 WRONG = ("disagrees", "outside")
 UNDECIDED = ("few", "noise", "rough", "masked", "constant")
@@ -28,6 +28,10 @@ NUDGE = 1e-10  # relative change of a vector, far below the rounding of single p
 ROUGH_SHARE = 0.3  # a larger second difference of the derivative is due to rounding
 LONG_SCALE = 2.0**6  # ratio of two steps over which the change of a differentiable function decreases clearly
 CHANGE_SHARE = 0.1
+SMOOTH_NOISE = 1e3  # noise of f in units of rounding, above which the roughness of a VJP shows nothing
+LARGER_NUDGE = 1e-6  # relative change of x, above the rounding of single precision
+SINGLE_SHARE = 2e-3  # a larger second difference of a VJP shows the rounding of single precision
+LEAST_CHANGE = 1e-4  # a smaller change of a VJP, relative to that of x, is due to rounding in double precision
 STAIRS = 2  # number of steps at which a staircase does not change although it should
 CLEAR_OF_ROUNDING = 100.0
 
@@ -140,6 +144,28 @@ def _roughness(audit: Any) -> float | None:
     behind = audit.derivative(vector - change) - middle
     size = max(norm(ahead), norm(behind))
     return norm(ahead + behind) / size if size else None
+
+
+def rounds_in_single_precision(audit: Any) -> bool:
+    """Return whether a VJP in double precision is a rough function of x, although f is smooth.
+
+    Then it rounds values that depend on x.
+    """
+    group = audit.groups[0]
+    if max(audit.point.eps, audit.program.result.eps) > SINGLE_EPS / 2 or group.evaluations.noise > SMOOTH_NOISE:
+        return False
+    point = audit.point
+    change = LARGER_NUDGE * point.units * np.random.default_rng(1).uniform(-1.0, 1.0, point.size)
+    slopes = [
+        audit.program.pull(point.unpack(point.vector + side * change), group.weights) * point.units
+        for side in (0.0, 1.0, -1.0)
+    ]
+    ahead = slopes[1] - slopes[0]
+    behind = slopes[2] - slopes[0]
+    size = max(norm(ahead), norm(behind))
+    if size <= LEAST_CHANGE * LARGER_NUDGE * norm(slopes[0]):
+        return False
+    return norm(ahead + behind) > SINGLE_SHARE * size
 
 
 def _drop_absolute_steps(audit: Any) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from sparsedp._utils.pytree import copied
 from sparsedp._utils.validation import check_choice, check_function, check_number, check_whole
 from sparsedp.check.chain import Chain
 from sparsedp.check.derivative_audit import DerivativeAudit, Options
@@ -52,8 +53,8 @@ def vjp(
     f : callable or object
         ``f(x)`` returns an array, or a tree (tuple, list, dict) of arrays. It may be a NumPy function, a torch function
         or module, a JAX function, an Operator, a SciPy LinearOperator, or an object with the methods ``apply(x)`` and
-        ``vjp(x, g)``. For a torch module, the point is ``{"x": x, "parameters": {...}}``, so that the derivatives in
-        its parameters are checked, too.
+        ``vjp(x, g)``, or ``vjp(g)`` for the last ``apply``. For a torch module, the point is ``{"x": x, "parameters":
+        {...}}``, so that the derivatives in its parameters are checked, too.
     vjp : callable, optional
         ``vjp(x, g)`` returns the cotangent of `x`, as a tree like `x`, for a cotangent `g` of the result. Default: the
         method of `f`, or the derivative of the library of `f`: torch, JAX, or the tape of this library.
@@ -311,13 +312,17 @@ def _takes_vector(H: Any) -> bool:
     """Return whether H is a function H(x, v), not a matrix or a function H(x)."""
     if not callable(H) or hasattr(H, "matvec") or isinstance(H, Operator):
         return False
+    return _needed_arguments(H) != 1
+
+
+def _needed_arguments(function: Any) -> int | None:
+    """Return the number of positional arguments without a default; None if it is not known."""
     try:
-        parameters = inspect.signature(H).parameters.values()
+        parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):  # functions without a signature
-        return True
+        return None
     kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    needed = [p for p in parameters if p.kind in kinds and p.default is inspect.Parameter.empty]
-    return len(needed) != 1
+    return len([p for p in parameters if p.kind in kinds and p.default is inspect.Parameter.empty])
 
 
 def _options(
@@ -351,7 +356,7 @@ def _checked(
     both = vjp is not None and jvp is not None
     for word, function in (("vjp", vjp), ("jvp", jvp)):
         if function is not None:
-            check_function(f"{word} of {name}", function, EXAMPLES[word])
+            check_function(f"{word} of {name}", function, EXAMPLES[word], 2)
     f, x, methods, convention = _function_and_point(name, f, x, options.rng, convention)
     program = Program(f, x, vjp or methods.get("vjp"), jvp or methods.get("jvp"), convention)
     return _audited(DerivativeAudit(program, options, kind, both), kind)
@@ -367,31 +372,23 @@ def _audited(audit: DerivativeAudit, title: str) -> DerivativeCheck:
 def _with_stage(
     result: DerivativeCheck, chain: Chain, x: Any, options: Options, convention: str | None
 ) -> DerivativeCheck:
-    """Return the result of a check, with the first stage that is wrong if the whole is wrong.
-
-    If no stage is found wrong, it is the only one that does not agree.
-    """
+    """Return the result of a check, with the first stage that is wrong if the whole is wrong."""
     if result.verdict != "disagrees":
         return result
-    undecided = []
     for stage, point in chain.inputs(x):
         function, derivative = stage.function, stage.derivative
         derivatives = {"vjp": None, "jvp": None, chain.kind: derivative}
         found = _checked(chain.kind, function, derivatives["vjp"], derivatives["jvp"], point, options, convention)
         if found.verdict == "disagrees":
             gaps = tuple(f"{stage.name}: {gap}" for gap in found.gaps)
+            result_gaps = tuple(f"{stage.name}: {gap}" for gap in found.result_gaps)
             note = f"{stage.name}: {found.reason}"
             if found.culprit:
                 note += f"; {found.culprit}"
-            return _changed(result, culprit=stage.name, gaps=gaps, notes=(f"culprit: {note}", *_gap_notes(gaps)))
-        if found.verdict == "inconclusive":
-            undecided.append((stage.name, found.reason))
-    if len(undecided) == 1:
-        name, reason = undecided[0]
-        note = f"culprit: {name}, as all other stages agree: {reason}"
-        return _changed(result, culprit=name, notes=(note, *_gap_notes(result.gaps)))
+            notes = (f"culprit: {note}", *_gap_notes(gaps, result_gaps))
+            return _changed(result, culprit=stage.name, gaps=gaps, result_gaps=result_gaps, notes=notes)
     note = "culprit: no stage is wrong; the stages may be put together wrongly"
-    return _changed(result, culprit=None, notes=(note, *_gap_notes(result.gaps)))
+    return _changed(result, culprit=None, notes=(note, *_gap_notes(result.gaps, result.result_gaps)))
 
 
 def _changed(result: DerivativeCheck, **values: Any) -> DerivativeCheck:
@@ -399,11 +396,14 @@ def _changed(result: DerivativeCheck, **values: Any) -> DerivativeCheck:
     return DerivativeCheck(**(vars(result) | values))
 
 
-def _gap_notes(gaps: Sequence[str]) -> list[str]:
-    """Return the note about entries."""
+def _gap_notes(gaps: Sequence[str], result_gaps: Sequence[str]) -> list[str]:
+    """Return the notes about entries of x and of f(x)."""
+    notes = []
     if gaps:
-        return [f"largest gaps: {'; '.join(gaps)}"]
-    return []
+        notes.append(f"largest gaps: {'; '.join(gaps)}")
+    if result_gaps:
+        notes.append(f"largest gaps in the result: {'; '.join(result_gaps)}")
+    return notes
 
 
 def _checked_steps(steps: Sequence[float] | None) -> tuple[float, ...]:
@@ -445,12 +445,28 @@ def _function_and_point(
     elif library_of(f).name == "torch" and hasattr(f, "named_parameters"):
         f, x = library_of(f).with_parameters(f, x)
     elif _is_simulator(f):
-        methods = {word: getattr(f, word) for word in DERIVATIVES if hasattr(f, word)}
+        methods = {word: _method(f, word) for word in DERIVATIVES if hasattr(f, word)}
         f = getattr(f, "apply", f)
     check_function(name, f, f"dp.{name}(f, x=x) with a function or an object with apply and vjp")
     if x is None:
         raise TypeError(f"{name} needs the point x at which the derivative is checked; write x=...")
     return f, x, methods, convention
+
+
+def _method(simulator: Any, name: str) -> Callable[[Any, Any], Any]:
+    """Return the derivative of a simulator object as a function of x and a vector.
+
+    The method may take the vector only, and differentiate the last call of ``apply``. Then ``apply`` runs first.
+    """
+    method = getattr(simulator, name)
+    if _needed_arguments(method) != 1:
+        return method
+
+    def after_apply(x: Any, vector: Any) -> Any:
+        simulator.apply(copied(x))
+        return method(vector)
+
+    return after_apply
 
 
 def _is_simulator(f: Any) -> bool:
@@ -491,7 +507,7 @@ def _result(audit: DerivativeAudit, title: str, seconds: float) -> DerivativeChe
     notes = [note for word, note in audit.findings if word == "note"]
     if audit.culprit:
         notes.append(f"culprit: {audit.culprit}")
-    notes += _gap_notes(audit.gaps)
+    notes += _gap_notes(audit.gaps, audit.result_gaps)
     return DerivativeCheck(
         kind=title,
         verdict=audit.verdict,
@@ -500,6 +516,7 @@ def _result(audit: DerivativeAudit, title: str, seconds: float) -> DerivativeChe
         culprit=audit.culprit,
         hessian=None,
         gaps=audit.gaps,
+        result_gaps=audit.result_gaps,
         value=float(np.linalg.norm(audit.base)),
         evaluations=sum(audit.program.runs.values()),
         runs=dict(audit.program.runs),
@@ -526,7 +543,10 @@ class DerivativeCheck(Audit):
     digits : int or None
         Number of digits that agree in the worst direction. None if the verdict is not "agrees".
     gaps : tuple of str
-        If the verdict is "disagrees": the entries with the largest gaps between derivative and finite differences.
+        If the verdict is "disagrees": the entries of `x` with the largest gaps between derivative and finite
+        differences, or the rows, walls and leaves whose entries are all wrong.
+    result_gaps : tuple of str
+        The same for the entries of ``f(x)``.
     culprit : str or None
         The stage whose derivative is wrong, or the kind of the mistake if it is known, such as a missing conjugate.
     identities : tuple of Row
@@ -553,6 +573,7 @@ class DerivativeCheck(Audit):
         "digits",
         "culprit",
         "gaps",
+        "result_gaps",
         "runs",
         "evaluations",
         "seconds",

@@ -209,19 +209,7 @@ class _Search:
                 signs = self.rng.choice([-1.0, 1.0], entries.size) * self.rng.uniform(0.2, 1.8, entries.size)
                 weights = [weight.copy() for weight in weights]
                 weights[leaf].reshape(-1)[entries] = signs
-        if not self._is_in_both_halves(leaf, entries):
-            return nan
         return float(np.median(shares))
-
-    def _is_in_both_halves(self, leaf: int, entries: NDArray[Any]) -> bool:
-        """Return whether two random halves of some entries have gaps. Entries without derivative fit every factor."""
-        shuffled = self.rng.permutation(entries)
-        for half in (shuffled[::2], shuffled[1::2]):
-            weights = [np.zeros(shape) for shape in self.shapes]
-            weights[leaf].reshape(-1)[half] = self.weights[leaf].reshape(-1)[half]
-            if not abs(self.gap_along(weights)) > self.noise:
-                return False
-        return True
 
     def leaves_gap(self, low: int, high: int) -> float:
         """Return the gap of the leaves low, ..., high - 1."""
@@ -238,9 +226,10 @@ class _Search:
         gap = gap_of_leaf
         everything = tuple(slice(None) for _ in self.shapes[leaf])
         factor = nan
-        if np.all(self.weights[leaf]):  # no entry of this leaf has been found before
+        if np.all(self.weights[leaf]):
             factor = self.factor(leaf, everything)
-        if not isnan(factor):
+        visible = max(NEGLIGIBLE_SHARE * REMAINDER_SHARE * abs(gap), self.noise)
+        if not isnan(factor) and all(abs(part) > visible for part in self._part_gaps(leaf, everything)):
             self.largest = max(self.largest, abs(gap))
             self.weights[leaf][everything] = 0.0
             return EntryGap(leaf, everything, nan, everything, True, factor)

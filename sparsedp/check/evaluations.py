@@ -21,7 +21,7 @@ from sparsedp.check.step_sizes import COARSER_STEPS, default_steps
 from sparsedp.check.summary import error_text
 from sparsedp.errors import SparsedpError
 
-__all__ = ["EVALUATION_ERRORS", "UNCHANGED", "Evaluations", "Level", "Line", "solvers_of"]
+__all__ = ["EVALUATION_ERRORS", "FLOAT_TINY", "UNCHANGED", "Evaluations", "Level", "Line", "solvers_of"]
 
 EVALUATION_ERRORS = (SparsedpError, ValueError, ArithmeticError)  # exceptions that a loss may raise at a trial point
 UNCHANGED = "the loss does not change"

@@ -20,6 +20,7 @@ from sparsedp.check.programs import Program
 __all__ = ["FunctionalEvaluations", "Functionals", "balanced_weights", "leaf_weights"]
 
 
+SMALLEST_SIZE = 1e-280  # weights relative to smaller values could overflow
 NOISY_EPS = 100.0  # an entry with more noise than this multiple of its rounding error has a smaller share
 
 
@@ -127,7 +128,7 @@ def leaf_weights(program: Program, base: NDArray[Any], change: NDArray[Any], rng
     weights = rng.standard_normal(base.size)
     for weight, *parts in zip(*(program.result.split(vector) for vector in (weights, base, change))):
         size = max(norm(part) for part in parts) / max(weight.size, 1) ** 0.5
-        weight /= size or 1.0
+        weight /= max(size, SMALLEST_SIZE) if size else 1.0
     return program.rounded(weights)
 
 

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from sparsedp._utils.pytree import norm
 from sparsedp.check.balanced_directions import balanced_direction
-from sparsedp.check.derivative_audit import DerivativeAudit, Group, Options
+from sparsedp.check.derivative_audit import DerivativeAudit, Group, Options, accept
 from sparsedp.check.derivative_places import Places
 from sparsedp.check.directions import examine_line
 from sparsedp.check.entries import MOST_ENTRIES, largest_gaps, listed
-from sparsedp.check.evaluations import Evaluations, Level, Line
+from sparsedp.check.evaluations import FLOAT_TINY, Evaluations, Level, Line
 from sparsedp.check.functionals import FunctionalEvaluations
 from sparsedp.check.point import Point
 from sparsedp.check.programs import Program
@@ -23,6 +23,7 @@ __all__ = ["GradientHessianAudit", "LossHessianAudit"]
 
 SYMMETRY_SHARE = 1e-8  # a larger relative gap between <u, H v> and <v, H u> is an error
 STEPS = tuple(2.0**-exponent for exponent in range(1, 28, 2))  # second differences need more of the coarse steps
+NEGLIGIBLE_BEND = 1e-6  # a second derivative counts as 0 if it and its error bar are below this share of the loss
 NOISE_FACTOR = 10.0  # a gap of an entry has to be this many times the rounding error of its measurement
 EVEN_EPS = 4.0  # rounding error of f(x + t d) + f(x - t d) - 2 f(x), in units of eps |f|
 
@@ -72,7 +73,8 @@ class SecondDifferences(Line):
 
     def rounding(self, steps: NDArray[Any], losses: NDArray[Any]) -> NDArray[Any]:
         """Return the rounding error of the second differences divided by the step."""
-        return EVEN_EPS * self.evaluations.eps * abs(self.loss) / steps
+        sizes = np.maximum(abs(self.loss) + steps * np.max(np.abs(losses), axis=0, initial=0.0), FLOAT_TINY)
+        return EVEN_EPS * self.evaluations.eps * sizes / steps
 
 
 class LossHessianAudit(DerivativeAudit):
@@ -118,7 +120,12 @@ class LossHessianAudit(DerivativeAudit):
             if not np.all(np.isfinite(product)):
                 self.findings.append(("broken", "the Hessian product holds NaN or infinity"))
                 continue
-            group.directions.append(examine_line(SecondDifferences(name, direction, evaluations, product)))
+            evidence = examine_line(SecondDifferences(name, direction, evaluations, product))
+            accept(evidence)
+            if evidence.word == "noise" and evidence.scale + evidence.bar <= NEGLIGIBLE_BEND * abs(evaluations.base):
+                evidence.word = "vanishes"
+                evidence.note = "the second derivative is 0 to rounding, beside the loss"
+            group.directions.append(evidence)
 
     def _loss(self, tree: Any) -> float:
         """Return the loss."""
@@ -152,4 +159,4 @@ class LossHessianAudit(DerivativeAudit):
 
         noise = NOISE_FACTOR * float(line.rounding(np.array([step]), np.zeros((2, 1)))[0]) / step
         found = largest_gaps(gap_along, [x.shape for x in point.values], MOST_ENTRIES, noise)
-        return Places(listed(found, point, None, self.options.spaces), False, 0.0)
+        return Places(listed(found, point, None, self.options.spaces), [], False, 0.0)

@@ -48,7 +48,8 @@ def noise_of_entries(values: Sequence[NDArray[Any]], base: NDArray[Any]) -> NDAr
     if not values:
         return np.zeros_like(base)
     differences = np.diff([value - base for value in values], ORDER, axis=0)
-    return np.sqrt(np.mean(differences**2, axis=0) / VARIANCE)
+    size = float(np.max(np.abs(differences), initial=0.0)) or 1.0  # the squares of large values overflow
+    return size * np.sqrt(np.mean((differences / size) ** 2, axis=0) / VARIANCE)
 
 
 def measure_noise(line: Line, points: int = POINTS) -> tuple[float, float]:

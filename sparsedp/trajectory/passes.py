@@ -394,12 +394,11 @@ class RolloutRule(Rule):
                 except BaseException as error:
                     release(kept, error)
                     raise
-        if not all(map(is_finite, last.values)):
-            try:
+        for value in last.values:
+            if not is_finite(value):
+                if isinstance(kept, DiskStates):
+                    kept.remove()
                 refuse_nonfinite_step(runner)
-            except BaseException as error:
-                release(kept, error)
-                raise
         runner.recorder.ended = True
         if specification.differentiated:
             self._last_fingerprint = last.fingerprint()

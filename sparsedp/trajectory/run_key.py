@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 __all__ = ["RunKey", "run_key"]
 
 LIBRARIES = sys.stdlib_module_names | {"autograd", "numpy", "scipy", "sparsedp"}  # their functions count by name
-MOST_OBJECTS = 10_000  # functions and other objects that are followed at most
-PLAIN_TYPES = (bool, int, float, complex, str, bytes, slice, np.dtype, type(None), type(...))
+MOST_OBJECTS = 1000  # functions and other objects that are followed at most
+PLAIN_TYPES = (np.generic, np.dtype, bool, int, float, complex, str, bytes, slice, type(None), type(...))
 FUNCTIONS_OF_C = (np.ufunc, BuiltinFunctionType, type(np.sum))
 
 
@@ -57,18 +57,15 @@ def run_key(specification: RolloutSpecification, args: Sequence) -> RunKey:
     """Return the hash of the step, the arguments and the options of a rollout."""
     statics = [form.statics for form in specification.forms]
     settings = (specification.n, specification.truncate, specification.differentiated, statics)
-    description = Description(specification.step)
+    description = Description()
+    description.add(specification.step)
     texts = [fingerprint(settings), *map(fingerprint, args), *description.texts]
     text = hashlib.sha256("\n".join(texts).encode()).hexdigest()[:32]
     return RunKey(text, description.is_complete)
 
 
 class Description:
-    """Texts that describe an object, and the objects to which it refers, and are the same in every process.
-
-    Parameters
-    ----------
-    value : object
+    """Texts that describe objects, and those to which they refer, and are the same in every process.
 
     Attributes
     ----------
@@ -77,21 +74,16 @@ class Description:
         Whether they describe everything.
     """
 
-    def __init__(self, value: Any) -> None:
+    def __init__(self) -> None:
         self.texts: list[str] = []
         self.is_complete = True
         self._numbers: dict[int, int] = {}  # of the objects that have been described, by their id
         self._objects: list[Any] = []  # these objects: while they exist, their ids are unique
-        self._pending = [value]  # a stack instead of a recursion: objects may be nested deeper than Python's limit
-        while self._pending:
-            self._add(self._pending.pop())
 
-    def _add(self, value):
-        """Add the texts of an object, without those of the objects to which it refers."""
-        if isinstance(value, (np.ndarray, np.generic)) and value.dtype != object:
+    def add(self, value: Any) -> None:
+        """Add the texts of an object."""
+        if isinstance(value, PLAIN_TYPES) or (isinstance(value, np.ndarray) and value.dtype != object):
             self.texts.append(fingerprint(value))
-        elif isinstance(value, PLAIN_TYPES):
-            self.texts.append(f"{type(value).__qualname__} {value!r}")
         elif id(value) in self._numbers:
             self.texts.append(f"object {self._numbers[id(value)]}")
         elif len(self._objects) >= MOST_OBJECTS:
@@ -104,7 +96,7 @@ class Description:
     def _add_object(self, value):
         """Add the texts of an object that is not a number, a text or an array of numbers."""
         if isinstance(value, Jitted):
-            self._pending.append(value.function)
+            self.add(value.function)
         elif isinstance(value, functools.partial):
             self._add_parts("partial", value.func, value.args, value.keywords)
         elif isinstance(value, MethodType):
@@ -129,7 +121,8 @@ class Description:
 
     def _add_parts(self, name, *parts):
         self.texts.append(f"{name} of {len(parts)}")
-        self._pending += reversed(parts)
+        for part in parts:
+            self.add(part)
 
     def _add_name(self, value, is_complete):
         """Add the name of a function, class or module, or the name of the class of another object."""
@@ -148,7 +141,8 @@ class Description:
             self.texts.append(_code_text(function.__code__))
             names = sorted(set(_names(function.__code__)) & function.__globals__.keys())
             referred += [function.__globals__[name] for name in names]
-        self._add_parts("references", *referred)
+        for value in referred:
+            self.add(value)
 
 
 def _is_of_library(value):
