@@ -427,6 +427,9 @@ class ForwardNode(JVPNode):
                 formula = distributed_formula(function, value, args, nums)
         if formula is None:
             _kind(function, value, args, nums)
+            if function is anp.concatenate_args:
+                self.g = _concatenated_tangent(args, nums, parents)
+                return
             super().__init__(value, replaced_functions.get(function, function), args, options, nums, parents)
             return
         total: Any = None
@@ -437,6 +440,16 @@ class ForwardNode(JVPNode):
             else:
                 total = added(total, g)
         self.g = total[0]
+
+
+def _concatenated_tangent(args, nums, parents):
+    """Return the tangent of a concatenation of n arrays; autograd adds n arrays of the size of the result."""
+    tangents = {num: parent.g for num, parent in zip(nums, parents, strict=True)}
+    axis, *arrays = args
+    parts = []
+    for num, array in enumerate(arrays, start=1):
+        parts.append(tangents[num] if num in tangents else anp.zeros_like(array))
+    return anp.concatenate_args(axis, *parts)
 
 
 def _kind(function, value, args, nums):

@@ -30,6 +30,17 @@ def test_grad_and_the_number_of_the_argument():
     assert (value, same) == (energy(U), of_k)
 
 
+def test_forward_mode_concatenates_all_tangents_at_once(monkeypatch):
+    """autograd's rule for one argument at a time takes n concatenations for n arrays."""
+    count = []
+    concatenate = np.concatenate
+    monkeypatch.setattr(np, "concatenate", lambda *args, **options: count.append(1) or concatenate(*args, **options))
+    value, tangent = dp.jvp(lambda u: anp.stack([k * u if k % 3 else GRID.volumes for k in range(30)], -1), U, T)
+    assert len(count) < 5
+    assert value.shape == (*GRID.shape, 30)
+    assert np.array_equal(tangent, np.stack([k * T if k % 3 else 0 * T for k in range(30)], -1))
+
+
 def test_vjp_of_several_arguments_and_of_a_tree():
     g = RNG.standard_normal(GRID.shape)
     value, pull = dp.vjp(lambda u, k: k * LAPLACIAN(u), U, 0.7)
