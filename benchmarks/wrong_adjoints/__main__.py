@@ -3,6 +3,7 @@
 Run ``python -m benchmarks.wrong_adjoints [--markdown]`` in the root of the repository. It needs torch and jax.
 """
 
+import re
 import sys
 import time
 
@@ -19,7 +20,7 @@ OTHERS = {"gradcheck": gradcheck, "check_grads": check_grads, "Taylor": taylor}
 def own_check(case):
     """Return the result of `check.vjp` for a case."""
     program = case.program()
-    return dp.check.vjp(program.f, program.vjp, program.x)
+    return dp.check.vjp(program.f, program.vjp, program.x, stages=program.stages or None)
 
 
 def other_verdict(case, name):
@@ -30,8 +31,30 @@ def other_verdict(case, name):
         return type(error).__name__
 
 
+def finding_of(result):
+    """Return the culprit, or a reason that tells more than the size of the gap."""
+    if result.culprit:
+        return result.culprit
+    if result.verdict == "disagrees" and result.reason.startswith("along"):
+        return ""
+    return result.reason.partition(", w 1: ")[2] or result.reason
+
+
+def place_of(result):
+    """Return the name of the entry with the largest gap, or of the region of all wrong entries."""
+    if not result.gaps:
+        return ""
+    entry = result.gaps[0]
+    if result.culprit:
+        entry = entry.removeprefix(f"{result.culprit}: ")
+    region = re.search(r"all of the gap in .* lies in (\S+\[.*?\])|as in all of (\S+\[.*?\])", entry)
+    if region:
+        return region[1] or region[2]
+    return entry.partition(":")[0]
+
+
 def row_of(case):
-    """Return the row of a case: name, fault, four verdicts, culprit, entry, runs, and seconds of the four checks."""
+    """Return the row of a case: the case, four verdicts, finding, entry, runs, and seconds of the four checks."""
     verdicts = []
     seconds = []
     with np.errstate(all="ignore"):
@@ -43,8 +66,7 @@ def row_of(case):
             begin = time.perf_counter()
             verdicts.append(other_verdict(case, name))
             seconds.append(time.perf_counter() - begin)
-    entry = result.gaps[0].partition(":")[0] if result.gaps else ""
-    return case, verdicts, result.culprit or "", entry, result.evaluations, seconds
+    return case, verdicts, finding_of(result), place_of(result), result.evaluations, seconds
 
 
 def is_false(case, verdict):
@@ -54,10 +76,10 @@ def is_false(case, verdict):
 
 def text_of(row):
     """Return the cells of a row as text."""
-    case, verdicts, culprit, entry, runs, seconds = row
+    case, verdicts, finding, entry, runs, seconds = row
     marked = [f"{verdict} (false)" if is_false(case, verdict) else verdict for verdict in verdicts]
     times = " ".join(f"{value:.2f}" for value in seconds)
-    return [case.name, case.kind, *marked, culprit, entry, str(runs), times]
+    return [case.name, case.kind, *marked, finding, entry, str(runs), times]
 
 
 def totals(rows):
@@ -91,7 +113,7 @@ def print_table(titles, rows, is_markdown):
 def main(is_markdown):
     """Print the table of wrong derivatives, that of right ones, and the totals."""
     row_of(RIGHT[0])  # imports
-    titles = ["program", "fault", *CHECKS, "culprit", "entry", "runs", "seconds"]
+    titles = ["program", "fault", *CHECKS, "culprit or reason", "entry", "runs", "seconds"]
     rows = []
     for cases in (WRONG, RIGHT):
         new = [row_of(case) for case in cases]
