@@ -192,7 +192,13 @@ def save_tree(path: str | os.PathLike, tree: Any, kind: str) -> None:
     text = json.dumps({"format": kind, "tree": _to_json(tree, arrays)})
 
     def write(stream):
-        np.savez(stream, np.frombuffer(text.encode(), np.uint8), *arrays)
+        try:
+            np.savez(stream, np.frombuffer(text.encode(), np.uint8), *arrays)
+        except ValueError as error:
+            interruption = error.__context__
+            if isinstance(interruption, KeyboardInterrupt):  # zipfile raised the error when it closed the stream
+                raise interruption from None
+            raise
 
     write_file(path, write)
 

@@ -216,6 +216,27 @@ def test_an_interruption_after_the_last_step(tmp_path, monkeypatch):
     assert not os.listdir(tmp_path)
 
 
+def test_an_interruption_while_cotangents_are_written(tmp_path, monkeypatch):
+    """zipfile then raises an error of its own, because it cannot close the unfinished file."""
+
+    def savez(*args):
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            raise ValueError("Can't close the ZIP file")  # noqa: B904
+
+    monkeypatch.setattr(disk_states, "INTERVAL", 0.0)
+    with monkeypatch.context() as patched:
+        patched.setattr(np, "savez", savez)
+        with pytest.raises(KeyboardInterrupt):
+            gradient(tmp_path)
+    monkeypatch.setattr(disk_states, "INTERVAL", np.inf)
+    records = []
+    assert same(gradient(tmp_path, record=records.append), WANTED)
+    assert records[0].resumed_at == N
+    assert not os.listdir(tmp_path)
+
+
 def test_a_run_that_exits_continues(tmp_path):
     step = Interrupted(at=20, error=SystemExit)
     with pytest.raises(SystemExit):
