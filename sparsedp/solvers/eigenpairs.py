@@ -232,6 +232,8 @@ def _pencil_member(name, op, coefficients, coefficients_name):
     if isinstance(op, ParametricSolver):
         op.D.backend.check("eigenpairs")
         op.D.codomain.backend.check("eigenpairs")
+        if isinstance(coefficients, list) and any(map(np.ndim, coefficients)):
+            raise TypeError(f"{coefficients_name} must be an array or a tuple (k, shift), got a list of arrays")
         if not isinstance(coefficients, tuple):
             coefficients = (coefficients,)
         if not coefficients:
@@ -498,6 +500,8 @@ class Eigenpairs:
 
     def _cluster_and_member(self, index):
         """Return the number of the cluster of a pair, and the place of the pair in it."""
+        if not hasattr(index, "__index__"):
+            raise TypeError(f"pairs[i] takes an integer, got {index!r}; write pairs.values[i] and pairs.vectors[i]")
         if not -len(self) <= index < len(self):
             raise IndexError(f"there is no pair {index} among {len(self)} eigenpairs; write 0 to {len(self) - 1}")
         index = range(len(self))[index]

@@ -26,7 +26,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from sparsedp._utils.validation import EPS
+from sparsedp._utils.validation import EPS, check_finite
 from sparsedp.errors import ConvergenceError
 from sparsedp.operators.masks_and_lift import diagonal, identity
 from sparsedp.operators.operator import Operator
@@ -342,17 +342,22 @@ class Pencil:
 
     def count_below(self, sigma: float) -> int:
         """Return the number of eigenvalues below a shift: the number of negative pivots of A - sigma M."""
-        from scipy.sparse.linalg import splu
-
         stiffness, mass = self.matrices
-        options = {"SymmetricMode": True}
         try:
-            factors = splu(
-                sp.csc_array(stiffness - sigma * mass), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options
-            )
+            return _negative_pivots(stiffness - sigma * mass)
         except RuntimeError:  # sigma is an eigenvalue
             return self.count_below(sigma - NUDGE * self.scale)
-        return int(np.count_nonzero(factors.U.diagonal().real < 0))
+
+    @cached_property
+    def mass_is_positive(self) -> bool:
+        """Whether M has positive pivots only; True if they are not known."""
+        is_known = isinstance(self.mass, Operator) and self.mass.structure.has_entries
+        if not is_known or self.unknowns > INERTIA_UP_TO:
+            return True
+        try:
+            return not _negative_pivots(self.matrices[1])
+        except RuntimeError:  # M is singular
+            return False
 
     @cached_property
     def is_positive(self) -> bool:
@@ -413,6 +418,15 @@ class Pencil:
         return sigma
 
 
+def _negative_pivots(matrix):
+    """Return the number of negative pivots of a symmetric matrix; raise RuntimeError if it is singular."""
+    from scipy.sparse.linalg import splu
+
+    options = {"SymmetricMode": True}
+    factors = splu(sp.csc_array(matrix), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+    return int(np.count_nonzero(factors.U.diagonal().real < 0))
+
+
 def _matrix(op: Operator) -> sp.csr_array:
     """Return the matrix of an operator; of one without entries, by its products with the unit vectors."""
     if op.structure.has_entries:
@@ -451,6 +465,8 @@ def symmetric_pairs(pencil: Pencil, settings: EigenSettings) -> Spectrum:
         if k + 1 < pencil.unknowns and not _are_accurate(pencil, k, scaled_which, values, vectors):
             method = "arpack"
             values, vectors = _by_arpack(pencil, k, scaled_which, maxiter)
+    elif not pencil.mass_is_positive:
+        raise _mass_error(pencil)
     elif method == "lobpcg":
         values, vectors = _by_lobpcg(pencil, k, maxiter)
     else:
@@ -463,10 +479,18 @@ def symmetric_pairs(pencil: Pencil, settings: EigenSettings) -> Spectrum:
     _check_residuals(residuals, pencil, method)
     is_zero = np.array([residual.is_zero for residual in residuals], bool)
     return Spectrum(
-        np.ldexp(np.where(is_zero, 0.0, values[chosen]), pencil.exponent),
+        _in_given_units(pencil, np.where(is_zero, 0.0, values[chosen])),
         vectors * 2.0 ** -(pencil.mass_exponent // 2),
-        np.ldexp(beyond, pencil.exponent),
+        _in_given_units(pencil, beyond),
     )
+
+
+def _in_given_units(pencil, values):
+    """Return eigenvalues of the operators as given, not scaled; raise NonFiniteError if they overflow."""
+    with np.errstate(over="ignore"):
+        values = values * 2.0 ** (pencil.exponent // 2) * 2.0 ** (pencil.exponent - pencil.exponent // 2)
+    check_finite(f"eigenvalues of {pencil.name}", values, advice="; write the operator and the mass in units near 1")
+    return values
 
 
 def _chosen_method(pencil, settings):
@@ -878,7 +902,7 @@ def general_values(pencil: Pencil, settings: EigenSettings) -> NDArray[Any]:
     else:
         values = _general_by_arpack(pencil, k, which, settings.maxiter)
     nearest = _distances(values.real if isinstance(which, str) else values, which).argsort(kind="stable")
-    return np.sort_complex(values[nearest[:k]]) * 2.0**pencil.exponent
+    return _in_given_units(pencil, np.sort_complex(values[nearest[:k]]))
 
 
 def _general_dense(pencil):

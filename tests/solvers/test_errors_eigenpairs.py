@@ -24,6 +24,7 @@ LINE = dp.from_functions(lambda u: 2 * u, lambda u: 2 * u, 600, 600, name="line"
 LONG = dp.upwind(dp.Grid(40, periodic=True), 0, 1)
 FACES = np.ones(GRID.faces.shape)
 ENTRIES = dp.matrix_solver.from_coo([0, 0, 1, 1], [0, 1, 0, 1])
+HALF = dp.from_matrix(np.diag([0.0, 1.0, 1.0, 1.0, 1.0, -1.0]))  # neither positive nor regular
 LIGHT = np.where(np.arange(25) == 12, 1e-12, 1.0).reshape(5, 5)
 HEAVY = np.where(np.arange(25) == 12, 1e20, 1.0).reshape(5, 5)
 
@@ -199,6 +200,27 @@ TABLE = [
         lambda: dp.jit(lambda m: dp.eigenpairs(TWO, mass=m).values[0])(1.0),
         dp.errors.JitError,
         "dp.jit cannot record eigenpairs, which decides by values; call the function without dp.jit",
+    ),
+    (
+        lambda: dp.eigenpairs(TWO, 2)[0:1],
+        TYPE,
+        "pairs[i] takes an integer, got slice(0, 1, None); write pairs.values[i] and pairs.vectors[i]",
+    ),
+    (
+        pairs(SOLVE, coefficients=[FACES, 0.1]),
+        TYPE,
+        "coefficients must be an array or a tuple (k, shift), got a list of arrays",
+    ),
+    (
+        pairs(TWO, mass=1e-320),
+        FINITE,
+        "eigenvalues of one must be finite, got 1 that are NaN or infinite, the first at 0; write the operator and the "
+        "mass in units near 1",
+    ),
+    (
+        pairs(dp.from_matrix(np.diag(np.arange(-2.0, 4.0))), mass=HALF, method="arpack"),
+        VALUE,
+        "mass must be positive definite, and the one given is not; write a mass > 0 in all unknowns",
     ),
     (lambda: dp.eigenpairs(TWO, 2)[2], IndexError, "there is no pair 2 among 2 eigenpairs; write 0 to 1"),
     (
