@@ -2,7 +2,7 @@
 
 The hash covers the arguments, the options, and everything that the step refers to: its code, its defaults, its
 closure, its global variables, and those of the functions among them. Functions of this library and of NumPy, SciPy and
-autograd count by name, and objects of this library by the call that constructs them.
+autograd count by name and version, and objects of this library by the call that constructs them.
 
 The content of some objects cannot be hashed, such as that of instances of the user's classes: they may hold counters,
 open files or random generators. The key says whether there are any.
@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 
 __all__ = ["RunKey", "run_key"]
 
-LIBRARIES = sys.stdlib_module_names | {"autograd", "numpy", "scipy", "sparsedp"}  # their functions count by name
+PACKAGES = ("autograd", "numpy", "scipy", "sparsedp")
+LIBRARIES = sys.stdlib_module_names | set(PACKAGES)  # their functions count by name
 MOST_OBJECTS = 1000  # functions and other objects that are followed at most
 PLAIN_TYPES = (np.generic, np.dtype, bool, int, float, complex, str, bytes, slice, type(None), type(...))
 FUNCTIONS_OF_C = (np.ufunc, BuiltinFunctionType, type(np.sum))
@@ -59,9 +60,20 @@ def run_key(specification: RolloutSpecification, args: Sequence) -> RunKey:
     settings = (specification.n, specification.truncate, specification.differentiated, statics)
     description = Description()
     description.add(specification.step)
-    texts = [fingerprint(settings), *map(fingerprint, args), *description.texts]
+    texts = [fingerprint(settings), *map(fingerprint, args), *_versions(), *description.texts]
     text = hashlib.sha256("\n".join(texts).encode()).hexdigest()[:32]
     return RunKey(text, description.is_complete)
+
+
+def _versions() -> Iterator[str]:
+    """Yield the versions of the packages whose functions count by name."""
+    from importlib import metadata  # slow to import
+
+    for package in PACKAGES:
+        try:
+            yield f"{package} {metadata.version(package)}"
+        except metadata.PackageNotFoundError:
+            yield package
 
 
 class Description:

@@ -375,6 +375,11 @@ def test_what_the_step_refers_to_belongs_to_the_run(monkeypatch):
     assert wanted != key(using(diffusion(0.2)))
     monkeypatch.setitem(globals(), "GAIN", 2.0)
     assert wanted != key(using(solve))
+    monkeypatch.setitem(globals(), "GAIN", 1.0)
+    assert wanted == key(using(solve))
+    with monkeypatch.context() as patched:
+        patched.setattr("importlib.metadata.version", lambda package: "another version")
+        assert wanted != key(using(solve))
     assert key(dp.stepper("rk4", make(1.0), 0.1)) != key(dp.stepper("rk4", make(1.0), 0.2))
     matrix = lambda factor: factor * sp.eye_array(3, format="csr")
     assert len({key(make(matrix(1.0))), key(make(matrix(2.0))), key(make({1.0})), key(make({"a": 1.0}))}) == 4
