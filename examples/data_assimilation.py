@@ -265,19 +265,19 @@ for name, (loss, method, maxiter, arguments, field) in searches.items():
 if options.out:
     from matplotlib import pyplot
 
-    picture, places = pyplot.subplots(1, 4, figsize=(17, 3.8), layout="constrained")
+    picture, axes = pyplot.subplots(1, 4, figsize=(17, 3.8), layout="constrained")
     days = 0.5 * np.arange(CYCLES * (WINDOW + 1)) * WINDOW / (WINDOW + 1)
     for name, errors in errors_in_time.items():
-        places[0].plot(days, errors["analysis"], label=f"{name} constraint")
-    places[0].set(title="Lorenz-96: analysis", xlabel="days", ylabel="error", ylim=(0.0, None))
-    places[0].legend()
+        axes[0].plot(days, errors["analysis"], label=f"{name} constraint")
+    axes[0].set(title="Lorenz-96: analysis", xlabel="days", ylabel="error", ylim=(0.0, None))
+    axes[0].legend()
     limits = -np.max(np.abs(flow.truth)), np.max(np.abs(flow.truth))
-    for ax, (title, field) in zip(places[1:3], {"truth": flow.truth, "estimate": fields["gauss_newton, z"]}.items()):
+    for ax, (title, field) in zip(axes[1:3], {"truth": flow.truth, "estimate": fields["gauss_newton, z"]}.items()):
         dp.plot(flow.grid, field, ax=ax, title=title, label="vorticity", limits=limits)
         ax.plot(*flow.places.T, "k.", markersize=3)
     for name, curve in curves.items():
-        places[3].plot(*zip(*curve), label=name)
-    places[3].set(title="error against time", xlabel="seconds", ylabel="error of the vorticity", xscale="log")
-    places[3].legend(loc="center left")
+        axes[3].plot(*zip(*curve), label=name)
+    axes[3].set(title="error against time", xlabel="seconds", ylabel="error of the vorticity", xscale="log")
+    axes[3].legend(loc="lower left")
     options.out.mkdir(parents=True, exist_ok=True)
     picture.savefig(options.out / "data_assimilation.png", dpi=120)

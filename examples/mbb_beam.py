@@ -294,9 +294,9 @@ for name, settings in METHODS.items():
 if options.out:
     from matplotlib import pyplot
 
-    picture, places = pyplot.subplots(len(layouts), 1, figsize=(8, 1.7 * len(layouts)), layout="constrained")
+    picture, axes = pyplot.subplots(len(layouts), 1, figsize=(8, 1.7 * len(layouts)), layout="constrained")
     column, row = centres.astype(int).T
-    for ax, (title, density) in zip(places, layouts.items()):
+    for ax, (title, density) in zip(axes, layouts.items()):
         half = np.zeros((height, width))
         half[row, column] = density
         whole = np.hstack([half[:, ::-1], half])

@@ -140,11 +140,11 @@ if options.out:
     fields = {"wanted": problem.wanted}
     for alpha, source in finest.items():
         fields[f"reached, alpha = {alpha:g}"] = problem.solve(source)
-    picture, places = pyplot.subplots(1, 4, figsize=(16, 3.6), layout="constrained")
+    picture, axes = pyplot.subplots(1, 4, figsize=(16, 3.6), layout="constrained")
     limits = 0.0, np.max(problem.wanted)
-    for ax, (title, field) in zip(places, fields.items()):
+    for ax, (title, field) in zip(axes, fields.items()):
         dp.plot(problem.grid, field, ax=ax, title=title, label="temperature", limits=limits)
-    ax = places[-1]
+    ax = axes[-1]
     for label, values in zip(("without metric", "metric of H1"), zip(*counts.values())):
         ax.loglog(list(counts), values, "o-", label=label)
     ax.set(title="smooth source", xlabel="cells along an axis", ylabel="iterations")

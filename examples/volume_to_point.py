@@ -238,8 +238,8 @@ run("peak, moving asymptotes", moving_asymptotes(peak_temperature))
 if options.out:
     from matplotlib import pyplot
 
-    picture, places = pyplot.subplots(1, len(designs), figsize=(12, 4), layout="constrained")
-    for ax, (title, density) in zip(places, designs.items()):
+    picture, axes = pyplot.subplots(1, len(designs), figsize=(12, 4), layout="constrained")
+    for ax, (title, density) in zip(axes, designs.items()):
         dp.plot(grid, density, ax=ax, title=title, limits=(0.0, 1.0), label="density")
     options.out.mkdir(parents=True, exist_ok=True)
     picture.savefig(options.out / "volume_to_point.png", dpi=120)

@@ -836,7 +836,7 @@ class _Translator:
     # ---- entrywise ----
 
     def _ufunc(self, call, function, dtype):
-        """Return a function ``act(operands, values) -> entry`` for a call of a ufunc."""
+        """Return the function for a call of a ufunc; ``act(operands, values)`` returns an entry."""
         if call.options or len(call.args) > 2:
             raise NotCompiled(f"{_name_of(call)} with options")
         samples = list(map(self._trace.sample, call.args))

@@ -240,5 +240,6 @@ class Monitor:
         share = self._gradient_norm(self._last) / (self._first_gradient_norm or 1.0)
         return (
             f"stopped: a step changes the loss by less than its rounding, but the gradient is {share:.1e} of "
-            "that at the start; smooth the kinks of the loss, or subtract a large constant from it"
+            "that at the start; smooth the kinks of the loss, subtract a large constant from it, or scale the "
+            "unknowns, for fields by metric="
         )

@@ -389,7 +389,8 @@ def _checked(name, covariance, shape, unknowns):
         if not 0 < covariance < np.inf:
             raise ValueError(f"a number as {name} is a variance and must be > 0 and finite, got {covariance}")
         return float(covariance)
-    check_type(name, covariance, Operator, "an Operator or a variance", "dp.diagonal(grid.cells, variances)")
+    example = "dp.diagonal(grid.cells, variances), or dp.from_matrix(matrix, grid.cells, grid.cells)"
+    check_type(name, covariance, Operator, "an Operator or a variance", example)
     check_operator("laplace", covariance)
     if covariance.shape[0] != covariance.shape[1] or not _fits(covariance.domain, shape):
         raise ShapeError(

@@ -22,6 +22,7 @@ from sparsedp._utils.validation import (
     check_type,
     check_whole,
     is_number,
+    place,
 )
 from sparsedp.autodiff.backend import require_arrays
 from sparsedp.autodiff.program_trace import recording_trace
@@ -275,7 +276,8 @@ def _mass_member(mass, coefficients, domain):
         )
     check_finite("the mass of eigenpairs", values)
     if np.any(values <= 0):
-        raise ValueError(f"the mass of eigenpairs must be > 0, got {np.min(values):g} at {np.argmin(values)}")
+        where = place(int(np.argmin(values)), values.shape or (1,))
+        raise ValueError(f"the mass of eigenpairs must be > 0, got {np.min(values):g} at {where}")
     return DiagonalMass(mass if isbox(mass) else values.astype(np.result_type(values, float)))
 
 

@@ -4,14 +4,19 @@ Notes
 -----
 Three methods: LAPACK on the full matrix, ARPACK in shift-invert mode, whose solves are those of `inverse`, and LOBPCG,
 whose preconditioner is an approximate solve. ARPACK and LOBPCG start from a fixed vector, so that results are
-reproducible. Four things happen after each of them:
+reproducible. The results are completed and tested:
 
 1. Missing copies: a Krylov space that starts from one vector contains one copy of a multiple eigenvalue; others enter
-   by rounding errors, or never. So the iteration is repeated on the complement of the vectors that are known, until
-   nothing nearer is found.
-2. One step of inverse iteration and a Rayleigh-Ritz projection bring residuals to the level of rounding errors.
+   by rounding errors, or never. So ARPACK is repeated in the complement of the known vectors, until it finds no nearer
+   eigenvalue. After LOBPCG, the negative pivots of A - sigma M count the eigenvalues below the last one.
+2. Steps of inverse iteration with a Rayleigh-Ritz projection bring residuals of ARPACK and LOBPCG to the level of
+   rounding errors. ARPACK follows LAPACK if the residuals of LAPACK are too large.
 3. The residual of every pair is computed and tested.
 4. The sign of a vector is fixed: its first large entry is positive.
+
+References
+----------
+B. N. Parlett, The symmetric eigenvalue problem, SIAM, 1998: shift-invert, inertia counts, Rayleigh-Ritz projections.
 """
 
 from __future__ import annotations
@@ -48,24 +53,24 @@ METHODS = ("auto", "dense", "arpack", "lobpcg")
 DENSE_UP_TO = 512  # unknowns for which "auto" takes LAPACK: 0.1 s
 GENERAL_DENSE_UP_TO = 1024  # the same for operators that are not symmetric: 1 s
 DENSE_AT_MOST = 20_000  # unknowns for which "dense" is accepted: a matrix of 3 GB
-LARGE_SHARE = 4  # "auto" takes LAPACK too for more than one eigenvalue in 4
+DENSE_SHARE = 4  # "auto" takes LAPACK too for more than one eigenvalue in 4
 # Distance of the shift from 0 for operators without negative eigenvalues, relative to the mean size of the rows. It is
 # larger where 0 is an eigenvalue and multigrid solves, whose cycles in single precision must see the shift.
 SHIFT = 1e-10
 SHIFT_OF_SINGULAR = 1e-6
-NEAR = 1e-4  # the same for operators with negative eigenvalues
-CLEARANCE = 1e-3  # least distance of the first shift below negative eigenvalues from them, relative to the shift
-NUDGE = 1e-11  # the same for a shift of the user, which may be an eigenvalue
+SHIFT_OF_INDEFINITE = 1e-4  # the same for operators with negative eigenvalues
+CLEARANCE = 1e-3  # smallest distance of the first shift below negative eigenvalues from them, relative to the shift
+OFFSET_OF_SHIFT = 1e-11  # distance from a shift of the user, which may be an eigenvalue, relative to the mean size
 SYMMETRIC = 1e-12  # two products that should be equal may differ by this share of their sizes
 LARGEST_EXPONENT = 200  # an operator or a mass beyond this power of two is scaled
 AT_ROUNDOFF = 128 * EPS  # residuals below this share of the terms are rounding errors
-ZERO = 4 * EPS  # lambda M v below this share of the terms of A v is 0
+ZERO_AT_ROUNDOFF = 4 * EPS  # lambda M v below this share of the terms of A v is 0
 LARGE_CONTRAST = 1e6  # of the mass; beyond it, errors name it as the reason
 COUNTED_UP_TO = 20_000  # unknowns up to which a factorisation tests that lobpcg missed no eigenvalue
-CLOSE = 1e-8  # relative distance below the last eigenvalue from which others are counted
-INNER = 1e-11  # relative tolerance of the solves inside of ARPACK
-TIGHT = 1e-11  # tolerance of ARPACK; a step of inverse iteration follows
-LOOSE = 1e-6  # tolerance of the search for missing copies
+COUNTED_BELOW = 1e-8  # relative distance below the last eigenvalue from which others are counted
+INNER_RTOL = 1e-11  # of the solves inside of ARPACK
+ARPACK_TOLERANCE = 1e-11  # a step of inverse iteration follows
+SEARCH_TOLERANCE = 1e-6  # of ARPACK in the search for missing copies
 MOST_RESTARTS = 64  # for missing copies
 TIE = 1e-9  # eigenvalues that are nearer by less than this share count as equally near in that search
 MOST_STEPS = 20  # of inverse iteration after ARPACK or LOBPCG
@@ -316,7 +321,7 @@ class Pencil:
         return Operator(shifted.structure, self.op.domain, self.op.domain, f"shift of {self.name}")
 
     def shifted_inverse(self, sigma: float, rtol: float, definite: bool) -> Callable:
-        """Return the function b -> x with diag(w) (A - sigma M) x = b.
+        """Return the function that maps b to the solution x of diag(w) (A - sigma M) x = b.
 
         Parameters
         ----------
@@ -341,12 +346,12 @@ class Pencil:
         return solved
 
     def count_below(self, sigma: float) -> int:
-        """Return the number of eigenvalues below a shift: the number of negative pivots of A - sigma M."""
+        """Return the number of eigenvalues below a shift: that of negative pivots of A - sigma M (Sylvester's law)."""
         stiffness, mass = self.matrices
         try:
             return _negative_pivots(stiffness - sigma * mass)
         except RuntimeError:  # sigma is an eigenvalue
-            return self.count_below(sigma - NUDGE * self.scale)
+            return self.count_below(sigma - OFFSET_OF_SHIFT * self.scale)
 
     @cached_property
     def mass_is_positive(self) -> bool:
@@ -409,10 +414,10 @@ class Pencil:
         """Return a shift that is nearer to the least eigenvalue than one far below it."""
         none = np.zeros((0, self.size), self.dtype)
         for _ in range(4):
-            solve = self.shifted_inverse(sigma, LOOSE, False)
+            solve = self.shifted_inverse(sigma, SEARCH_TOLERANCE, False)
             upper = float(_shift_invert(self, sigma, solve, none, 1, None, 1e-3)[0][0])  # the least one, or above it
             distance = upper - sigma
-            if distance <= NEAR * self.scale or self.count_below(upper - 0.01 * distance):
+            if distance <= SHIFT_OF_INDEFINITE * self.scale or self.count_below(upper - 0.01 * distance):
                 break
             sigma = upper - 0.01 * distance
         return sigma
@@ -510,7 +515,7 @@ def _chosen_method(pencil, settings):
         raise ValueError(f"method arpack takes k < {n - 1} for {n} unknowns, got {k}; write method='dense'")
     if method != "auto":
         return method
-    if n <= DENSE_UP_TO or (LARGE_SHARE * (k + 1) > n and n <= DENSE_AT_MOST):
+    if n <= DENSE_UP_TO or (DENSE_SHARE * (k + 1) > n and n <= DENSE_AT_MOST):
         return "dense"
     return "arpack"
 
@@ -563,11 +568,11 @@ def _by_arpack(pencil, k, which, maxiter):
     if isinstance(which, str):
         sigma = pencil.below_spectrum()
     else:
-        sigma = which - NUDGE * pencil.scale
-    solve = pencil.shifted_inverse(sigma, INNER, isinstance(which, str) and pencil.is_positive)
+        sigma = which - OFFSET_OF_SHIFT * pencil.scale
+    solve = pencil.shifted_inverse(sigma, INNER_RTOL, isinstance(which, str) and pencil.is_positive)
 
     def search(known, count):
-        tolerance = LOOSE if len(known) else TIGHT
+        tolerance = SEARCH_TOLERANCE if len(known) else ARPACK_TOLERANCE
         return _shift_invert(pencil, sigma, solve, known, count, maxiter, tolerance)
 
     def is_nearer(value, last):
@@ -753,7 +758,7 @@ def _by_lobpcg(pencil, k, maxiter):
     from scipy.sparse.linalg import LinearOperator, lobpcg
 
     sigma = pencil.below_spectrum()
-    solve = pencil.shifted_inverse(sigma, INNER, pencil.is_positive)
+    solve = pencil.shifted_inverse(sigma, INNER_RTOL, pencil.is_positive)
     count = k + 1 + max(2, (k + 1) // 4)  # the last vectors converge slowly
     shape = pencil.size, pencil.size
 
@@ -792,7 +797,7 @@ def _by_lobpcg(pencil, k, maxiter):
 
 def _check_complete(pencil, values, k):
     """Raise ConvergenceError if there are more eigenvalues below the k-th than were found."""
-    distance = CLOSE * max(abs(values[k - 1]), CLOSE * pencil.scale)
+    distance = COUNTED_BELOW * max(abs(values[k - 1]), COUNTED_BELOW * pencil.scale)
     missing = pencil.count_below(values[k - 1] - distance) - int(np.count_nonzero(values < values[k - 1] - distance))
     if missing > 0:
         raise ConvergenceError(
@@ -828,7 +833,7 @@ class PairResidual(NamedTuple):
         size = np.linalg.norm(mass)
         terms = np.linalg.norm(pencil.weights * pencil.system.magnitude(np.abs(vector)))
         is_small = residual <= max(pencil.rtol * size, AT_ROUNDOFF * (terms + size))
-        return cls(float(residual / (size or 1.0)), bool(is_small), bool(size <= ZERO * terms))
+        return cls(float(residual / (size or 1.0)), bool(is_small), bool(size <= ZERO_AT_ROUNDOFF * terms))
 
 
 def _are_accurate(pencil, k, which, values, vectors):
@@ -896,7 +901,7 @@ def general_values(pencil: Pencil, settings: EigenSettings) -> NDArray[Any]:
     if settings.method == "lobpcg":
         raise ValueError("method lobpcg takes symmetric operators; write method='arpack'")
     n = pencil.unknowns
-    is_small = n <= GENERAL_DENSE_UP_TO or LARGE_SHARE * (k + 2) > n
+    is_small = n <= GENERAL_DENSE_UP_TO or DENSE_SHARE * (k + 2) > n
     if settings.method == "dense" or (settings.method == "auto" and is_small):
         values = _general_dense(pencil)
     else:
@@ -924,8 +929,8 @@ def _general_by_arpack(pencil, k, which, maxiter):
     options: dict[str, Any] = {"which": {"smallest": "SR", "largest": "LR"}.get(str(which), "LM")}
     if not isinstance(which, str):
         sigma = which.real if which.imag == 0 else which
-        sigma = sigma - NUDGE * pencil.scale
-        solve = pencil.shifted_inverse(sigma, INNER, False)
+        sigma = sigma - OFFSET_OF_SHIFT * pencil.scale
+        solve = pencil.shifted_inverse(sigma, INNER_RTOL, False)
         if isinstance(sigma, complex):
             dtype = complex
         options.update(sigma=sigma, OPinv=LinearOperator(shape, solve, dtype=dtype))

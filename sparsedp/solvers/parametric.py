@@ -275,9 +275,11 @@ class EllipticSolver(ParametricSolver):
         Parameters
         ----------
         k : number, or array of the shape of a field on the faces, or of shape (dim, dim, *grid.shape)
-            A tensor need not be symmetric; where it is, so is the operator. A leading axis is a batch.
+            A tensor need not be symmetric; where it is, so is the operator. A leading axis is a batch; a batch of
+            numbers has the shape (batch, 1).
         b : array, a field on the cells; leading axes are a batch
-        shift : number, or array of the shape of a field on the cells; a leading axis is a batch
+        shift : number, or array of the shape of a field on the cells; a leading axis is a batch, of numbers with the
+            shape (batch, 1, ..., 1)
 
         Returns
         -------
@@ -504,16 +506,10 @@ class TensorSolver(ParametricSolver):
         return Operator(structure, self.G.domain, self.D.codomain, "shift - divergence of tensor fluxes")
 
 
-def _checked_parameter(name, parameter, space, advice="", other_space=None):
-    """Return a parameter, traced or not, which must be one finite number or a field on `space`.
-
-    `advice` says what to write where it is a field on `other_space`.
-    """
+def _checked_parameter(name, parameter, space, hint=""):
+    """Return a parameter, traced or not, which must be one finite number or a field on `space`."""
     values = as_field(sample(parameter))
     if values.shape not in ((), space.shape):
-        hint = ""
-        if other_space is not None and values.shape == other_space.shape:
-            hint = f"; write {advice}"
         raise ShapeError(
             f"{name} takes a number or a field on {space.described}, got an array of shape {values.shape}{hint}"
         )
@@ -532,13 +528,20 @@ def _finite_numbers(name, parameter):
 def _checked_batch(name, parameter, space, advice="", other_space=None):
     """Return a parameter, and the size of its batch: as `_checked_parameter`, but there may be a leading axis.
 
-    A batch of numbers, with axes of length 1 behind the leading one, is broadcast to fields.
+    A batch of numbers, with axes of length 1 behind the leading one, is broadcast to fields. `advice` says what to
+    write where the parameter is a field on `other_space`.
     """
     shape = np.shape(as_field(sample(parameter)))
-    of_numbers = shape[1:] == (1,) * len(space.shape)
+    trailing_ones = (1,) * len(space.shape)
+    of_numbers = shape[1:] == trailing_ones
     is_other_field = other_space is not None and shape == other_space.shape
     if len(shape) != 1 + len(space.shape) or not (of_numbers or shape[1:] == space.shape) or is_other_field:
-        return _checked_parameter(name, parameter, space, advice, other_space), None
+        hint = ""
+        if is_other_field:
+            hint = f"; write {advice}"
+        elif len(shape) == 1:
+            hint = f"; a batch of {shape[0]} numbers has the shape {shape + trailing_ones}"
+        return _checked_parameter(name, parameter, space, hint), None
     parameter = _finite_numbers(name, parameter)
     if of_numbers:
         parameter = parameter * np.ones((1, *space.shape))

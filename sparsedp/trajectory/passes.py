@@ -394,11 +394,12 @@ class RolloutRule(Rule):
                 except BaseException as error:
                     release(kept, error)
                     raise
-        for value in last.values:
-            if not is_finite(value):
-                if isinstance(kept, DiskStates):
-                    kept.remove()
+        if not all(map(is_finite, last.values)):
+            try:
                 refuse_nonfinite_step(runner)
+            except BaseException as error:
+                release(kept, error)
+                raise
         runner.recorder.ended = True
         if specification.differentiated:
             self._last_fingerprint = last.fingerprint()

@@ -158,7 +158,8 @@ def rollout(
     other modules are not compared. If a step refers to those, the steps after the last state in a file are run again,
     too, and must give the same last state; the backward pass compares the other states. States are written as the run
     proceeds, and the cotangents of the backward pass at most every 30 seconds. Only keep="last", with a state of
-    floating arrays, can be continued. Use a folder on a local disk; several runs may use it at the same time.
+    floating arrays, can be continued. Ctrl-C and ``sys.exit()`` keep the files of the rollout that is running, not
+    those of other rollouts in the same loss. Use a folder on a local disk; several runs may use it at the same time.
 
     References
     ----------

@@ -34,8 +34,8 @@ __all__ = ["RunKey", "run_key"]
 
 PACKAGES = ("autograd", "numpy", "scipy", "sparsedp")
 LIBRARIES = sys.stdlib_module_names | set(PACKAGES)  # their functions count by name
-MOST_OBJECTS = 1000  # functions and other objects that are followed at most
-PLAIN_TYPES = (np.generic, np.dtype, bool, int, float, complex, str, bytes, slice, type(None), type(...))
+MOST_OBJECTS = 10_000  # functions and other objects that are followed at most
+PLAIN_TYPES = (bool, int, float, complex, str, bytes, slice, np.dtype, type(None), type(...))
 FUNCTIONS_OF_C = (np.ufunc, BuiltinFunctionType, type(np.sum))
 
 
@@ -58,8 +58,7 @@ def run_key(specification: RolloutSpecification, args: Sequence) -> RunKey:
     """Return the hash of the step, the arguments and the options of a rollout."""
     statics = [form.statics for form in specification.forms]
     settings = (specification.n, specification.truncate, specification.differentiated, statics)
-    description = Description()
-    description.add(specification.step)
+    description = Description(specification.step)
     texts = [fingerprint(settings), *map(fingerprint, args), *_versions(), *description.texts]
     text = hashlib.sha256("\n".join(texts).encode()).hexdigest()[:32]
     return RunKey(text, description.is_complete)
@@ -77,7 +76,11 @@ def _versions() -> Iterator[str]:
 
 
 class Description:
-    """Texts that describe objects, and those to which they refer, and are the same in every process.
+    """Texts that describe an object, and the objects to which it refers, and are the same in every process.
+
+    Parameters
+    ----------
+    value : object
 
     Attributes
     ----------
@@ -86,16 +89,21 @@ class Description:
         Whether they describe everything.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, value: Any) -> None:
         self.texts: list[str] = []
         self.is_complete = True
         self._numbers: dict[int, int] = {}  # of the objects that have been described, by their id
         self._objects: list[Any] = []  # these objects: while they exist, their ids are unique
+        self._pending = [value]  # a stack instead of a recursion: objects may be nested deeper than Python's limit
+        while self._pending:
+            self._add(self._pending.pop())
 
-    def add(self, value: Any) -> None:
-        """Add the texts of an object."""
-        if isinstance(value, PLAIN_TYPES) or (isinstance(value, np.ndarray) and value.dtype != object):
+    def _add(self, value):
+        """Add the texts of an object, without those of the objects to which it refers."""
+        if isinstance(value, (np.ndarray, np.generic)) and value.dtype != object:
             self.texts.append(fingerprint(value))
+        elif isinstance(value, PLAIN_TYPES):
+            self.texts.append(f"{type(value).__qualname__} {value!r}")
         elif id(value) in self._numbers:
             self.texts.append(f"object {self._numbers[id(value)]}")
         elif len(self._objects) >= MOST_OBJECTS:
@@ -108,7 +116,7 @@ class Description:
     def _add_object(self, value):
         """Add the texts of an object that is not a number, a text or an array of numbers."""
         if isinstance(value, Jitted):
-            self.add(value.function)
+            self._pending.append(value.function)
         elif isinstance(value, functools.partial):
             self._add_parts("partial", value.func, value.args, value.keywords)
         elif isinstance(value, MethodType):
@@ -133,8 +141,7 @@ class Description:
 
     def _add_parts(self, name, *parts):
         self.texts.append(f"{name} of {len(parts)}")
-        for part in parts:
-            self.add(part)
+        self._pending += reversed(parts)
 
     def _add_name(self, value, is_complete):
         """Add the name of a function, class or module, or the name of the class of another object."""
@@ -153,8 +160,7 @@ class Description:
             self.texts.append(_code_text(function.__code__))
             names = sorted(set(_names(function.__code__)) & function.__globals__.keys())
             referred += [function.__globals__[name] for name in names]
-        for value in referred:
-            self.add(value)
+        self._add_parts("references", *referred)
 
 
 def _is_of_library(value):

@@ -6,7 +6,9 @@ import pytest
 
 import sparsedp as dp
 
-N, STEPS, NOISE = 12, 3, 0.2
+N = 12
+STEPS = 3
+NOISE = 0.2
 RING = dp.Grid(N, size=1.0, periodic=True)
 HELMHOLTZ = dp.identity(RING.cells) - 0.02 * dp.laplacian(RING)
 ROOTS = {"start": dp.matrix_power(HELMHOLTZ, -1.0), "pushes": 0.3 * dp.matrix_power(HELMHOLTZ, -0.5)}
@@ -32,13 +34,17 @@ def smoother(background, data, push_covariance):
     """Return the means of all states, and the covariance of the first one (Rauch, Tung and Striebel)."""
     model = np.array([step(unit, None, np.zeros(N)) for unit in np.eye(N)]).T
     H = dense(SENSORS)
-    mean, covariance = background, dense(COVARIANCES["start"])
-    predicted, filtered = [], [(mean, covariance)]
+    mean = background
+    covariance = dense(COVARIANCES["start"])
+    predicted = []
+    filtered = [(mean, covariance)]
     for readings in data:
-        mean, covariance = model @ mean, model @ covariance @ model.T + push_covariance
+        mean = model @ mean
+        covariance = model @ covariance @ model.T + push_covariance
         predicted.append((mean, covariance))
         gain = covariance @ H.T @ np.linalg.inv(H @ covariance @ H.T + NOISE**2 * np.eye(len(H)))
-        mean, covariance = mean + gain @ (readings - H @ mean), covariance - gain @ H @ covariance
+        mean = mean + gain @ (readings - H @ mean)
+        covariance = covariance - gain @ H @ covariance
         filtered.append((mean, covariance))
     means = [mean]
     for (mean_before, covariance_before), (mean_after, covariance_after) in zip(filtered[-2::-1], predicted[::-1]):

@@ -83,7 +83,8 @@ WRONG = [
     (
         run(prior=np.eye(12)),
         TypeError,
-        "the prior takes an Operator or a variance, got ndarray; write dp.diagonal(grid.cells, variances)",
+        "the prior takes an Operator or a variance, got ndarray; write dp.diagonal(grid.cells, variances), "
+        "or dp.from_matrix(matrix, grid.cells, grid.cells)",
     ),
     (run(prior=0.0), ValueError, "a number as the prior is a variance and must be > 0 and finite, got 0.0"),
     (

@@ -1,4 +1,4 @@
-"""Constraints of minimize: published optima, multipliers, and what wrong constraints get."""
+"""Constraints of minimize: published optima, multipliers, units, and results for constraints that contradict."""
 
 import functools
 import importlib.util

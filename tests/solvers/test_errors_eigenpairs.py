@@ -132,6 +132,11 @@ TABLE = [
     (pairs(TWO, mass=np.nan), FINITE, "the mass of eigenpairs must be finite, got nan; write a finite number"),
     (pairs(TWO, mass=np.array([1.0, -1.0])), VALUE, "the mass of eigenpairs must be > 0, got -1 at 1"),
     (
+        pairs(dp.laplacian(dp.Grid((2, 3), size=1.0)), mass=np.array([[1.0, 2.0, 1.0], [1.0, 1.0, -1.0]])),
+        VALUE,
+        "the mass of eigenpairs must be > 0, got -1 at (1, 2)",
+    ),
+    (
         pairs(TWO, mass=dp.from_matrix([[1.0, 2.0], [2.0, 1.0]])),
         VALUE,
         "mass must be positive definite, and the one given is not; write a mass > 0 in all unknowns",

@@ -254,7 +254,8 @@ ELLIPTIC = [
     Case(
         lambda: SOLVE(K[1:], B),
         SHAPE,
-        match="k takes a number or a field on faces(3, 2) of shape (17,), got an array of shape (16,)",
+        match="k takes a number or a field on faces(3, 2) of shape (17,), got an array of shape (16,); "
+        "a batch of 16 numbers has the shape (16, 1)",
     ),
     Case(
         lambda: SOLVE(B, B),
@@ -282,7 +283,13 @@ ELLIPTIC = [
     Case(
         lambda: SOLVE(K, B, K),
         SHAPE,
-        match="shift takes a number or a field on cells(3, 2), got an array of shape (17,)",
+        match="shift takes a number or a field on cells(3, 2), got an array of shape (17,); "
+        "a batch of 17 numbers has the shape (17, 1, 1)",
+    ),
+    Case(
+        lambda: SOLVE(K, B, np.ones((4, 2))),
+        SHAPE,
+        match="shift takes a number or a field on cells(3, 2), got an array of shape (4, 2)",
     ),
     Case(
         lambda: SOLVE(K, B, np.where(B > 0, np.nan, 1j)),

@@ -383,6 +383,10 @@ def test_what_the_step_refers_to_belongs_to_the_run(monkeypatch):
     assert key(dp.stepper("rk4", make(1.0), 0.1)) != key(dp.stepper("rk4", make(1.0), 0.2))
     matrix = lambda factor: factor * sp.eye_array(3, format="csr")
     assert len({key(make(matrix(1.0))), key(make(matrix(2.0))), key(make({1.0})), key(make({"a": 1.0}))}) == 4
+    nested = make(1.0)
+    for _ in range(sys.getrecursionlimit()):
+        nested = (lambda inner: lambda u, p: inner(u, p))(nested)
+    assert key(nested).is_complete
     assert not key(Measured(U)).is_complete and not key(make(np.random.default_rng(0))).is_complete
     assert key(make(os)).is_complete and not key(make(pytest)).is_complete
 
