@@ -76,6 +76,7 @@ def examined(line: Line, search_ripples: bool = False) -> DirectionEvidence:
         if finer.resolution < evidence.resolution or finer.word not in UNDECIDED:
             evidence = finer
     accept(evidence)
+    evidence.note = evidence.note.replace("6 are needed", f"{-np.log10(ACCEPTED_SHARE):.0f} are needed")
     return evidence
 
 
@@ -565,7 +566,7 @@ class DerivativeAudit:
             for verdict, reason in verdicts:
                 if verdict == wanted:
                     self.verdict = verdict
-                    self.reason = reason
+                    self.reason = reason.replace("the loss", "f(x)").replace("the gradient", self.title)
                     break
             if self.verdict:
                 break

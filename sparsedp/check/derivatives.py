@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from sparsedp._utils.pytree import copied
+from sparsedp._utils.pytree import copied, leaves
 from sparsedp._utils.validation import check_choice, check_function, check_number, check_whole
+from sparsedp.autodiff.backend import require_arrays
 from sparsedp.check.chain import Chain
 from sparsedp.check.derivative_audit import DerivativeAudit, Options
 from sparsedp.check.direction_evidence import CONFIRMING_WORDS
@@ -298,6 +299,7 @@ def hessian(
             return program.point.build(unflattened(slopes, program.point.values))
 
     options = _options("check.hessian", directions, steps, rng, grid, noise, beside and is_function)
+    require_arrays("check.hessian", leaves(x))
     program = Program(f if gradient is None else gradient, x, None, product, None)
     program.takes_arrays = not has_products
     program.jvp_name = "H(x, v)"
@@ -436,7 +438,9 @@ def _function_and_point(
 ) -> tuple[Callable[[Any], Any], Any, dict[str, Any], str | None]:
     """Return the function of a program, its point, its own derivatives by name, and the convention of its VJP."""
     methods: dict[str, Any] = {}
+    require_arrays(name, leaves(x))
     if isinstance(f, Operator):
+        f.backend.check(name)
         if x is None:
             x = rng.standard_normal(f.domain.shape)
     elif hasattr(f, "matvec") and hasattr(f, "shape"):

@@ -133,6 +133,21 @@ REFUSED = [
     ),
     (
         TypeError,
+        "check.vjp does not work on ranks yet; give it the grid from before dp.distribute",
+        lambda s: dp.check.vjp(s.G),
+    ),
+    (
+        TypeError,
+        "check.jvp does not work on a field on ranks; write dp.gather(u) for the whole array",
+        lambda s: dp.check.jvp(lambda u: u, x=s.u),
+    ),
+    (
+        TypeError,
+        "check.hessian does not work on a field on ranks; write dp.gather(u) for the whole array",
+        lambda s: dp.check.hessian(lambda u: anp.sum(u**2), lambda u, v: 2 * v, s.u),
+    ),
+    (
+        TypeError,
         "an estimate of the error of solves (certify, certified) does not work on ranks yet; give it the grid from "
         "before dp.distribute",
         lambda s: dp.certify(lambda u: anp.sum(dp.inverse(-dp.laplacian(s.grid, dp.dirichlet))(u)), s.u),
