@@ -26,10 +26,10 @@ def box(shape, kind):
     axes = [width * np.arange(n + 1) for n, width in zip(shape, WIDTHS, strict=True)]
     mesh = skfem.MeshHex.init_tensor(*axes)
     if kind == "heat":
-        return Hexahedra(shape, heat_matrix(WIDTHS), fixed), skfem.Basis(mesh, skfem.ElementHex1()), laplace
+        return Hexahedra(shape, WIDTHS, heat_matrix(WIDTHS), fixed), skfem.Basis(mesh, skfem.ElementHex1()), laplace
     element = skfem.ElementVector(skfem.ElementHex1())
     form = linear_elasticity(*lame_parameters(1.0, 0.3))
-    return Hexahedra(shape, elasticity_matrix(WIDTHS, 0.3), fixed), skfem.Basis(mesh, element), form
+    return Hexahedra(shape, WIDTHS, elasticity_matrix(WIDTHS, 0.3), fixed), skfem.Basis(mesh, element), form
 
 
 def nodes_of(basis, shape):
@@ -79,7 +79,7 @@ def test_derivatives_of_hexahedra(kind, rng):
 def test_multigrid_of_hexahedra(shape, most, rng):
     mesh, _, _ = box(shape, "heat")
     k = 1e-3 + 0.999 * rng.uniform(0.05, 0.95, shape) ** 3
-    level = Level(mesh.shape, mesh.matrix, k, mesh.free)
+    level = Level(mesh.shape, WIDTHS, mesh.matrix, k, mesh.free)
     a, b = mesh.free * rng.standard_normal((2, *mesh.nodes))
     assert np.sum(a * level.cycle(b)) == pytest.approx(np.sum(b * level.cycle(a)), rel=1e-10)
     np.testing.assert_allclose(level.product(a), mesh.product(k, a), atol=1e-13)
@@ -161,6 +161,23 @@ def test_cylinders():
     assert dp.check.gradient(task.loss, task.flat() + 0.05 * np.cos(np.arange(16.0)), quick=True).verdict == "agrees"
     assert task.loss(task.flat()) == pytest.approx(task.drag(task.flat()))
     assert task.loss(2.0 * task.flat()) - task.drag(2.0 * task.flat()) == pytest.approx(12.5)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_tesseract(dim, rng):
+    tesseract_core = pytest.importorskip("tesseract_core", reason="needs tesseract-core[runtime]")
+    flow = tesseract_core.Tesseract.from_tesseract_api("benchmarks/mosaic/tesseract_api.py")
+    start = taylor_green(8, dim) + 0.1 * rng.standard_normal((8,) * dim + (dim,))
+    v0 = np.float32(start[:, :, None] if dim == 2 else start)
+    settings = {"viscosity": np.float32([0.01]), "dt": np.float32([0.05]), "steps": 10}
+    result = flow.apply({"v0": v0, **settings})["result"]
+    assert result.shape == v0.shape
+    exact = StaggeredFlow(8, dim, float(np.float32(0.01)), float(np.float32(0.05)), 10)
+    expected, pull = dp.vjp(exact, v0.reshape(start.shape).astype(float))
+    np.testing.assert_allclose(result.reshape(start.shape), expected, atol=1e-6)
+    g = np.float32(rng.standard_normal(v0.shape))
+    cotangent = flow.vector_jacobian_product({"v0": v0, **settings}, ["v0"], ["result"], {"result": g})["v0"]
+    np.testing.assert_allclose(cotangent.reshape(start.shape), pull(g.reshape(start.shape).astype(float)), atol=1e-5)
 
 
 def test_quick_tables(capsys, monkeypatch, tmp_path):

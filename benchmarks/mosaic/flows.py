@@ -68,12 +68,14 @@ class StaggeredFlow:
     dim : int
     nu, dt : float
     steps : int
+    side : float
+        Of the square or the cube.
     """
 
-    def __init__(self, n, dim, nu, dt, steps):
-        self.grid = dp.Grid((n,) * dim, size=SIDE, periodic=True)
+    def __init__(self, n, dim, nu, dt, steps, side=SIDE):
+        self.grid = dp.Grid((n,) * dim, size=side, periodic=True)
         self.dim, self.steps = dim, steps
-        is_stiff = nu * dt * (n / SIDE) ** 2 > 1 / (4 * dim)  # explicit viscosity would be unstable
+        is_stiff = nu * dt * (n / side) ** 2 > 1 / (4 * dim)  # explicit viscosity would be unstable
         self.step = dp.flow_step(self.grid, dt, nu, implicit=is_stiff)
         self.forth = _half_cell(n)
 

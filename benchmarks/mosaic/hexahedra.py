@@ -25,6 +25,7 @@ __all__ = ["Hexahedra", "elasticity_matrix", "heat_matrix"]
 SWEEPS = 2  # of the smoother, before and after the coarse correction
 MOST_FACTORED = 600  # unknowns of the coarsest level, whose matrix is factored, unless its shape is odd
 SMOOTHED = 0.25  # the smoother damps eigenvalues between this share of the largest one and the largest one
+ISOTROPIC = 1.5  # ratio of widths up to which elements become longer along both axes
 CORNERS = list(np.ndindex(2, 2, 2))
 
 
@@ -74,14 +75,17 @@ class Hexahedra:
     ----------
     shape : tuple of 3 int
         Elements along each axis.
+    widths : sequence of 3 float
+        Of an element; they decide along which axes multigrid makes larger elements.
     matrix : array, shape (8 c, 8 c)
         The element matrix, for fields of c components.
     fixed : bool array, shape (nx + 1, ny + 1, nz + 1)
         The nodes at which the field is 0.
     """
 
-    def __init__(self, shape, matrix, fixed, rtol=1e-10):
+    def __init__(self, shape, widths, matrix, fixed, rtol=1e-10):
         self.shape = tuple(shape)
+        self.widths = tuple(widths)
         self.matrix = matrix
         self.components = matrix.shape[0] // 8
         self.nodes = (self.components, *(n + 1 for n in shape))
@@ -139,7 +143,7 @@ class Hexahedra:
             raise ValueError("the coefficients of all elements must be positive and finite")
         if self._last is None or not np.array_equal(self._last[0], k):
             scale = 2.0 ** np.frexp(np.max(k))[1]
-            cycle = Level(self.shape, self.matrix, k / scale, self.free).correction
+            cycle = Level(self.shape, self.widths, self.matrix, k / scale, self.free).correction
             inverse = dp.inverse(self.stiffness(k / scale), "krylov", rtol=self.rtol, preconditioner=cycle)
             self._last = (k.copy(), scale, inverse)
         return self._last[1:]
@@ -171,6 +175,7 @@ class Level:
     Parameters
     ----------
     shape : tuple of 3 int
+    widths : sequence of 3 float
     matrices : array, shape (8 c, 8 c) or (8 c, 8 c, nx, ny, nz)
         The element matrix, or one for each element.
     k : array, shape (nx, ny, nz)
@@ -179,15 +184,15 @@ class Level:
         1 at free nodes, 0 at fixed ones.
     """
 
-    def __init__(self, shape, matrices, k, free):
-        self.mesh = Hexahedra(shape, np.zeros(matrices.shape[:2]), free[0] == 0)
+    def __init__(self, shape, widths, matrices, k, free):
+        self.mesh = Hexahedra(shape, widths, np.zeros(matrices.shape[:2]), free[0] == 0)
         self.matrices = matrices
         self.k = k
         self.free = free
         of_corners = np.moveaxis(np.diagonal(matrices), -1, 0)  # the diagonal of the element matrices
         diagonal = self.mesh._scattered(of_corners.reshape(-1, *matrices.shape[2:] or (1, 1, 1)) * k)
         self.inverse_diagonal = free / np.where(free == 0, 1.0, diagonal)
-        coarsened = [n % 2 == 0 for n in shape]
+        coarsened = self._coarsened_axes()
         self.coarse = None
         if np.sum(free) > MOST_FACTORED and any(coarsened):
             self.interpolations = interpolation(coarsened)
@@ -204,13 +209,19 @@ class Level:
             result = np.einsum("ijxyz,jxyz->ixyz", self.matrices, at_corners)
         return self.free * self.mesh._scattered(self.k * result)
 
+    def _coarsened_axes(self):
+        """Return which axes get elements twice as long: those of short elements, as links along them are strong."""
+        can_be = [n % 2 == 0 for n in self.mesh.shape]
+        shortest = min((width for width, yes in zip(self.mesh.widths, can_be, strict=True) if yes), default=0.0)
+        return [yes and width < ISOTROPIC * shortest for width, yes in zip(self.mesh.widths, can_be, strict=True)]
+
     def _children(self):
         """Return the index of the elements that are child number 0, 1, ... of their parents."""
         offsets = np.ndindex(*self.steps)
         return [tuple(slice(first, None, step) for first, step in zip(o, self.steps, strict=True)) for o in offsets]
 
     def _coarse_problem(self):
-        """Return shape, Galerkin matrices, their factors and free nodes of the next level."""
+        """Return the arguments of the next level, whose elements have Galerkin matrices."""
         identity = np.eye(self.mesh.components)
         shape = tuple(n // step for n, step in zip(self.mesh.shape, self.steps, strict=True))
         matrices = 0.0
@@ -223,7 +234,8 @@ class Level:
                 of_child = np.moveaxis(np.tensordot(left, P, (1, 0)), -1, 1)
             matrices = matrices + of_child * self.k[child]
         nodes = tuple(slice(None, None, step) for step in self.steps)
-        return shape, np.ascontiguousarray(matrices), np.ones(shape), self.free[(slice(None), *nodes)]
+        widths = [width * step for width, step in zip(self.mesh.widths, self.steps, strict=True)]
+        return shape, widths, np.ascontiguousarray(matrices), np.ones(shape), self.free[(slice(None), *nodes)]
 
     def _interpolate(self, u):
         """Return the trilinear interpolation of a coarse field."""

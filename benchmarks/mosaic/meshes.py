@@ -9,7 +9,7 @@ import autograd.numpy as np
 
 from benchmarks.mosaic.hexahedra import Hexahedra, elasticity_matrix, heat_matrix
 
-__all__ = ["Cantilever", "Slab", "random_density"]
+__all__ = ["Cantilever", "Slab", "random_density", "simp"]
 
 VOID = 1e-3
 POWER = 3
@@ -51,7 +51,7 @@ class Slab:
         self.widths = (depth, WIDTH / self.shape[1], depth)
         fixed = np.zeros([n + 1 for n in self.shape], dtype=bool)
         fixed[0] = True
-        self.mesh = Hexahedra(self.shape, heat_matrix(self.widths), fixed)
+        self.mesh = Hexahedra(self.shape, self.widths, heat_matrix(self.widths), fixed)
         self.load = np.zeros(self.mesh.nodes)
         self.load[0, -1] = np.outer(_areas(self.shape[1], WIDTH), _areas(1, depth)) / (WIDTH * depth)
 
@@ -89,7 +89,7 @@ class Cantilever:
         widths = [size / n for size, n in zip((LENGTH, WIDTH, HEIGHT), shape, strict=True)]
         fixed = np.zeros([n + 1 for n in shape], dtype=bool)
         fixed[0] = True
-        self.mesh = Hexahedra(shape, elasticity_matrix(widths, POISSON), fixed)
+        self.mesh = Hexahedra(shape, widths, elasticity_matrix(widths, POISSON), fixed)
         self.load = np.zeros(self.mesh.nodes)
         if at_corner:
             self.load[2, -1, :2, :2] = 0.25
