@@ -38,6 +38,11 @@ NOT_AT_MODE = (
     "continue minimize, or add posterior.step to x"
 )
 
+LINEAR = (
+    "the misfit returns one number, the negative log-likelihood, and its Hessian at x is 0: the variances are those of "
+    "the prior; for one residual write np.array([residual])"
+)
+
 
 def laplace(
     misfit: Callable[[Any], Any],
@@ -102,7 +107,8 @@ def laplace(
     -----
     PosteriorWarning
         If eigenvalues above the tolerance are neglected, because there are more than `rank` or because they are lost in
-        rounding; or if x is more than 0.1 posterior standard deviations from the mode.
+        rounding; if x is more than 0.1 posterior standard deviations from the mode; or if the misfit returns one number
+        and its Hessian is 0, so that it is rather a residual.
 
     See Also
     --------
@@ -182,6 +188,8 @@ def laplace(
             pairs = eigenpairs_of_jacobian(hessian.jacobian, covariance, tolerance)
         else:
             pairs = eigenpairs_of_products(hessian.product, covariance, rank, tolerance, seed)
+    if hessian.squares is None and np.any(hessian.gradient) and not pairs.values.size and pairs.neglected == 0:
+        warnings.warn(LINEAR, PosteriorWarning, stacklevel=frames_inside() + 1)
     if not pairs.is_complete:
         reason = f"there are more than rank={rank}"
         advice = "increase rank"

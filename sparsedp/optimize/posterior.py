@@ -234,7 +234,7 @@ class Posterior(Frozen):
         Raises
         ------
         DerivativeError
-            If the quantity is complex.
+            If the quantity is complex, or has integer or boolean values.
         NonFiniteError
             If the quantity is NaN or infinite.
         """
@@ -242,6 +242,10 @@ class Posterior(Frozen):
         value, pull = pullback(quantity, self._packing.unpack(self._mean))
         if np.iscomplexobj(value):
             raise DerivativeError("std_of takes a real quantity, got a complex one; take its real part")
+        if np.asarray(value).dtype.kind in "biu":
+            raise DerivativeError(
+                f"std_of takes a differentiable quantity, got dtype {np.asarray(value).dtype}; return floating numbers"
+            )
         check_finite("the quantity of std_of", value)
         deviations = np.zeros(np.size(value))
         for number in range(deviations.size):

@@ -183,7 +183,7 @@ class PriorBlock(Uncached):
         NonFiniteError
             If a product is not finite.
         """
-        if not isinstance(self.covariance, Operator):
+        if not isinstance(self.covariance, Operator) and self.root is None:
             return
         tests = np.random.default_rng(0).standard_normal((TEST_VECTORS, self.size))
         images = self.apply(tests)

@@ -208,6 +208,16 @@ WRONG = [
         "std_of takes a real quantity, got a complex one; take its real part",
     ),
     (
+        lambda: run()().std_of(lambda x: x > 0),
+        DerivativeError,
+        "std_of takes a differentiable quantity, got dtype bool; return floating numbers",
+    ),
+    (
+        lambda: dp.laplace(lambda x: x, np.zeros(4), 4.0, prior_root=dp.from_matrix(3.0 * np.eye(4))),
+        ValueError,
+        "prior_root must satisfy R @ R.T = prior, but the products of the prior differ by 1.2e+00",
+    ),
+    (
         lambda: run()().std_of(lambda x: anp.log(x)),
         NonFiniteError,
         "the quantity of std_of must be finite, got 12 that are NaN or infinite, the first at (0, 0)",
@@ -233,6 +243,15 @@ def test_too_small_rank_is_reported():
         posterior = dp.laplace(misfit, np.zeros(4), 1.0, rank=2)
     assert posterior.eigenvalues == pytest.approx([11.25, 11.25])
     assert np.all(posterior.variance() >= 1 / 12.25 - 1e-12)
+
+
+def test_a_residual_as_one_number_is_reported():
+    message = (
+        "the misfit returns one number, the negative log-likelihood, and its Hessian at x is 0: the variances are "
+        "those of the prior; for one residual write np.array([residual])"
+    )
+    with pytest.warns(PosteriorWarning, match=re.escape(message)):
+        dp.laplace(lambda x: 0.01 * x[0], np.zeros(4), 1.0)
 
 
 def test_loss_of_precision_is_reported():
