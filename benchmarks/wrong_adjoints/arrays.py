@@ -108,25 +108,24 @@ def cells_at_sensors():
 
 @wrong("single precision")
 def checkpoints_in_single_precision():
-    """A field after four steps u (2 - u); the backward loop reads states that were stored with seven digits."""
+    """Particles far from the origin in a periodic potential; the backward loop reads states with seven digits."""
 
     def trajectory(u):
         states = [u]
-        for _ in range(4):
-            states.append(states[-1] * (2 - states[-1]))
+        for _ in range(10):
+            states.append(states[-1] + 0.1 * np.sin(states[-1]))
         return states
 
     def f(u):
-        return np.sin(trajectory(u)[-1])
+        return trajectory(u)[-1]
 
     def vjp(u, g):
         stored = [state.astype(np.float32) for state in trajectory(u)]  # fault: in double precision
-        g = np.cos(stored[-1]) * g
         for state in reversed(stored[:-1]):
-            g = (2 - 2 * state) * g
+            g = (1 + 0.1 * np.cos(state)) * g
         return g
 
-    return f, vjp, np.linspace(1.6, 1.85, 6)
+    return f, vjp, np.linspace(1000.0, 1004.0, 6)
 
 
 @wrong("single precision")

@@ -14,7 +14,7 @@ def difference_matrix(n):
 @wrong("loose tolerance", culprit="conduction")
 def loose_adjoint_solve():
     """The temperatures of a rod with a heat source, squared; the adjoint solve ends at a tolerance of 1e-3."""
-    matrix = difference_matrix(16) + 0.1 * np.eye(16)
+    matrix = difference_matrix(40) + 0.1 * np.eye(40)
 
     def conduction(source):
         return np.linalg.solve(matrix, source)
@@ -28,7 +28,7 @@ def loose_adjoint_solve():
     def square_vjp(u, g):
         return 2 * u * g
 
-    return chained(1.5 + np.sin(np.arange(16.0)), (conduction, conduction_vjp), (square, square_vjp))
+    return chained(1.5 + np.sin(np.arange(40.0)), (conduction, conduction_vjp), (square, square_vjp))
 
 
 @wrong("null space", culprit="conduction")

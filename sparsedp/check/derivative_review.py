@@ -17,11 +17,12 @@ __all__ = ["review", "rounds_in_single_precision"]
 WRONG = ("disagrees", "outside")
 UNDECIDED = ("few", "noise", "rough", "masked", "constant")
 ABSOLUTE = "absolute"  # name of directions with steps relative to a whole leaf, if there are relative ones too
-NOT_LINEAR = (
-    5e-4  # a larger gap of a linear combination is an error; that of a solve with a tolerance of 1e-4 is smaller
-)
-INEXACT_SOLVE = 1e-2  # a gap of linearity up to this value is likely to be the tolerance of a solve
+NOT_LINEAR = 1e-2  # a larger gap of a linear combination is an error; a smaller one may be that of an inexact solve
 INEXACT_SHARES = 1e3  # a gap up to this multiple of the gap of linearity may be due to the same inexact solve
+LEAST_SINGLE = 1e-9  # a smaller gap of linearity is not due to single precision
+RESOLVED_SHARE = 0.01
+COARSE = 2.0**-6  # steps from here on are coarse
+EXACT_SHARE = 1e-3  # f is exact if the differences with coarse steps differ by at most this share of the gap
 LEAST_INEXACT = 1e-13  # gaps of linearity below this value are rounding errors
 SINGLE_EPS = float(np.finfo(np.float32).eps)
 NUDGE = 1e-10  # relative change of a vector, far below the rounding of single precision
@@ -91,15 +92,19 @@ def _review_linearity(audit: Any) -> None:
         for direction in group.directions
         if direction.word in WRONG and direction.share <= INEXACT_SHARES * gap
     ]
-    if gap <= allowed and not suspects:
-        return
     name = audit.kind
+    argument = {"vjp": "g", "jvp": "t"}[name]
+    if gap <= allowed and not suspects:
+        is_smooth = audit.groups[0].evaluations.noise <= SMOOTH_NOISE
+        if gap > LEAST_SINGLE and is_smooth and _roughness(audit) is None:
+            reason = f"{name} rounds its numbers to single precision: it is linear in {argument} only to {gap:.0e}"
+            audit.findings.append(("broken", reason))
+        return
     vector, _ = audit.pairs[0]
     zero = norm(audit.derivative(0 * vector))
     if zero:
         audit.findings.append(("broken", f"{name} is not linear: for a vector of zeros it does not return zeros"))
         return
-    argument = {"vjp": "g", "jvp": "t"}[name]
     roughness = _roughness(audit)
     if roughness is None and gap > NOT_LINEAR:
         audit.findings.append(
@@ -114,9 +119,12 @@ def _review_linearity(audit: Any) -> None:
             audit.findings.append(("note", f"{name} has the rounding errors of single precision, {gap:.0e}"))
         return
     if gap > max(NOT_LINEAR, allowed):
-        reason = f"{name} is not linear in {argument}: it is off by {gap:.1e}"
-        if gap <= INEXACT_SOLVE:
-            reason += "; if this is the tolerance of a solve, tighten it, or write noise=..."
+        audit.findings.append(("broken", f"{name} is not linear in {argument}: it is off by {gap:.1e}"))
+        return
+    if gap > allowed and (any(map(_is_exact, suspects)) or (not suspects and _is_resolved(audit, gap))):
+        reason = (
+            f"{name} is linear in {argument} only to {gap:.0e}, although f is exact: tighten the tolerance of its solve"
+        )
         audit.findings.append(("broken", reason))
         return
     for direction in suspects:
@@ -127,6 +135,22 @@ def _review_linearity(audit: Any) -> None:
         )
     if gap > allowed and not suspects:
         audit.findings.append(("note", f"{name} is linear only to {gap:.0e}: a solve in it may be inexact"))
+
+
+def _is_resolved(audit: Any, gap: float) -> bool:
+    """Return whether all differences at x have much smaller error bars than a gap: then f has smaller errors, too."""
+    lines = [direction for group in audit.groups for direction in group.directions]
+    return all(direction.resolution <= RESOLVED_SHARE * gap for direction in lines)
+
+
+def _is_exact(direction: DirectionEvidence) -> bool:
+    """Return whether coarse steps show the same derivative: then a solve in f has a smaller error than the gap.
+
+    An inexact solve is a nonlinear function of its right-hand side, with a relative error of its tolerance.
+    """
+    coarse = [level for level in direction.line.levels if not level.note and level.step >= COARSE]
+    allowed = EXACT_SHARE * abs(direction.gap)
+    return len(coarse) > 1 and all(abs(level.difference - direction.difference) <= allowed for level in coarse)
 
 
 def _roughness(audit: Any) -> float | None:

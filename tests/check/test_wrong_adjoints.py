@@ -162,3 +162,20 @@ def test_right_derivatives_agree(case):
     result = check(case)
     allowed = ("agrees", "inconclusive") if case.undecidable else ("agrees",)
     assert result.verdict in allowed, result
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("seed", range(4, 8))
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("cotangent in single precision", "rounds its numbers to single precision|off by"),
+        ("loose adjoint solve", "although f is exact: tighten the tolerance"),
+        ("values of the last run", "it keeps a state of other runs"),
+        ("cells at sensors", "is a staircase of g"),
+    ],
+)
+def test_reasons_do_not_depend_on_the_random_directions(name, reason, seed):
+    program = next(case for case in WRONG if case.name == name).program()
+    result = dp.check.vjp(program.f, program.vjp, program.x, rng=seed)
+    assert result.verdict == "disagrees" and re.search(reason, result.reason), result

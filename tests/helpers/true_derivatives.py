@@ -76,7 +76,7 @@ def diffusion(u):
 
 def table(x):
     values = np.sin(np.arange(11.0))
-    cell = np.floor(x.real).astype(int)
+    cell = np.clip(np.floor(x.real).astype(int), 0, 9)
     return values[cell] + (x - cell) * (values[cell + 1] - values[cell])
 
 
