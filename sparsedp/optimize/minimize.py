@@ -456,7 +456,7 @@ def _check_names(method, options, names):
             advice = f"; write {advice}"
         else:
             advice = advice_near(option, [*names, *parameters])
-        raise TypeError(f"{method} has no option {option!r}; it has {', '.join(names)}{advice}")
+        raise TypeError(f"{method} has no option {option!r}; it has {', '.join(names) or 'none'}{advice}")
 
 
 def _check_tolerance(tolerance):

@@ -189,6 +189,7 @@ WRONG = [
         ValueError,
         "multipliers contains -1, and no limit there has a multiplier of this sign; those of function(x) <= 0 are >= 0",
     ),
+    (run(above, "slsqp", multipliers=1.0), TypeError, "slsqp has no option 'multipliers'; it has none"),
     (
         run(None, multipliers=1.0),
         TypeError,
