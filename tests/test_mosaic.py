@@ -1,5 +1,7 @@
 """benchmarks.mosaic: matrix-free hexahedra beside assembled matrices, flows beside exact ones, and their gradients."""
 
+import sys
+
 import numpy as np
 import pytest
 import skfem
@@ -98,6 +100,10 @@ def test_hexahedra_refuse_what_they_cannot_solve():
     for wrong in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(ValueError, match="^the coefficients of all elements must be positive and finite$"):
             mesh.solve(np.full(mesh.shape, wrong), np.ones(mesh.nodes))
+    with pytest.raises(ValueError, match=r"^k must be a real array of shape \(2, 2, 1\), got float64 of shape \(\)$"):
+        mesh.solve(0.5, np.ones(mesh.nodes))
+    with pytest.raises(ValueError, match=r"^k must be a real array of shape \(2, 2, 1\), got complex128 of shape"):
+        mesh.solve(np.ones(mesh.shape) + 0j, np.ones(mesh.nodes))
     with pytest.raises(dp.errors.NonFiniteError):
         mesh.solve(np.ones(mesh.shape), np.full(mesh.nodes, np.nan))
     np.testing.assert_allclose(  # the scale of the coefficients and of the data does not matter
@@ -193,6 +199,7 @@ def test_quick_tables(capsys, monkeypatch, tmp_path):
     assert pairs == [(0.2, values[0]), (0.5, values[1])]
     assert FORWARD["heat, uniform density"][1](0.5) == pytest.approx(values[1])
     monkeypatch.delenv("MOSAIC_REFERENCES", raising=False)
+    monkeypatch.setitem(sys.modules, "jax", None)  # not needed here
     main(["--quick"])
     text = capsys.readouterr().out
     assert "no stored results: write --references FOLDER for the part forward" in text

@@ -139,6 +139,8 @@ class Hexahedra:
 
     def set_up(self, k):
         """Return the power of two s near the largest k, and the inverse of A(k / s); the last ones are kept."""
+        if k.shape != self.shape or np.iscomplexobj(k):
+            raise ValueError(f"k must be a real array of shape {self.shape}, got {k.dtype} of shape {k.shape}")
         if not np.all((k > 0.0) & np.isfinite(k)):
             raise ValueError("the coefficients of all elements must be positive and finite")
         if self._last is None or not np.array_equal(self._last[0], k):
