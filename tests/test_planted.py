@@ -980,6 +980,30 @@ BUGS = {
         "is_solved = True\n",
         "tests/optimize/test_minimize_constraints.py",
     ),
+    "an equality behind a wrapper as an inequality": Bug(
+        "optimize/constraints.py",
+        "    if any(isinstance(function, Equality) for function in wrapped_functions(entry)):\n",
+        "    if False:\n",
+        "tests/optimize/test_minimize_constraints.py",
+    ),
+    "eigenpairs: a range of pairs cluster by cluster": Bug(
+        "solvers/eigenpairs.py",
+        "        spaces = [problem.vectors(whole)] if whole else []\n",
+        "        spaces = [problem.vectors(range(i, i + 1)) for i in whole]\n",
+        "tests/solvers/test_eigenpairs.py",
+    ),
+    "eigenpairs: lobpcg does not count the eigenvalues below": Bug(
+        "solvers/eigensolver.py",
+        "    if missing > 0:\n",
+        "    if False:\n",
+        "tests/solvers/test_errors_eigenpairs.py",
+    ),
+    "where of a number without the sum of its cotangents": Bug(
+        "autodiff/tape.py",
+        "slopes=(None, _chosen_slope, _other_slope)",
+        "slopes=(None, None, None)",
+        "tests/autodiff/test_shortcuts.py",
+    ),
     "initial multipliers without their unit": Bug(
         "optimize/augmented_lagrangian.py",
         "rows_of_multipliers(self.multipliers) / problem.loss_unit",
