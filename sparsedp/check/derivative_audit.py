@@ -34,7 +34,7 @@ from sparsedp.check.derivative_review import review, rounds_in_single_precision
 from sparsedp.check.direction_evidence import CONFIRMING_WORDS, DirectionEvidence, weigh
 from sparsedp.check.directions import SHIFT, SHIFT_SEED, examine_line
 from sparsedp.check.evaluations import EVALUATION_ERRORS, Evaluations, Line
-from sparsedp.check.functionals import FunctionalEvaluations, Functionals, balanced_weights, leaf_weights
+from sparsedp.check.functionals import FunctionalEvaluations, Functionals, Pullback, balanced_weights, leaf_weights
 from sparsedp.check.loss_noise import measure_noise, noise_of_entries, noise_steps
 from sparsedp.check.overall_verdict import overall_verdict
 from sparsedp.check.point import MOST_LEAVES, Point, audit_generator
@@ -331,11 +331,7 @@ class DerivativeAudit:
         """Return the evaluations of a functional, with the gradient under test if there is a VJP."""
         if self.kind == "jvp":
             return functionals.evaluations(number, np.zeros(self.point.size), None, self.like)
-        weights = functionals.weights[number]
-
-        def gradient(tree: Any) -> NDArray[Any]:
-            return self.program.pull(tree, weights)
-
+        gradient = Pullback(self.program, functionals.weights[number])
         return functionals.evaluations(number, slopes[number], gradient, self.like)
 
     def _line(self, name: str, direction: NDArray[Any], group: Group, slopes: Any) -> Line:

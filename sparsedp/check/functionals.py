@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from sparsedp.check.evaluations import EVALUATION_ERRORS, Evaluations
 from sparsedp.check.point import Point
 from sparsedp.check.programs import Program
 
-__all__ = ["FunctionalEvaluations", "Functionals", "balanced_weights", "leaf_weights"]
+__all__ = ["FunctionalEvaluations", "Functionals", "Pullback", "balanced_weights", "leaf_weights"]
 
 
 SMALLEST_SIZE = 1e-280  # weights relative to smaller values could overflow
@@ -36,6 +37,30 @@ class FunctionalEvaluations(Evaluations):
     def at(self, point: Point) -> Evaluations:
         """Return evaluations of the same functional and gradient at another point, with the default steps."""
         return FunctionalEvaluations(self.loss, point, self.gradient)
+
+
+@dataclass
+class Functional:
+    """One of some functionals, as a function of a tree."""
+
+    functionals: Any
+    number: int
+
+    def __call__(self, tree: Any) -> float:
+        """Return the functional at a tree."""
+        return self.functionals.values(tree)[self.number]
+
+
+@dataclass
+class Pullback:
+    """The gradient of a functional by the VJP under test, as a function of a tree that returns a vector."""
+
+    program: Program
+    weights: NDArray[Any]
+
+    def __call__(self, tree: Any) -> NDArray[Any]:
+        """Return the gradient at a tree."""
+        return self.program.pull(tree, self.weights)
 
 
 class Functionals:
@@ -107,11 +132,7 @@ class Functionals:
         like : Evaluations
             Steps, tolerances and precision are copied from these evaluations.
         """
-
-        def loss(tree: Any) -> float:
-            return self.values(tree)[number]
-
-        evaluations = FunctionalEvaluations(loss, self.point, gradient, like.steps)
+        evaluations = FunctionalEvaluations(Functional(self, number), self.point, gradient, like.steps)
         evaluations.may_extend = like.may_extend
         evaluations.base = self.constants[number]
         evaluations.slopes = slopes

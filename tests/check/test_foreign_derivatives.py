@@ -1,5 +1,7 @@
 """Derivatives that other code computes: right ones agree, wrong ones disagree, within 40 runs of a right program."""
 
+import json
+import pickle
 import time
 
 import numpy as np
@@ -171,6 +173,13 @@ def test_wrong_vjps_disagree(name):
     result = VJP(cube, function, X)
     assert result.verdict == "disagrees" and words in str(result), result
     assert not result
+
+
+@pytest.mark.whole
+def test_results_can_be_stored():
+    wrong = pickle.loads(pickle.dumps(VJP(cube, np.multiply, X)))
+    assert wrong.verdict == "disagrees" and wrong.gaps and json.dumps(wrong.to_dict())
+    assert "disagrees" in wrong.markdown() and "disagrees" in wrong.html() and wrong.csv().count("\n") > 20
 
 
 def test_a_state_of_the_last_run():
@@ -352,9 +361,9 @@ def test_right_but_hard_programs(name):
 
 
 def test_small_entries_hide_no_error():
-    two = lambda p: 1e8 * p["a"] ** 2 + np.sum(p["b"] ** 2)
-    pull = lambda p, g: {"a": 2e8 * p["a"] * g, "b": np.sum(g) * p["b"]}
-    result = VJP(two, pull, {"a": X, "b": X[:3]})
+    two = lambda p: 1e10 * p["a"] ** 2 + np.sum(p["b"] ** 2)
+    pull = lambda p, g: {"a": 2e10 * p["a"] * g, "b": np.sum(g) * p["b"]}
+    result = VJP(two, pull, {"a": np.linspace(1.0, 2.0, 40), "b": X[:3]})
     assert result.gaps == ("every entry of x['b']: vjp is too small, by a factor of 0.5",)
 
 
