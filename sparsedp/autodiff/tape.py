@@ -13,6 +13,7 @@ Complex cotangents follow autograd, g = dL/dRe(y) - i dL/dIm(y): the VJP of y = 
 from __future__ import annotations
 
 import inspect
+import math
 import sys
 from contextlib import contextmanager
 from functools import cached_property, partial, wraps
@@ -184,10 +185,17 @@ def _concatenation(axis, *arrays):
 def _concatenation_vjp(nums, value, args, options):
     """Return the pullback, which splits a cotangent; autograd adds up the lengths again for each array."""
     axis, *arrays = args
-    lengths = [anp.shape(array)[axis] for array in arrays]
+    shapes = [anp.shape(array) for array in arrays]
+    if axis is None:  # the arrays were flattened
+        lengths = [math.prod(shape) for shape in shapes]
+        before = ()
+    else:
+        lengths = [shape[axis] for shape in shapes]
+        before = (slice(None),) * (axis % value.ndim)
     ends = list(accumulate(lengths))
-    before = (slice(None),) * (axis % value.ndim)
     places = [(*before, slice(ends[num - 1] - lengths[num - 1], ends[num - 1])) for num in nums]
+    if axis is None:
+        return lambda g: [anp.reshape(g[place], shapes[num - 1]) for num, place in zip(nums, places, strict=True)]
     return lambda g: [g[place] for place in places]
 
 

@@ -55,6 +55,12 @@ def test_reverse_mode_of_a_concatenation_takes_the_length_of_each_array_once(mon
     np.testing.assert_allclose(slope, sum(k * weights[..., k] for k in range(30) if k % 3), rtol=1e-15)
 
 
+def test_concatenation_without_axis():
+    weights = np.arange(40.0)
+    slope = dp.grad(lambda u: anp.sum(weights * anp.concatenate([u, 2.0 * u], axis=None)))(U)
+    np.testing.assert_allclose(slope, np.reshape(weights[:20] + 2.0 * weights[20:], GRID.shape), rtol=1e-15)
+
+
 def test_forward_mode_concatenates_all_tangents_at_once(monkeypatch):
     """autograd's rule for one argument at a time takes n concatenations for n arrays."""
     calls = counted(monkeypatch, np, "concatenate")
