@@ -1154,6 +1154,12 @@ BUGS = {
         "M[..., :n] += 0.0 * section[:, None, None]",
         "tests/integrators/test_integrators_radau.py::test_stiff_problems_with_their_gradients",
     ),
+    "second derivatives of radau from one iteration": Bug(
+        "integrators",
+        "for _ in traces_of([v, *leaves(params), t, h]):",
+        "for _ in range(1):",
+        "tests/integrators/test_integrators_radau.py::test_second_derivatives_in_everything",
+    ),
     "derivatives of radau at the wrong stage": Bug(
         "integrators",
         "[(u + z[:, i], done + C[i] * length) for i in (0, 1)]",

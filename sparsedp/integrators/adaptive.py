@@ -43,7 +43,7 @@ Math. Software 20 (1994).
 from __future__ import annotations
 
 from collections import deque
-from functools import reduce
+from functools import partial, reduce
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import autograd.numpy as anp
@@ -67,7 +67,15 @@ if TYPE_CHECKING:
 
     from sparsedp.integrators.events import Event
 
-__all__ = ["AcceptedStep", "Adaptive", "FlatDeviation", "inner_product", "relative_sizes"]
+__all__ = [
+    "AcceptedStep",
+    "Adaptive",
+    "FlatDeviation",
+    "inner_product",
+    "length_shift",
+    "relative_sizes",
+    "with_values",
+]
 
 FLOOR_ADVICE = "; give one number, or a tree like the state"  # advice about a floor
 # Safety factor, least and largest ratio of successive step lengths.
@@ -142,9 +150,12 @@ class Adaptive(Scheme):
         Lengths of the accepted steps in the last interval, as fractions of the interval.
     weight : float
         Weight of the extrapolation: 1 / (2^p - 1), or 0 for none.
+    allowance : float
+        Factor by which the estimated error of a derivative may be larger for each order above the first.
     """
 
     window = WINDOW
+    allowance = 1.0
 
     def __init__(self, scheme: Scheme, tolerance: Any, floor: Any, max_step: float | None = None) -> None:
         super().__init__(scheme.problem, f"stepper({scheme.name})", scheme.order)
@@ -516,7 +527,7 @@ class Adaptive(Scheme):
         sizes = [*self.sizes(path[0].u), *map(relative_sizes, leaves(plain_arguments[1:]))]
         start = FlatDeviation(arguments, has_derivative, sizes)
         end = FlatDeviation(path[-1].new, is_variable, self.sizes(path[0].u, path[-1].new))
-        perturb, evaluate = linear(f"{self.name}.variation", *self.perturbed_solutions(len(path)))
+        perturb, evaluate = linear(f"{self.name}.variation", *self.perturbed_solutions(len(path), arguments))
         entered = perturb(start.deviation(arguments))
         return end.tree(evaluate(self._deviations_at_end(path, plain_arguments, start, end, entered)))
 
@@ -579,42 +590,58 @@ class Adaptive(Scheme):
             half = 0.5 * step.length * h
             start = time_after(time_after(t, step.done * h), shift)
             if event and step is path[-1]:
-                return self._state_at_event(event, step, less, u, params, start, half)
+                advance = partial(self._advanced, step, self.weight - less)
+                return self._state_at_event(event, step, less, u, params, start, half, advance)
             if row:
-                first = _length_shift(u, row[0])
+                first = length_shift(u, row[0])
             else:
                 first = -returned * plain(half)
-            middle = _with_values(self.scheme(u, params, start, half + first), step.middle)
+            middle = with_values(self.scheme(u, params, start, half + first), step.middle)
             if row:
-                second = _length_shift(middle, row[1])
+                second = length_shift(middle, row[1])
             else:
                 second = -returned * plain(half)
             fine = self.scheme(middle, params, time_after(time_after(start, half), first), half + second)
             whole = self.scheme(u, params, start, half + first + (half + second))
-            u = _with_values(self.extrapolated(fine, whole, self.weight - less), step.new)
+            u = with_values(self.extrapolated(fine, whole, self.weight - less), step.new)
             shift = shift + first + second
             if row:
                 returned = shift / rest
         return u, None
 
+    def _advanced(self, step: AcceptedStep, weight: float, u: Any, params: Any, t: Any, length: Any) -> Any:
+        """Return the state after an accepted step with another length, with derivatives."""
+        half = 0.5 * length
+        middle = with_values(self.scheme(u, params, t, half), step.middle)
+        fine = self.scheme(middle, params, t + half, half)
+        whole = self.scheme(u, params, t, length)
+        return with_values(self.extrapolated(fine, whole, weight), step.new)
+
     def _state_at_event(
-        self, event: Event, step: AcceptedStep, less: float, u: Any, params: Any, t: Any, half: Any
+        self,
+        event: Event,
+        step: AcceptedStep,
+        less: float,
+        u: Any,
+        params: Any,
+        t: Any,
+        half: Any,
+        advance: Callable[[Any, Any, Any, Any], Any],
     ) -> tuple[Any, Any]:
-        """Return the state and the time at the end of a step that an event ends."""
-        weight = self.weight - less
+        """Return the state and the time at the end of a step that an event ends.
+
+        ``advance(u, params, t, length)`` returns the state after the step.
+        """
 
         def advanced(point: tuple, change: Any) -> tuple[Any, Any]:
             """Return the state and the time after a step of length 2 half + change."""
             u, params, t = point
-            length = half + 0.5 * change
-            middle = _with_values(self.scheme(u, params, t, length), step.middle)
-            fine = self.scheme(middle, params, t + length, length)
-            whole = self.scheme(u, params, t, length + length)
-            return _with_values(self.extrapolated(fine, whole, weight), step.new), t + (length + length)
+            length = 2.0 * (half + 0.5 * change)
+            return advance(u, params, t, length), t + length
 
         def value(point: tuple, change: Any) -> Any:
             new, time = advanced(point, change)
-            return event.value(new, without_side(point[1]), time)
+            return event.value(self.tree(new), without_side(point[1]), time)
 
         point = u, params, t
         plain_point = untraced(point)
@@ -650,7 +677,7 @@ class Adaptive(Scheme):
                 "give another event or parameter, or a smaller tolerance"
             )
 
-    def perturbed_solutions(self, count: int) -> tuple[Callable, Callable]:
+    def perturbed_solutions(self, count: int, arguments: tuple) -> tuple[Callable, Callable]:
         """Return the functions `perturb` and `evaluate` of plain arrays, for a number of steps.
 
         `perturb` returns the initial deviations of the solution and of two perturbed solutions. `evaluate` returns the
@@ -659,6 +686,7 @@ class Adaptive(Scheme):
         share = self.compared / (self.compared + 1)
         if self.weight:
             limit = LARGEST_DERIVATIVE_ERROR * self.tolerance**share
+            limit = limit * self.allowance ** (len(traces_of(leaves(arguments))) - 1)
         else:
             limit = TIMES * self.tolerance
         unit = EPSILON * self.ratio
@@ -753,12 +781,12 @@ def _deviation(leaf: Any, value: Any) -> Any:
     return cast(deviation, np.result_type(dtype_of(deviation), float))
 
 
-def _with_values(tree: Any, values: Any) -> Any:
+def with_values(tree: Any, values: Any) -> Any:
     """Replace the values of a tree by others that differ by rounding, and keep its derivatives."""
     return mapped(lambda leaf, value: leaf - plain(leaf) + value if isbox(leaf) else value, tree, values)
 
 
-def _length_shift(u: Any, rows: Sequence) -> Any:
+def length_shift(u: Any, rows: Sequence) -> Any:
     """Return d: 0, with its derivative."""
     pairs = zip(leaves(u), rows, strict=True)
     return sum(anp.sum(anp.real(row * _deviation(leaf, plain(leaf)))) for leaf, row in pairs if isbox(leaf))

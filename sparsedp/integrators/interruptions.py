@@ -155,7 +155,7 @@ class Interrupted(Scheme):
         start = FlatDeviation(arguments, isbox, sizes)
         end = FlatDeviation((new, time), is_variable, [*Adaptive.sizes(scheme, u, new), h])
         count = sum(len(segment.path) for segment in segments)
-        perturb, evaluate = linear(f"{self.name}.variation", *scheme.perturbed_solutions(count))
+        perturb, evaluate = linear(f"{self.name}.variation", *scheme.perturbed_solutions(count, arguments))
         entered = perturb(start.deviation(arguments))
         runs = [start.tree(entered[number]) for number in range(len(entered))]
         continuous: set[int] = set()

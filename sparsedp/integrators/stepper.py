@@ -222,19 +222,21 @@ def stepper(
     steps. The contribution of the extrapolation to it, relative to the params and to its largest entry, must be less
     than 6 tolerance^(p / (p + 1)) with the order p (crank_nicolson: less than 10 tolerance); otherwise a
     DerivativeError is raised. This may also happen for a derivative that is small because terms cancel. radau uses an
-    embedded formula instead of the extrapolation (p = 3 in the bound), and has only first derivatives.
+    embedded formula instead of the extrapolation (p = 3 in the bound). For each order above the first its bound is ten
+    times larger.
 
     Cost: n linear steps and their gradient take one set-up and 2 n solves (tr_bdf2: 4 n). With a tolerance a gradient
     takes about six times the steps of its value, and three times the time of a gradient without the error estimate.
     radau evaluates three Jacobians for the derivative of a step, batches them over many steps, and records one rule on
     the tape for an interval; a gradient takes 1.5 to 3.2 times as long as the value, and 3 to 5 times if the rate is
-    vectorized.
+    vectorized. For derivatives of higher order radau records each step: a Hessian product of two parameters takes 50
+    times as long as a gradient.
 
     Breaks and events: du/db = f_- - f_+ just after a break b, where f_- and f_+ are the rates before and after it. The
     derivative of the time of an event g = 0 follows from the implicit function theorem,
     -(g_u du + g_p dp + g_t dt) / (g_u f + g_t), applied to the step that ends at the event. This step is located by
     Brent's method to rounding (implicit methods: to `rtol`). Derivatives of all orders are available, also in rollouts
-    with any `memory`; radau has only first derivatives. If an event function has two zeros within one step, they are
+    with any `memory`. If an event function has two zeros within one step, they are
     found if the values at the start, the middle and the end of the step indicate an extremum between them. After a
     terminal event the next step of a rollout starts from the returned state and time. `step.t_events` lists the times
     of events in the last interval as constants. To differentiate the time of an event, use the time that a terminal

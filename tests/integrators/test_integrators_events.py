@@ -332,4 +332,4 @@ def test_errors_stay_near_the_tolerance():
 
     for _, _, tolerance, found in table({"heun": (1e-3,), "rk4": (1e-3,), "radau": (1e-6,)}):
         assert all(error is None or error <= 10 * tolerance for error in found)
-        assert found[1] is not None
+        assert found[1] is not None and found[2] is not None

@@ -230,16 +230,38 @@ def test_tapes_of_many_points_are_traversed_together(monkeypatch):
         assert rows == pytest.approx(np.array([np.diag(dp.vjp(fun, u)[1](np.ones(2))) for u in points]), rel=1e-15)
 
 
-def test_second_derivatives_are_refused():
-    step = dp.stepper("radau", oscillator, 1.0, tolerance=1e-4)
-    with pytest.raises(
-        DerivativeError,
-        match=r"stepper\(radau\) has first derivatives only, got one inside another; take tr_bdf2 for second ones",
-    ):
-        dp.hvp(lambda u: step(u, 2.0)[0], np.array([2.0, 0.0]), np.array([1.0, 0.0]))
-    loss = lambda p: dp.rollout(step, np.array([2.0, 0.0]), p, 3)[0]
-    with pytest.raises(DerivativeError, match="first derivatives only"):
-        value_and_grad(lambda p: value_and_grad(loss)(p)[1])(2.0)
+def test_second_and_third_derivatives():
+    """u' = -p u^2 has the solution u / (1 + p u t): with error control, and of one step in every order of the modes."""
+    x, tangent = np.array([1.5, 2.0]), np.array([0.3, -0.7])
+    second = lambda fun: lambda x: dp.grad(lambda x: dp.grad(fun)(x) @ tangent)(x)
+    third = lambda fun: pushforward(second(fun), x, tangent)[1]
+    for dt, options, near in ((0.5, dict(tolerance=1e-3), 1e-5), (0.05, dict(rtol=1e-13), 1e-8)):
+        step = dp.stepper("radau", lambda u, p: -p * u**2, dt, **options)
+        ours = lambda x, step=step: step(x[:1], x[1])[0]
+        exact = lambda x, dt=dt: x[0] / (1 + dt * x[0] * x[1])
+        assert dp.hvp(ours, x, tangent) == pytest.approx(second(exact)(x), rel=near)
+    assert second(ours)(x) == pytest.approx(second(exact)(x), rel=near)
+    assert third(ours) == pytest.approx(third(exact), rel=near)
+
+
+def test_second_derivatives_in_everything():
+    """Of a tree with time, in state, params, length and time: a symmetric matrix that differences of gradients give."""
+    loss = lambda x: angle(x, 2, rtol=1e-13)
+    tangent, slopes = np.array([0.3, 0.5, -0.2, 0.1]), dp.grad(loss)
+    wanted = (slopes(X + 1e-4 * tangent) - slopes(X - 1e-4 * tangent)) / 2e-4
+    assert dp.hvp(loss, X, tangent) == pytest.approx(wanted, rel=1e-7)
+
+
+def test_second_derivatives_of_the_time_of_an_event():
+    """The ball reaches the height 1 at sqrt(2 (h - 1) / g)."""
+    reached = lambda u, g, t: u["x"] - 1.0
+    reached.terminal = True
+    fall = lambda u, g, t: {"x": u["v"], "v": -g + 0.0 * u["v"]}
+    step = dp.stepper("radau", fall, 2.0, tolerance=1e-4, events=reached)
+    ours = lambda x: step(({"x": x[0], "v": 0.0}, 0.0), x[1])[1]
+    exact = lambda x: anp.sqrt(2 * (x[0] - 1) / x[1])
+    x, tangent = np.array([5.0, 10.0]), np.array([0.3, -0.7])
+    assert dp.hvp(ours, x, tangent) == pytest.approx(dp.hvp(exact, x, tangent), rel=1e-8)
 
 
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-4, pytest.param(1e-6, marks=pytest.mark.whole)])

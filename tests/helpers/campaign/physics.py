@@ -562,17 +562,8 @@ class ErrorControlled(OnCells):
     own_refusals = ()
 
     @property
-    def order(self):
-        if self.method == "radau":
-            return 1
-        return 2
-
-    @property
     def refusals(self):
-        coarse = (dp.errors.DerivativeError, "tolerance")
-        if self.method == "radau":
-            return (*FIRST_ORDER, coarse, *self.own_refusals)
-        return (coarse, *self.own_refusals)
+        return ((dp.errors.DerivativeError, "tolerance"), *self.own_refusals)
 
 
 @dataclass(frozen=True)
