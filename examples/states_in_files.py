@@ -101,18 +101,21 @@ with tempfile.TemporaryDirectory() as folder:
 # After the gradient the folder is empty. The same holds if the process is killed, for instance by the end of a batch
 # job.
 
-calls = 0
+
+class InterruptedStep:
+    """The same step; its call number 300 is interrupted."""
+
+    def __init__(self):
+        self.calls = 0
+
+    def __call__(self, state, _):
+        self.calls += 1
+        if self.calls == 300:
+            raise KeyboardInterrupt
+        return step(state, _)
 
 
-def interrupted_step(state, _):
-    """The same step; one of its calls is interrupted."""
-    global calls
-    calls += 1
-    if calls == 300:
-        raise KeyboardInterrupt
-    return step(state, _)
-
-
+interrupted_step = InterruptedStep()
 with tempfile.TemporaryDirectory() as folder:
     passes = []
 

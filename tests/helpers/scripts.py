@@ -50,7 +50,7 @@ SMALL = {
     "ensemble.py": "5",
     "mesh_design.py": "3",
     "mbb_beam.py": "20",
-    "volume_to_point.py": "16",
+    "volume_to_point.py": "32",
     "room.py": "8",
     "pylops_exchange.py": "32",
     "pendulums.py": "10",
