@@ -93,7 +93,7 @@ def conjugate_gradients():
 
 
 @right("Newton's method at 1e-8")
-def newton_at_1e_8():
+def keplers_equation():
     """Kepler's equation by Newton's method that stops at a step of 1e-8."""
 
     def f(anomaly):
@@ -111,7 +111,7 @@ def newton_at_1e_8():
 
 
 @right("fixed point at 1e-8", undecidable="a fixed point at 1e-8 leaves too few digits")
-def fixed_point_at_1e_8():
+def contraction():
     """The fixed point of a contraction; forward and adjoint iterations stop at a change of 1e-8."""
 
     def solved(update, u):
@@ -132,7 +132,7 @@ def fixed_point_at_1e_8():
 
 
 @right("bisection at 1e-8", undecidable="a bisection at 1e-8 leaves too few digits")
-def bisection_at_1e_8():
+def gas_law_by_bisection():
     """The volume of a gas at a pressure, by bisection to 1e-8."""
 
     def f(pressure):

@@ -210,5 +210,5 @@ def _stored_value(audit: Any) -> str | None:
         if group.weights is last.weights and first is not None:
             slopes = group.evaluations.slopes
             if _is_curved(first) and np.any(slopes) and np.array_equal(slopes, last.evaluations.slopes):
-                return "it returns the same cotangent at x and beside x: it uses a stored value instead of x"
+                return "it returns the same cotangent at x and beside x: it uses a stored value, or a term is missing"
     return None

@@ -188,6 +188,14 @@ def test_a_state_of_the_last_run():
 
 
 @pytest.mark.whole
+def test_derivatives_with_less_precision_than_the_function():
+    """Along some directions their errors cancel: then a test of linearity shows them."""
+    rounded = VJP(lambda u: u**3, lambda u, g: (3 * u**2 * g).astype(np.float32).astype(float), X, rng=4)
+    assert rounded.verdict == "disagrees" and "rounds its numbers to single precision" in rounded.reason
+    inexact = VJP(lambda u: 2 * u, lambda u, g: 2 * (g + 1e-4 * np.roll(np.abs(g), 1)), X)
+    assert inexact.verdict == "disagrees" and "although f is exact: tighten the tolerance" in inexact.reason
+
+
 def test_wrong_derivatives_of_other_kinds_disagree():
     assert JVP(cube, lambda u, t: 3.001 * u**2 * t, X).verdict == "disagrees"
     assert JVP(cube, lambda u, t: 3 * X**2 * t, X).verdict == "disagrees"

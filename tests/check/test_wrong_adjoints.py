@@ -26,7 +26,7 @@ SAMPLE = {
     "complex polynomial",
 }
 # Errors of right derivatives that are larger than those of rounding in double precision.
-TOLERANCES = {"diffusion in single precision": 1e-6, "fixed point at 1e 8": 1e-8, "bisection at 1e 8": 1e-8}
+TOLERANCES = {"diffusion in single precision": 1e-6, "contraction": 1e-8, "gas law by bisection": 1e-8}
 
 
 def marked(cases):
