@@ -187,7 +187,6 @@ def test_a_state_of_the_last_run():
     assert result.verdict == "disagrees" and "it keeps a state of other runs" in result.reason
 
 
-@pytest.mark.whole
 def test_derivatives_with_less_precision_than_the_function():
     """Along some directions their errors cancel: then a test of linearity shows them."""
     rounded = VJP(lambda u: u**3, lambda u, g: (3 * u**2 * g).astype(np.float32).astype(float), X, rng=4)
@@ -196,6 +195,7 @@ def test_derivatives_with_less_precision_than_the_function():
     assert inexact.verdict == "disagrees" and "although f is exact: tighten the tolerance" in inexact.reason
 
 
+@pytest.mark.whole
 def test_wrong_derivatives_of_other_kinds_disagree():
     assert JVP(cube, lambda u, t: 3.001 * u**2 * t, X).verdict == "disagrees"
     assert JVP(cube, lambda u, t: 3 * X**2 * t, X).verdict == "disagrees"
