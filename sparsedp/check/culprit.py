@@ -24,6 +24,7 @@ from sparsedp.check.direction_evidence import DirectionEvidence
 from sparsedp.check.directions import examine_directions
 from sparsedp.check.entries import (
     DEFAULT_STEP,
+    EVERY_ENTRY,
     EntryGap,
     gaps_along_entries,
     largest_gaps,
@@ -243,7 +244,12 @@ def _entries_of_rule(
     point = evaluations.point
     in_arguments = gaps_along_entries(evaluations, directions, 1)
     sentences = listed(in_arguments, point, evaluations.slopes, spaces, "its VJP")
-    words = [f"largest gap in its {sentence}" for sentence in sentences]
+    words = []
+    for sentence in sentences:
+        if sentence.startswith(EVERY_ENTRY):
+            words.append(sentence.replace(EVERY_ENTRY, f"{EVERY_ENTRY}its ", 1))
+        else:
+            words.append(f"largest gap in its {sentence}")
     shapes = [np.shape(weight) for weight in weights.values()]
     is_complex = point.complex or any(map(np.iscomplexobj, weights.values()))
     if not is_complex and sum(map(prod, shapes)) > 1:

@@ -23,6 +23,7 @@ from sparsedp.grid.grid import node_axes
 
 __all__ = [
     "DEFAULT_STEP",
+    "EVERY_ENTRY",
     "MOST_ENTRIES",
     "EntryGap",
     "gaps_along_entries",
@@ -40,6 +41,7 @@ SLAB_PARTS = 4  # a region is divided into this number of parts, each of which m
 NOISE_RATIO = 3.0  # a gap that was measured along a direction exceeds the noise by this factor
 FACTOR_DIRECTIONS = 3  # a common factor of all entries is measured along this number of directions
 FACTOR_SHARE = 0.02  # it may differ between them by this share of its distance from 1
+EVERY_ENTRY = "every entry of "  # begins a sentence about a leaf
 DEFAULT_STEP = 2.0**-11  # used if the sweep found no plateau
 CLEAR_OF_NOISE = 4.0  # a gap has to be this many times the noise of its measurement
 
@@ -476,7 +478,7 @@ def listed(
         x = point.values[entry.leaf]
         slope = slopes[entry.leaf]
         if entry.block == entry.region:
-            sentences.append(f"every entry of {name}: {source} {_factor_in_words(entry.factor)}")
+            sentences.append(f"{EVERY_ENTRY}{name}: {source} {_factor_in_words(entry.factor)}")
             continue
         words = f"{name}{subscript(entry.block, x.shape)}{where(entry.block, x.shape, spaces)}"
         if not isnan(entry.gap) and slope is not None and not np.iscomplexobj(x):

@@ -335,7 +335,8 @@ class Audit(Result):
     gaps : tuple of str
         If the verdict is "disagrees": the entries of `x` with the largest gaps between gradient and finite difference.
         Each string has both derivatives. If the loss applies Operators on a grid, it also has the coordinates of the
-        entry, or the region that contains the whole gap.
+        entry. If all entries of a wall, a row or a leaf are wrong, it names this region, and the factor by which the
+        gradient is wrong if it is the same in the whole region.
     hessian : "agrees", "disagrees", "inconclusive" or None
         Result of the third Taylor remainder for a Hessian product along the first direction. The verdict on the
         gradient does not depend on it. None if no Hessian product was computed: `gradient` was given, the audit was

@@ -55,6 +55,11 @@ def test_the_largest_entries_come_first():
     assert [gap.split(":")[0] for gap in found.gaps] == ["x[7, 0]", "x[1, 1]", "x[3, 4]"]
 
 
+def test_a_factor_of_a_call_on_the_tape():
+    found = dp.check.gradient(lambda u: anp.sum(anp.sin(law(-2.0)(u))), FIELD, quick=True)
+    assert found.culprit == "law" and "every entry of its argument: its VJP has the wrong sign" in str(found)
+
+
 def test_the_numbers_of_a_gradient_that_is_given():
     """There is no tape and no culprit, and the entry is named all the same."""
     slope = 2 * FIELD
