@@ -4,11 +4,13 @@ import pytest
 
 from benchmarks.suites import CASES, Number, rounding, row
 
-AUDITED = ("fit of mu, dt 0.1", "shadowing", "15 steps")  # a quick audit of these takes less than 0.3 s
+AUDITED = ("fit of mu, dt 0.1", "shadowing")  # a quick audit of these takes less than 0.3 s
+LONG = ("van der Pol, 500 steps", "van der Pol, fit of mu, stiff")  # the same methods as in other cases, 1 to 3 s each
 
 
-@pytest.mark.whole
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name in LONG else pytest.mark.whole) for name in CASES]
+)
 def test_published_numbers(name):
     audited = any(part in name for part in AUDITED)
     found, _, verdict = row(name, audited)
