@@ -274,7 +274,16 @@ class Pencil:
     @cached_property
     def start(self) -> NDArray[Any]:
         """The vector with which iterations start: random numbers from a fixed seed."""
-        return self.masked(np.random.default_rng(1).standard_normal(self.size)).astype(self.dtype)
+        return self.start_of_search(0)
+
+    def start_of_search(self, known: int) -> NDArray[Any]:
+        """Return the vector with which a search in the complement of a number of known vectors starts.
+
+        The component of one start in an eigenspace is the copy that its Krylov space contains. In the complement of
+        this copy the same start has nothing of the eigenspace but rounding errors, so each search needs another one.
+        """
+        seed = 1 + known
+        return self.masked(np.random.default_rng(seed).standard_normal(self.size)).astype(self.dtype)
 
     @property
     def dtype(self) -> Any:
@@ -655,7 +664,7 @@ def _shift_invert(pencil, sigma, solve, known, count, maxiter, tolerance):
             count,
             LinearOperator(shape, pencil.apply_mass, dtype=dtype),
             sigma,
-            v0=complement(pencil.start),
+            v0=complement(pencil.start_of_search(len(known))),
             ncv=min(pencil.unknowns, max(2 * count + 1, 20)),
             maxiter=maxiter,
             tol=tolerance,
@@ -689,8 +698,9 @@ def _by_products(pencil, k, which, maxiter):
         op = LinearOperator((pencil.size, pencil.size), product, dtype=pencil.dtype)
         ncv = min(pencil.size, max(2 * count + 1, 20))
         limit = maxiter or 100 * pencil.size
+        start = pencil.start_of_search(len(known))
         with _arpack_errors(count):
-            values, vectors = eigsh(op, count, which=ends[which], v0=pencil.start, ncv=ncv, maxiter=limit)
+            values, vectors = eigsh(op, count, which=ends[which], v0=start, ncv=ncv, maxiter=limit)
         return values.real, vectors.T
 
     def is_nearer(value, last):

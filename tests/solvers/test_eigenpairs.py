@@ -313,6 +313,14 @@ def test_an_operator_with_eigenvalues_of_both_signs():
     assert np.allclose(pairs.values, laplacian_values(25, "dirichlet", 3) - 60.0)
 
 
+def test_all_copies_in_three_dimensions():
+    """A search in the complement of the known vectors needs a start of its own: the first has no copies there."""
+    op = -dp.laplacian(dp.Grid((9, 9, 9), size=1.0), dp.dirichlet)
+    line = 4.0 * 9**2 * np.sin(0.5 * np.pi * np.arange(1, 10) / 9) ** 2
+    expected = np.sort(np.add.outer(np.add.outer(line, line), line).ravel())
+    assert np.allclose(dp.eigenpairs(op, 7, method="arpack").values, expected[:7], rtol=1e-10)
+
+
 def test_many_copies_of_one_eigenvalue():
     """ARPACK alone finds only some of them: its space holds one copy, and others by rounding errors."""
     line = -dp.laplacian(dp.Grid(10, size=1.0), dp.dirichlet)
