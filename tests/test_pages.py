@@ -178,6 +178,7 @@ def site(tmp_path_factory):
     copy = tmp_path_factory.mktemp("site")
     shutil.copytree(DOCS, copy / "docs", ignore=shutil.ignore_patterns("_build", "gallery", "api", "__pycache__"))
     shutil.copytree(ROOT / "examples", copy / "examples")
+    shutil.copytree(ROOT / "benchmarks" / "wrong_adjoints", copy / "benchmarks" / "wrong_adjoints")
     (copy / "tests" / "helpers").mkdir(parents=True)
     shutil.copy(ROOT / "tests" / "helpers" / "scripts.py", copy / "tests" / "helpers")
     options = ["-W", "--keep-going", "-q", "-D", f"sphinx_gallery_conf.filename_pattern={QUICK}"]
