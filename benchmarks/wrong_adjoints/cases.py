@@ -36,6 +36,8 @@ class Case:
         The entries of x in which the VJP is wrong.
     culprit : str
         The stage whose VJP is wrong.
+    diagnosis : str
+        Words by which `check.vjp` describes the mistake, if it is one that it recognizes.
     undecidable : str
         Why values of f cannot show that the derivative is right.
     """
@@ -47,6 +49,7 @@ class Case:
     is_wrong: bool
     entries: Any = None
     culprit: str = ""
+    diagnosis: str = ""
     undecidable: str = ""
 
     def program(self) -> Program:
@@ -60,9 +63,9 @@ def _case(build, kind, is_wrong, **known):
     return Case(build.__name__.replace("_", " "), summary, build, kind, is_wrong, **known)
 
 
-def wrong(fault, entries=EVERY, culprit=""):
+def wrong(fault, entries=EVERY, culprit="", diagnosis=""):
     """Return a decorator for a program with a planted fault."""
-    return lambda build: _case(build, fault, True, entries=entries, culprit=culprit)
+    return lambda build: _case(build, fault, True, entries=entries, culprit=culprit, diagnosis=diagnosis)
 
 
 def right(difficulty, undecidable=""):

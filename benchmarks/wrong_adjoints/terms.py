@@ -93,7 +93,7 @@ def radioactive_decay():
     return chained(np.linspace(0.5, 2.0, 6), (injected, injected_vjp), (decay, decay_vjp))
 
 
-@wrong("stale linearization")
+@wrong("stale linearization", diagnosis="the same cotangent at x and beside x")
 def linearized_once():
     """The drag on a vehicle; its derivative is that at the speed at which the program was started."""
     start = np.linspace(10.0, 30.0, 5)

@@ -5,7 +5,7 @@ import numpy as np
 from benchmarks.wrong_adjoints.cases import wrong
 
 
-@wrong("missing transpose")
+@wrong("missing transpose", diagnosis="instead of its transpose")
 def upwind_step():
     """One upwind step of a concentration in a ring."""
 
@@ -18,7 +18,7 @@ def upwind_step():
     return f, vjp, np.sin(np.arange(10.0))
 
 
-@wrong("missing transpose", entries=np.s_[:, :2])
+@wrong("missing transpose", entries=np.s_[:, :2], diagnosis="instead of its transpose")
 def rotated_coordinates():
     """Positions of points in a coordinate system that is rotated about the vertical axis."""
     c, s = np.cos(0.3), np.sin(0.3)
@@ -33,7 +33,7 @@ def rotated_coordinates():
     return f, vjp, np.sin(np.arange(12.0)).reshape(4, 3)
 
 
-@wrong("kernel not reversed")
+@wrong("kernel not reversed", diagnosis="instead of its transpose")
 def blurred_signal():
     """The convolution of a periodic signal with a kernel that is not symmetric."""
     kernel = (0.5, 0.3, 0.2)

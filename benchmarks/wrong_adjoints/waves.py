@@ -53,7 +53,7 @@ def helmholtz_equation():
     return chained(np.exp(1j * np.arange(12.0)), (waves, waves_vjp), (microphones, microphones_vjp))
 
 
-@wrong("missing conjugate")
+@wrong("missing conjugate", diagnosis="convention")
 def intensity_of_light():
     """The intensity of a complex wave."""
 

@@ -377,6 +377,7 @@ def _with_stage(
     """Return the result of a check, with the first stage that is wrong if the whole is wrong."""
     if result.verdict != "disagrees":
         return result
+    undecided = []
     for stage, point in chain.inputs(x):
         function, derivative = stage.function, stage.derivative
         derivatives = {"vjp": None, "jvp": None, chain.kind: derivative}
@@ -389,6 +390,12 @@ def _with_stage(
                 note += f"; {found.culprit}"
             notes = (f"culprit: {note}", *_gap_notes(gaps, result_gaps))
             return _changed(result, culprit=stage.name, gaps=gaps, result_gaps=result_gaps, notes=notes)
+        if found.verdict == "inconclusive":
+            undecided.append((stage.name, found.reason))
+    if len(undecided) == 1:
+        name, reason = undecided[0]
+        note = f"culprit: {name}, as all other stages agree: {reason}"
+        return _changed(result, culprit=name, notes=(note, *_gap_notes(result.gaps, result.result_gaps)))
     note = "culprit: no stage is wrong; the stages may be put together wrongly"
     return _changed(result, culprit=None, notes=(note, *_gap_notes(result.gaps, result.result_gaps)))
 

@@ -280,7 +280,7 @@ def test_mistakes_with_a_name():
     assert VJP(lambda u: shift @ u, lambda u, g: shift @ g, X).culprit == (
         "it multiplies by the Jacobian instead of its transpose"
     )
-    assert "uses a stored value" in VJP(cube, lambda u, g: cube_vjp(X, g), X).culprit
+    assert "it uses a stored value" in VJP(cube, lambda u, g: cube_vjp(X, g), X).culprit
     z = X + 0.5j
     assert "convention='adjoint'" in VJP(lambda z: z**2, lambda z, g: np.conj(2 * z) * g, z).culprit
     assert "a conjugate is missing" in VJP(lambda z: z**2, lambda z, g: 2 * z * np.conj(g), z).culprit

@@ -137,23 +137,41 @@ def test_right_derivatives_are_right_to_rounding(case):
 
 def check(case):
     program = case.program()
-    return dp.check.vjp(program.f, program.vjp, program.x)
+    return dp.check.vjp(program.f, program.vjp, program.x, stages=program.stages or None)
+
+
+def names_the_culprit(case, result):
+    """Return whether `check.vjp` names the stage at fault, or the mistake where it is one that it recognizes."""
+    names = [function.__name__ for function, _ in case.program().stages]
+    if names:
+        return result.culprit == f"stage {names.index(case.culprit) + 1} ({case.culprit})"
+    if case.diagnosis:
+        return case.diagnosis in result.culprit
+    return result.culprit is None
+
+
+def leaf_and_index(gap):
+    """Return the name of a leaf of x, and an index, from the words of `check.vjp`; None for entries of f(x)."""
+    words = gap.rpartition("): ")[2] if gap.startswith("stage") else gap
+    found = re.match(r"(every entry of )?(x(?:\['\w+'\])?)((?:\[[\d, ]+\])?)(?=[:, ]|$)", words)
+    if found is None:
+        return None
+    every, name, index = found.groups()
+    return name, ... if every else tuple(map(int, re.findall(r"\d+", index)))
 
 
 @pytest.mark.parametrize("case", marked(WRONG))
 def test_wrong_derivatives_disagree(case):
-    """The verdict comes with entries that are wrong."""
+    """The verdict comes with the stage at fault, and with entries that are wrong: those of x, or of its input."""
     result = check(case)
-    assert result.verdict == "disagrees", result
+    assert result.verdict == "disagrees" and names_the_culprit(case, result), result
     x = case.program().x
     masks = wrong_entries(case, x)
     names = [f"x['{name}']" for name in x] if isinstance(x, dict) else ["x"]
-    assert bool(result.gaps) == any(map(np.any, masks))
-    for gap in result.gaps:
-        every, name, index = re.match(r"(every entry of )?(x(?:\['\w+'\])?)((?:\[[\d, ]+\])?)", gap).groups()
-        mask = masks[names.index(name)]
-        place = tuple(map(int, re.findall(r"\d+", index)))
-        assert np.all(mask[place]) if every is None else np.all(mask), gap
+    places = [place for gap in result.gaps if (place := leaf_and_index(gap))]
+    assert bool(places) == any(map(np.any, masks))
+    for name, index in places:
+        assert np.all(masks[names.index(name)][index]), result.gaps
 
 
 @pytest.mark.parametrize("case", marked(RIGHT))
