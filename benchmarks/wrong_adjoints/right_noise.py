@@ -22,7 +22,7 @@ def noisy_simulator():
     return f, vjp, np.linspace(1.0, 2.0, 5)
 
 
-@right("single precision")
+@right("single precision", undecidable="along some directions, single precision leaves too few digits")
 def diffusion_in_single_precision():
     """Ten steps of nonlinear diffusion in single precision."""
     r = np.float32(0.1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,9 @@ SMOOTH_NOISE = 1e3  # noise of f in units of rounding, above which the roughness
 LARGER_NUDGE = 1e-6  # relative change of x, above the rounding of single precision
 SINGLE_SHARE = 2e-3  # a larger second difference of a VJP shows the rounding of single precision
 LEAST_CHANGE = 1e-4  # a smaller change of a VJP, relative to that of x, is due to rounding in double precision
+ROUNDING_STEP = 2.0**-27  # rounding of intermediate values may be visible in steps below this one
+FAR_STEPS = 2.0**9  # steps from this multiple on are far above the best one
+STEEP_SHARE = 0.05
 STAIRS = 2  # number of steps at which a staircase does not change although it should
 CLEAR_OF_ROUNDING = 100.0
 
@@ -69,6 +73,14 @@ def _find_other_scales(direction: DirectionEvidence) -> None:
             direction.word = "noise"
             direction.note = "f varies on a scale below the smallest step: differences see no derivative"
             return
+    larger = [level for level in line.levels if not level.note and level.step >= FAR_STEPS * direction.step]
+    steepest = max((abs(level.difference) for level in larger), default=inf)
+    if direction.step < ROUNDING_STEP and steepest <= STEEP_SHARE * abs(direction.difference):
+        direction.word = "noise"
+        direction.note = (
+            f"steps below {direction.step:.0e} show a much steeper f than all others: rounding inside f may do it"
+        )
+        return
     rounding = CLEAR_OF_ROUNDING * line.evaluations.eps * abs(line.base)
     expected = abs(direction.difference)
     stairs = [level for level in line.levels if level.note == UNCHANGED and level.step * expected > rounding]

@@ -197,3 +197,10 @@ def test_reasons_do_not_depend_on_the_random_directions(name, reason, seed):
     program = next(case for case in WRONG if case.name == name).program()
     result = dp.check.vjp(program.f, program.vjp, program.x, rng=seed)
     assert result.verdict == "disagrees" and re.search(reason, result.reason), result
+
+
+@pytest.mark.whole
+def test_rounding_inside_a_function_is_no_derivative():
+    """With some weights, the finest steps show a slope that is due to the rounding of cosines."""
+    program = next(case for case in RIGHT if case.name == "nearly cancelling terms").program()
+    assert dp.check.vjp(program.f, program.vjp, program.x, rng=11).verdict == "inconclusive"
