@@ -24,7 +24,7 @@ from __future__ import annotations
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -949,14 +949,82 @@ def _general_by_arpack(pencil, k, which, maxiter):
             "method arpack for an operator that is not symmetric, with a mass, needs a shift, got "
             f"which={which!r}; write a number as which"
         )
+    if isinstance(which, str):
+        # ARPACK's tolerance is relative to an eigenvalue: it never finds 0. Far from 0 it is relative to the operator.
+        bound = float(np.max(pencil._row_sums, initial=0.0)) or 1.0
+        offset = -2.0 * bound if which == "smallest" else 2.0 * bound
+
+        def act(x):
+            return pencil.apply_stiffness(x) + offset * x
+
+        with _arpack_errors(k):
+            act_op = LinearOperator(shape, act, dtype=dtype)
+            values, vectors = eigs(act_op, k, v0=pencil.start, maxiter=maxiter, **options)
+        value_of = partial(np.add, -offset)
+        return _with_missing_values(pencil, k, which, maxiter, value_of(values), vectors, act, value_of)
     mass_op = None if pencil.mass is None else LinearOperator(shape, pencil.apply_mass, dtype=dtype)
     with _arpack_errors(k):
-        return eigs(
+        values, vectors = eigs(
             LinearOperator(shape, pencil.apply_stiffness, dtype=dtype),
             k,
             mass_op,
             v0=pencil.start,
             maxiter=maxiter,
-            return_eigenvectors=False,
             **options,
         )
+
+    def inverse(x):
+        return solve(pencil.apply_mass(x))
+
+    return _with_missing_values(pencil, k, which, maxiter, values, vectors, inverse, lambda mu: sigma + 1.0 / mu)
+
+
+def _with_missing_values(pencil, k, which, maxiter, values, vectors, act, value_of):
+    """Return eigenvalues after searches outside of the known invariant subspace that find no nearer one.
+
+    Parameters
+    ----------
+    pencil, k, which, maxiter
+        As for `_general_by_arpack`.
+    values, vectors : arrays, shapes (k,) and (n, k)
+    act : callable
+        The operator of which the vectors are eigenvectors. On the orthogonal complement of an invariant subspace its
+        compression has the other eigenvalues.
+    value_of : callable
+        Returns the eigenvalue of the pencil for one of `act`.
+    """
+    from scipy.sparse.linalg import LinearOperator, eigs
+
+    if not np.any(vectors.imag):
+        vectors = vectors.real
+    basis = la.qr(vectors, mode="economic")[0]
+    end = {"smallest": "SR", "largest": "LR"}.get(str(which), "LM")
+
+    def distances(values):
+        return _distances(values.real if isinstance(which, str) else values, which)
+
+    def complement(x):
+        x = np.asarray(x).reshape(-1)
+        return x - basis @ (basis.conj().T @ x)  # of all vectors that are known at this time
+
+    for _ in range(MOST_RESTARTS):
+        known = basis.shape[1]
+        if known + 3 > pencil.unknowns:
+            break
+        last = np.sort(distances(values))[k - 1]
+
+        def compressed(x):
+            return complement(act(complement(x)))
+
+        start = complement(pencil.start_of_search(known)).astype(basis.dtype)
+        with _arpack_errors(1):
+            operator = LinearOperator((pencil.size, pencil.size), compressed, dtype=basis.dtype)
+            found, vector = eigs(operator, 1, which=end, v0=start, maxiter=maxiter, tol=ARPACK_TOLERANCE)
+        new = value_of(found)
+        if not distances(new)[0] < last - TIE * max(abs(last), pencil.scale * TIE):
+            break
+        values = np.concatenate([values, new])
+        vector = complement(vector[:, 0])
+        vector = complement(vector / np.linalg.norm(vector))
+        basis = np.concatenate([basis, vector[:, None] / np.linalg.norm(vector)], axis=1)
+    return values

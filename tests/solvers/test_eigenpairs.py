@@ -319,6 +319,14 @@ def test_all_copies_in_three_dimensions():
     line = 4.0 * 9**2 * np.sin(0.5 * np.pi * np.arange(1, 10) / 9) ** 2
     expected = np.sort(np.add.outer(np.add.outer(line, line), line).ravel())
     assert np.allclose(dp.eigenpairs(op, 7, method="arpack").values, expected[:7], rtol=1e-10)
+    nearest = dp.eigenpairs(op, 7, expected[3] + 0.1, method="arpack", symmetric=False).values
+    assert np.allclose(nearest, expected[:7], rtol=1e-10)
+
+
+def test_a_multiple_eigenvalue_0_at_an_end_of_the_spectrum():
+    op = dp.from_matrix(-np.diag(np.arange(60.0) // 3))
+    values = dp.eigenpairs(op, 4, "largest", method="arpack", symmetric=False).values
+    assert np.allclose(values, [-1.0, 0.0, 0.0, 0.0], atol=1e-10)
 
 
 def test_many_copies_of_one_eigenvalue():
