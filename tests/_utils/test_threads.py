@@ -504,6 +504,7 @@ abstract._TypeMetaclass._intern = intern
 """
 
 
+@pytest.mark.whole
 @NUMBA
 def test_numba_types_that_threads_create_at_once():
     """numba numbers a type twice if two threads create it at once; afterwards it found no signature of our loops."""

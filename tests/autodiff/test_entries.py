@@ -45,6 +45,7 @@ def test_solution_and_gradients_are_the_dense_formulas(rng):
     np.testing.assert_allclose(of_data, -np.outer(y, x)[solve.rows, solve.columns], rtol=1e-11)
 
 
+@pytest.mark.whole
 def test_planted_errors_are_detected(rng, monkeypatch):
     """A for its transpose in the adjoint; rows for columns in the cotangent."""
     solve, data, b = system(rng)

@@ -278,7 +278,8 @@ def test_intervals_that_meet_in_a_jump(tolerance):
             assert abs(g / slope - 1) <= 10 * tolerance
 
 
-@pytest.mark.parametrize("at_fault", ["double", pytest.param(None, marks=pytest.mark.whole)])
+@pytest.mark.whole
+@pytest.mark.parametrize("at_fault", ["double", None])
 def test_an_audit_of_a_wrong_loss_blames_no_step(at_fault):
     """Its gradient is right, and the search for the culprit goes on after it."""
     step = dp.stepper("radau", robertson, 0.5, tolerance=1e-3, floor=SMALL["Robertson"])

@@ -79,6 +79,7 @@ def judge(name, tolerances, floor=None):
     return [of_gradient for _, of_gradient in found]
 
 
+@pytest.mark.whole
 def test_a_jump_that_moves():
     """With lengths that are held the derivative at mu = 20 was wrong by 90 %."""
     assert all(isinstance(error, float) for error in judge("van der Pol, 20", [1e-3]))
@@ -157,6 +158,7 @@ def test_in_loops(count):
             assert derivative(5.0) == pytest.approx(slope, rel=1e-4)
 
 
+@pytest.mark.whole
 def test_uncertain_derivatives_are_refused():
     """Two runs that meet in the middle of a jump: the terms of the derivative there cancel to a thousandth."""
     found = solve_ivp(lambda t, u: oscillator(u, 20.0), (0, 20), [2.0, 0.0], "Radau", rtol=1e-8, dense_output=True)

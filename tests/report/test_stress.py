@@ -227,6 +227,7 @@ def test_a_state_and_a_modified_input_fail():
     assert dp.stress(lambda u: greedy(getattr(u, "_value", u)) + anp.sum(u), START).failures
 
 
+@pytest.mark.whole
 def test_implicit_diffusion_passes_and_has_a_map():
     result = dp.stress(implicit, {"start": START, "dt": 1e-3, "nu": 0.1})
     assert result, str(result)

@@ -100,6 +100,7 @@ def test_strategies_with_an_operator(grid, data):
     assert not np.any(constant)
 
 
+@pytest.mark.whole
 def test_simple_examples_come_first():
     assert hypothesis.find(grids(), lambda grid: True) == dp.Grid(1, size=1.0)
     assert not np.any(hypothesis.find(fields((2, 3)), lambda field: True))
