@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from sparsedp._utils.calls import advice_near
 from sparsedp.check.derivatives import hessian as check_hessian
 from sparsedp.check.derivatives import jacobian as check_jacobian
 from sparsedp.check.derivatives import jvp as check_jvp
@@ -19,7 +21,9 @@ from sparsedp.operators.operator import Operator
 __all__ = ["DERIVATIVES", "check_derivative"]
 
 DERIVATIVES = ("gradient", "vjp", "jvp", "jacobian", "hessian")
+CHECKS = (check_gradient, check_vjp, check_jvp, check_jacobian, check_hessian)
 PAIRS = ({"vjp", "jvp"}, {"gradient", "hessian"})  # derivatives that one check compares with each other
+ARGUMENTS = sorted({name for check in CHECKS for name in inspect.signature(check).parameters} | set(DERIVATIVES))
 DIRECTIONS = 3  # random directions of a complete check of a derivative of a vector function
 
 
@@ -64,6 +68,9 @@ def check_derivative(
     if len(given) > 1 and given not in PAIRS:
         names = " and ".join(name for name in DERIVATIVES if name in given)
         raise TypeError(f"one derivative is checked at a time, got {names}; write one call for each")
+    for name in options:
+        if name not in ARGUMENTS:
+            raise TypeError(f"no check of a derivative has the argument {name!r}{advice_near(name, ARGUMENTS)}")
     if given == {"gradient"} or (not given and _is_loss(f, x)):
         return check_gradient(f, x, gradient, quick=quick, **options)
     if not quick:
@@ -79,7 +86,7 @@ def check_derivative(
 
 def _is_loss(f: Any, x: Any) -> bool:
     """Return whether f is a function with a real scalar result that is not written with torch or JAX."""
-    if isinstance(f, Operator) or not callable(f) or hasattr(f, "matvec"):
+    if x is None or isinstance(f, Operator) or not callable(f) or hasattr(f, "matvec"):
         return False
     if library_of(f, x).name != "numpy":
         return False

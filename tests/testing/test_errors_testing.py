@@ -23,6 +23,16 @@ MESSAGES = [
         "one derivative is checked at a time, got gradient and vjp; write one call for each",
     ),
     (
+        lambda: assert_gradient(total, X, vpj=lambda u, g: g * SLOPE),
+        TypeError,
+        "no check of a derivative has the argument 'vpj'; write 'vjp'",
+    ),
+    (
+        lambda: assert_gradient(total),
+        TypeError,
+        "check.vjp needs the point x at which the derivative is checked; write x=...",
+    ),
+    (
         lambda: assert_transpose(lambda u: u, lambda g: g),
         TypeError,
         "assert_transpose takes an Operator, a LinearOperator, or two functions and the shape of the argument; got "
