@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from sparsedp._utils.calls import advice_near
+from sparsedp._utils.pytree import copied
 from sparsedp.check.derivatives import hessian as check_hessian
 from sparsedp.check.derivatives import jacobian as check_jacobian
 from sparsedp.check.derivatives import jvp as check_jvp
@@ -90,5 +91,5 @@ def _is_loss(f: Any, x: Any) -> bool:
         return False
     if library_of(f, x).name != "numpy":
         return False
-    value = f(x)
+    value = f(copied(x))  # f may change its argument in place
     return library_of(value).name == "numpy" and np.shape(value) == () and np.isrealobj(value)

@@ -63,6 +63,17 @@ def test_a_wrong_entry_is_named():
         assert_gradient(cube, X, gradient=gradient, quick=False)
 
 
+def test_the_point_is_not_changed_by_a_function_that_changes_its_argument():
+    def square(u):
+        u *= 2
+        return u**2
+
+    x = X.copy()
+    with pytest.raises(AssertionError, match=r"^the vjp disagrees: f\(x\) changes x in place"):
+        assert_gradient(square, x)
+    np.testing.assert_array_equal(x, X)
+
+
 def test_an_inconclusive_check_fails_unless_it_is_allowed():
     def loss(u):
         return np.sum(np.abs(u))
