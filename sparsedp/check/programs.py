@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sparsedp._utils.pytree import TreeStructure, keys, leaves, mapped
-from sparsedp._utils.validation import check_function
 from sparsedp.autodiff.derivative import jvp as forward_derivative
 from sparsedp.autodiff.flattening import Packing, joined
 from sparsedp.autodiff.tape import is_variable
@@ -337,12 +336,3 @@ def _conjugated(leaf: Any) -> Any:
     if np.iscomplexobj(leaf):
         return np.conj(leaf)
     return leaf
-
-
-def function_of(f: Any, name: str) -> Callable[[Any], Any]:
-    """Return the function f(x) of a program that is a function or an object with a method ``apply``."""
-    for method in ("matvec", "apply"):
-        if not callable(f) and hasattr(f, method):
-            return getattr(f, method)
-    check_function(name, f, "lambda x: ...")
-    return f
