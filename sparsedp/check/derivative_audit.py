@@ -150,6 +150,14 @@ class DerivativeAudit:
     covered : float
         Share of the entries of x that contribute to the derivative along a balanced direction.
     verdict, reason : str
+    gaps, result_gaps : tuple of str
+        The wrong entries of x and of f(x). Empty unless the verdict is "disagrees".
+    culprit : str or None
+        The kind of the mistake if it is known.
+    worst : (Group, DirectionEvidence) or None
+        The direction with the largest gap, and its functional.
+    base : ndarray
+        f(x) as a vector.
     pairs : list of (ndarray, ndarray)
         Two vectors with their derivatives, see `derivative`.
     linear_gap : float
