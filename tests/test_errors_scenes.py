@@ -155,6 +155,38 @@ TABLE = [
         "conservation_law, as flux, takes a function, got ndarray; write lambda u, params, axis: ...",
     ),
     (
+        lambda: law(positive=["density"]),
+        TYPE,
+        'positive of conservation_law must be a dict of functions, got list; write {"density": lambda u, params: u[0]}',
+    ),
+    (
+        lambda: law(positive={"depth": 0}),
+        TYPE,
+        "conservation_law, as positive['depth'], takes a function, got int; write lambda u, params: ...",
+    ),
+    (
+        lambda: law(positive={"depth": lambda u, p: 1.0})(np.ones(4)),
+        SHAPE,
+        "the depth of a conservation_law must have shape (4,), got ()",
+    ),
+    (
+        lambda: law(positive={"depth": lambda u, p: u})(np.array([1.0, 0.0, 1.0, 1.0])),
+        UNSTABLE,
+        "the depth of a conservation_law must be > 0, got 0 in cell 1; give a state where it is positive, or take "
+        "smaller steps, dt <= law.time_step(u, params)",
+    ),
+    (
+        lambda: dp.conservation_law(BOX, carry, carry, positive={"depth": lambda u, p: -u[0]})(np.ones((2, 4, 4))),
+        UNSTABLE,
+        "the depth of a conservation_law must be > 0, got -1 in cell (0, 0) and in 15 more; give a state where it is "
+        "positive, or take smaller steps, dt <= law.time_step(u, params)",
+    ),
+    (
+        lambda: law(positive={"depth": lambda u, p: u})(np.array([1.0, 1.0, np.nan, 1.0])),
+        dp.errors.NonFiniteError,
+        "the depth of a conservation_law must be finite, got 1 that are NaN or infinite, the first at 2",
+    ),
+    (
         lambda: flow(scalars={"heat": 0.1}),
         VALUE,
         "scalar 'heat' of flow_step needs a dict of diffusivity, boundary, values, source, got 0.1",

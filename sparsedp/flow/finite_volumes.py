@@ -23,6 +23,17 @@ preserved exactly: for example a lake at rest over uneven ground, or a gas at re
 at an inflow boundary repeat its last cell. Therefore e is preserved if the inflow equals this last cell, as for a
 moving steady state; any other inflow changes the field.
 
+Positivity: if quantities are given that must stay positive, such as density and pressure, the values at both ends of a
+cell are moved towards the value u_i of the cell. With Q the quantity, and theta = 1 where no end is below the floor,
+
+    u_end <- u_i + theta (u_end - u_i),   theta = (Q(u_i) - floor) / (Q(u_i) - least Q(u_end)),   floor = Q(u_i) / 100.
+
+Q is concave, therefore Q(u_end) >= floor afterwards, and the mean of both ends remains u_i. A quantity is limited after
+those before it: the pressure is concave only where the density is positive. An Euler step of the cell is then the mean
+of two steps with the flux between its ends, each with cells of half the width, and each such step is a sum of
+(s u - F(u)) and (F(u) + s u), with weights >= 0 if dt s / h <= 1/2 for the largest s of its faces. These states are
+positive for waves not faster than s. In more dimensions dt s / h is summed over the axes.
+
 All operations except the limiter are recorded by autograd, so that derivatives of every order exist where the user's
 flux, speed and source have them. The limiter is one differentiation rule with first derivatives only.
 """
@@ -47,12 +58,13 @@ from sparsedp._utils.validation import (
     check_shape,
     field_array,
     is_whole,
+    place,
 )
 from sparsedp.autodiff.derivative import entrywise
 from sparsedp.autodiff.program_trace import check_values
 from sparsedp.autodiff.tape import cast, dtype_of, isbox, plain, sample
 from sparsedp.autodiff.tape_constants import constant, frozen
-from sparsedp.errors import ShapeError
+from sparsedp.errors import ShapeError, UnstableStepError
 from sparsedp.grid.boundary_conditions import free_slip, outflow, resolve
 from sparsedp.grid.boundary_conditions import inflow as inflow_side
 from sparsedp.grid.grid import AXES, check_grid
@@ -69,6 +81,9 @@ if TYPE_CHECKING:
 __all__ = ["ConservationLaw", "conservation_law"]
 
 IF_NOT_FINITE = "; a density or a depth may have become negative: take a smaller dt"
+POSITIVE_FLOOR = (
+    0.01  # least share of a positive quantity at the ends of a cell: no slope is limited where it is smooth
+)
 GHOSTS = 2  # ghost cells beyond each end: the slope in the nearer one needs the value of the farther one
 # The mode of np.pad that fills the ghost cells, by boundary condition; None stands for a periodic axis.
 PAD_MODES: dict[Any, Any] = {None: "wrap", free_slip: "symmetric", outflow: "edge", inflow_side: "edge"}
@@ -85,6 +100,7 @@ def conservation_law(
     inflow: Any = None,
     source: Callable | None = None,
     equilibrium: Any = None,
+    positive: dict[str, Callable] | None = None,
 ) -> ConservationLaw:
     """Return the rate of change ``law(u, params)`` of a conservation law: -div F(u) + S(u).
 
@@ -117,6 +133,11 @@ def conservation_law(
     equilibrium : array or callable, optional
         A steady state, at rest or moving, that is preserved exactly; or ``equilibrium(params)`` that returns one. At an
         inflow boundary it is preserved only if the inflow equals the equilibrium in the cell next to the boundary.
+    positive : dict of callables, optional
+        Quantities that must stay positive, by name: ``{"density": lambda u, params: u[0], "pressure": pressure}``. Each
+        ``quantity(u, params)`` returns an array of the shape of u without the axis of the fields, a linear or concave
+        function of u where the quantities before it are positive. Steep slopes at which one would be negative are
+        reduced, and an error names the quantity and the cell if it is not positive in a state.
 
     Returns
     -------
@@ -132,9 +153,13 @@ def conservation_law(
     ShapeError
         If the state, or the result of a function, has the wrong shape, or the state has no field for a momentum.
     NonFiniteError
-        If a speed or the rate is NaN or infinite, often because a density or a depth has become negative.
+        If a speed, the rate or a positive quantity is NaN or infinite, often because a density or a depth has become
+        negative.
+    UnstableStepError
+        On use, if a positive quantity is not positive in a cell: a previous step was too long, or the state is wrong.
     TypeError
-        If flux, speed or source is not a function, or if the state or the result of a function is not real.
+        If flux, speed, source or a quantity is not a function, if `positive` is not a dict, or if the state or the
+        result of a function is not real.
 
     See Also
     --------
@@ -146,6 +171,10 @@ def conservation_law(
     Time steps: use "ssprk3" of `stepper` with a dt from `law.time_step`. This method is strong stability preserving:
     bounds that hold for an Euler step of size dt, such as the absence of new extrema, hold for its step too. The law
     itself does not check dt.
+    Positivity: with `positive` an Euler step, and therefore one of "ssprk3", keeps the quantities positive if
+    dt <= ``law.time_step(u, params, cfl=0.5)`` in each stage, for gas, shallow water and all laws whose exact solution
+    stays positive, on cells of any width. Waves may become faster than those of the first state: take a smaller cfl or
+    compute dt again after some steps. A source and an equilibrium are not part of this bound.
     Derivatives: limiters, shocks and the maximum of two speeds have kinks, where `check.gradient` returns
     "inconclusive".
 
@@ -154,6 +183,7 @@ def conservation_law(
     Harten, Lax, van Leer, SIAM Review 25 (1983) 35-61.
     van Leer, J. Comput. Phys. 32 (1979) 101-136.
     Berberich, Chandrashekar, Klingenberg, Computers & Fluids 219 (2021) 104858 (equilibrium).
+    Zhang, Shu, J. Comput. Phys. 229 (2010) 8918-8934; Perthame, Shu, Numer. Math. 73 (1996) 119-130 (positive).
 
     Examples
     --------
@@ -172,6 +202,16 @@ def conservation_law(
     >>> water(np.array([[2.0, 2.0, 1.0, 1.0], [0.0, 0.0, 0.0, 0.0]]), 10.0).round(2)
     array([[ 0.  , -2.24,  2.24,  0.  ],
            [ 0.  ,  7.5 ,  7.5 ,  0.  ]])
+
+    Declare the depth as positive, so that an error names the cell in which it is not:
+
+    >>> options = {"boundary": free_slip, "momentum": 1, "positive": {"depth": lambda u, g: u[0]}}
+    >>> water = conservation_law(Grid(4), flux, speed, **options)
+    >>> try:
+    ...     water(np.array([[2.0, 2.0, -1.0, 1.0], [0.0, 0.0, 0.0, 0.0]]), 10.0)
+    ... except ValueError as error:
+    ...     print(str(error).split(";")[0])
+    the depth of a conservation_law must be > 0, got -1 in cell 2
     """
     check_grid("conservation_law", grid)
     check_choice("scheme of conservation_law", scheme, SCHEMES)
@@ -179,6 +219,7 @@ def conservation_law(
     check_function("conservation_law, as speed,", speed, "lambda u, params, axis: ...", 3)
     if source is not None:
         check_function("conservation_law, as source,", source, "lambda u, params: ...", 2)
+    quantities = _checked_quantities(positive)
     sides = resolve(grid, boundary, outflow, name="conservation_law")
     conditions = [condition for pair in sides for condition in pair or ()]
     for condition in conditions:
@@ -193,7 +234,21 @@ def conservation_law(
         fields = _momentum_fields(grid, momentum)
     else:
         fields = None
-    return ConservationLaw(grid, flux, speed, scheme, sides, fields, inflow, source, equilibrium)
+    return ConservationLaw(grid, flux, speed, scheme, sides, fields, inflow, source, equilibrium, quantities)
+
+
+def _checked_quantities(positive: Any) -> dict[str, Callable]:
+    """Return a copy of the positive quantities; raise unless it is a dict of functions."""
+    if positive is None:
+        return {}
+    if not isinstance(positive, dict):
+        raise TypeError(
+            f"positive of conservation_law must be a dict of functions, got {type(positive).__name__}; "
+            'write {"density": lambda u, params: u[0]}'
+        )
+    for name, quantity in positive.items():
+        check_function(f"conservation_law, as positive[{name!r}],", quantity, "lambda u, params: ...", 2)
+    return dict(positive)
 
 
 def _momentum_fields(grid: Grid, momentum: Any) -> tuple[int, ...]:
@@ -216,7 +271,7 @@ class ConservationLaw(Reconstructible):
 
     Parameters
     ----------
-    grid, flux, speed, scheme, inflow, source, equilibrium
+    grid, flux, speed, scheme, inflow, source, equilibrium, positive
         As `conservation_law` takes them.
     sides : tuple
         The conditions as `resolve` returns them.
@@ -242,6 +297,7 @@ class ConservationLaw(Reconstructible):
         inflow: Any,
         source: Callable | None,
         equilibrium: Any,
+        positive: dict[str, Callable] | None = None,
     ) -> None:
         self.grid = grid
         self.domain = grid.cells
@@ -253,6 +309,7 @@ class ConservationLaw(Reconstructible):
         self.inflow = constant(inflow)
         self.source = source
         self.equilibrium = constant(equilibrium)
+        self.positive = positive or {}
         self.axes: list[AxisFluxes] = []
         if not grid.cells.size:
             return
@@ -280,6 +337,7 @@ class ConservationLaw(Reconstructible):
             self.inflow,
             self.source,
             self.equilibrium,
+            self.positive,
         )
 
     @public("dp.conservation_law(grid, flux, speed)")
@@ -297,13 +355,12 @@ class ConservationLaw(Reconstructible):
         array like u
         """
         u = self._checked_state(u)
-        if self.equilibrium is None:
+        for name, quantity in self.positive.items():
+            check_values(partial(_check_positive, name), self._quantity(name, quantity, u, params))
+        e = self._equilibrium_state(u, params)
+        if e is None:
             rate = self._rate(u, None, params)
         else:
-            equilibrium = self.equilibrium
-            if callable(equilibrium):
-                equilibrium = equilibrium(params)
-            e = _checked_result("equilibrium", equilibrium, u)
             rate = self._rate(u, e, params) - self._rate(e, e, params, with_inflow=False)
         check_values(_check_rate, rate)
         return cast(rate, dtype_of(u))
@@ -327,6 +384,25 @@ class ConservationLaw(Reconstructible):
         check_kind("u of conservation_law", values.dtype, "real numbers", "; write u.real")
         return frozen(u if isbox(u) else values)
 
+    def _equilibrium_state(self, u: Any, params: Any) -> Any:
+        """Return the equilibrium for these params, or None."""
+        equilibrium = self.equilibrium
+        if equilibrium is None:
+            return None
+        if callable(equilibrium):
+            equilibrium = equilibrium(params)
+        return _checked_result("equilibrium", equilibrium, u)
+
+    def _quantity(self, name: str, quantity: Callable, u: Any, params: Any) -> Any:
+        """Return a positive quantity of states; raise unless it is real and has the shape of one field."""
+        value = quantity(u, params)
+        _checked_result(name, sample(value), self._first_field(u))
+        return value
+
+    def _first_field(self, u: Any) -> Any:
+        """Return the first field of a state, or the state if it is one field."""
+        return u[(0,) * (u.ndim - self.grid.dim)]
+
     def _rate(self, u: Any, equilibrium: Any, params: Any, with_inflow: bool = True) -> Any:
         """Return the rate of a state; `equilibrium` affects the slopes only.
 
@@ -337,18 +413,39 @@ class ConservationLaw(Reconstructible):
         else:
             total = _checked_result("source", self.source(u, params), u)
         for axis in self.axes:
-            padded = axis.padded(u, params, with_inflow)
-            if equilibrium is None:
-                lower, upper = axis.beside_faces(padded)
-            else:
-                at_rest = axis.padded(equilibrium, params, False)
-                at_faces = axis.face_means(at_rest)
-                lower, upper = axis.beside_faces(padded - at_rest)
-                lower = lower + at_faces
-                upper = upper + at_faces
+            lower, upper = self._beside_faces(axis, u, equilibrium, params, with_inflow)
             f = self._numerical_flux(axis, lower, upper, params)
             total = total + (axis.part(f, 0, -1) - axis.part(f, 1)) / axis.widths
         return total
+
+    def _beside_faces(self, axis: AxisFluxes, u: Any, equilibrium: Any, params: Any, with_inflow: bool = True) -> tuple:
+        """Return the values below and above each face along an axis."""
+        padded = axis.padded(u, params, with_inflow)
+        if equilibrium is None:
+            at_lower_end, at_upper_end = axis.ends_of_cells(padded)
+        else:
+            at_rest = axis.padded(equilibrium, params, False)
+            at_faces = axis.face_means(at_rest)
+            at_lower_end, at_upper_end = axis.ends_of_cells(padded - at_rest)
+            at_lower_end = at_lower_end + axis.part(at_faces, 0, -1)
+            at_upper_end = at_upper_end + axis.part(at_faces, 1)
+        if self.positive:
+            cells = axis.part(padded, 1, -1)
+            at_lower_end, at_upper_end = self._kept_positive(cells, at_lower_end, at_upper_end, params)
+        return axis.part(at_upper_end, 0, -1), axis.part(at_lower_end, 1)
+
+    def _kept_positive(self, cells: Any, at_lower_end: Any, at_upper_end: Any, params: Any) -> tuple[Any, Any]:
+        """Return the values at both ends of the cells, moved towards the cells where a quantity is too small."""
+        for name, quantity in self.positive.items():
+            states = [frozen(state) for state in (cells, at_lower_end, at_upper_end)]
+            in_cell, at_lower, at_upper = (self._quantity(name, quantity, state, params) for state in states)
+            least = anp.minimum(at_lower, at_upper)
+            floor = POSITIVE_FLOOR * in_cell
+            too_small = least < floor
+            theta = anp.where(too_small, (in_cell - floor) / anp.where(too_small, in_cell - least, 1.0), 1.0)
+            at_lower_end = anp.where(too_small, cells + theta * (at_lower_end - cells), at_lower_end)
+            at_upper_end = anp.where(too_small, cells + theta * (at_upper_end - cells), at_upper_end)
+        return at_lower_end, at_upper_end
 
     def _numerical_flux(self, axis: AxisFluxes, lower: Any, upper: Any, params: Any) -> Any:
         """Return the flux of Harten, Lax and van Leer for the values below and above each face."""
@@ -367,7 +464,7 @@ class ConservationLaw(Reconstructible):
         speeds = self.speed(u, params, axis)
         if not isinstance(speeds, tuple):
             speeds = (-speeds, speeds)
-        first_field = u[(0,) * (u.ndim - self.grid.dim)]
+        first_field = self._first_field(u)
         for speed in speeds:
             _checked_result("speed", sample(speed), first_field)
         check_values(partial(_check_speeds, axis), *speeds)
@@ -379,7 +476,8 @@ class ConservationLaw(Reconstructible):
         Parameters
         ----------
         u : array
-            The state, as for the call. The speeds are taken in the cells and, at inflow boundaries, of the inflow.
+            The state, as for the call. The speeds are taken in the cells and, at inflow boundaries, of the inflow; with
+            `positive` also on both sides of the faces.
         params : tree, optional
         cfl : float
             Up to 0.5 for limited slopes, up to 1 for "upwind".
@@ -407,6 +505,13 @@ class ConservationLaw(Reconstructible):
                 beyond = np.max(np.abs(self._wave_speeds(axis.number, entering, params)), axis=0)
                 cells = axis.at(edge)
                 speeds[cells] = np.maximum(speeds[cells], axis.part(beyond, 0, 1))
+        if self.positive:
+            lower, upper = map(plain, self._beside_faces(axis, u, plain(self._equilibrium_state(u, params)), params))
+            both = frozen(np.concatenate([lower, upper], axis.place))
+            beside_faces = np.max(np.abs(self._wave_speeds(axis.number, both, params)), axis=0)
+            at_faces = np.maximum(*axis.halves(beside_faces))
+            at_ends = np.maximum(axis.part(at_faces, 0, -1), axis.part(at_faces, 1))
+            speeds = np.maximum(speeds, at_ends)
         return speeds
 
     def __repr__(self) -> str:
@@ -415,6 +520,24 @@ class ConservationLaw(Reconstructible):
 
 def _check_rate(rate):
     check_finite("the rate of a conservation_law", rate)
+
+
+def _check_positive(name, values):
+    """Raise an error that names the quantity and the cell where it is not positive."""
+    what = f"the {name} of a conservation_law"
+    check_finite(what, values)
+    not_positive = values <= 0
+    if np.any(not_positive):
+        first = int(np.argmax(not_positive))
+        count = np.count_nonzero(not_positive)
+        if count > 1:
+            others = f" and in {count - 1} more"
+        else:
+            others = ""
+        raise UnstableStepError(
+            f"{what} must be > 0, got {values.flat[first]:g} in cell {place(first, values.shape)}{others}; give a "
+            f"state where it is positive, or take smaller steps, dt <= law.time_step(u, params)"
+        )
 
 
 def _check_speeds(axis, slowest, fastest):
@@ -525,20 +648,19 @@ class AxisFluxes:
         return anp.reshape(numbers, (-1,) + (1,) * self.dim)
 
     def face_means(self, padded: Any) -> Any:
-        """Return the means of the two cells at each face."""
-        return 0.5 * (self.part(padded, 1, -2) + self.part(padded, 2, -1))
+        """Return the means of the two cells at each face, including the faces between two ghost cells."""
+        return 0.5 * (self.part(padded, 0, -1) + self.part(padded, 1))
 
-    def beside_faces(self, padded: Any) -> tuple[Any, Any]:
-        """Return the values below and above each face, for a state with ghost cells."""
-        lower = self.part(padded, 1, -2)
-        upper = self.part(padded, 2, -1)
+    def ends_of_cells(self, padded: Any) -> tuple[Any, Any]:
+        """Return the values at the lower and the upper end of each cell, and of one ghost cell beyond each side."""
+        cells = self.part(padded, 1, -1)
         if not self.limiters:
-            return lower, upper
+            return cells, cells
         differences = self.part(padded, 1) - self.part(padded, 0, -1)
         below = self.part(differences, 0, -1)
         above = self.part(differences, 1)
         slopes = [limiter(below, above) for limiter in self.limiters]
-        return lower + self.part(slopes[0], 0, -1), upper - self.part(slopes[-1], 1)
+        return cells - slopes[-1], cells + slopes[0]
 
     def _limiter(self, limiter: Callable, end: int) -> Any:
         """Return the differentiation rule of the limited slope at an end of each cell (0 upper, 1 lower).

@@ -187,6 +187,14 @@ for name, limiter in (("upwind", "upwind"), ("default", None)):
 
 
 @scene
+def conservation_law_positive():
+    """Slopes of the same fields are limited in one argument and not in another."""
+    amount = {"amount": lambda u, p: u - 0.5 * p}
+    law = dp.conservation_law(RING, lambda u, p, axis: p * u**2, lambda u, p, axis: anp.abs(2 * p * u), positive=amount)
+    return law, [of(RING, 0.51, 1.0), of((), 0.9, 1.0)]
+
+
+@scene
 def conservation_law_still():
     """Speeds are 0 at some faces, other ones for other arguments."""
     law = dp.conservation_law(RING, lambda u, p, axis: p * u**2, lambda u, p, axis: anp.abs(2 * p * u))
