@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
+from functools import partial
 from math import inf
 from typing import Any
 
@@ -11,7 +13,8 @@ import numpy as np
 from sparsedp._utils.pytree import norm
 from sparsedp.check.direction_evidence import CONFIRMING_WORDS, DirectionEvidence
 from sparsedp.check.directions import reclassify_kinks
-from sparsedp.check.evaluations import UNCHANGED
+from sparsedp.check.evaluations import EVALUATION_ERRORS, UNCHANGED
+from sparsedp.check.rounding_modes import ROUNDING_FACTOR, rounding_error
 
 __all__ = ["review", "rounds_in_single_precision"]
 
@@ -39,6 +42,8 @@ FAR_STEPS = 2.0**9  # steps from this multiple on are far above the best one
 STEEP_SHARE = 0.05
 STAIRS = 2  # number of steps at which a staircase does not change although it should
 CLEAR_OF_ROUNDING = 100.0
+LEAST_AMPLIFIED_SHARE = 1 / 30
+SAME_GAP_SHARE = 0.1
 
 
 def review(audit: Any) -> None:
@@ -55,6 +60,7 @@ def review(audit: Any) -> None:
                 _find_other_scales(direction)
     if audit.base.size and np.all(np.isfinite(audit.base)) and audit.pairs:
         _review_linearity(audit)
+    _review_rounding(audit)
     for group in audit.groups:
         if group.evaluations.gradient is not None:
             reclassify_kinks(group.evaluations, group.directions)
@@ -202,6 +208,63 @@ def rounds_in_single_precision(audit: Any) -> bool:
     if size <= LEAST_CHANGE * LARGER_NUDGE * norm(slopes[0]):
         return False
     return norm(ahead + behind) > SINGLE_SHARE * size
+
+
+def _review_rounding(audit: Any) -> None:
+    """Change the words of directions to "noise" if rounding errors of f or of its derivative may be the reason.
+
+    The verdict is "disagrees" as soon as one gap has another reason, so that the largest gaps are examined first.
+    """
+    if any(word in ("broken", "unsound") for word, _ in audit.findings):
+        return
+    wrong = [(group, direction) for group in audit.groups for direction in group.directions if direction.word in WRONG]
+    for group, direction in sorted(wrong, key=lambda pair: -pair[1].share):
+        reason = None
+        with suppress(*EVALUATION_ERRORS):
+            reason = _rounding_reason(audit, group, direction)
+        if reason is None:
+            return
+        direction.word = "noise"
+        direction.note = f"off by {direction.share:.1e}, and {reason}"
+
+
+def _rounding_reason(audit: Any, group: Any, direction: DirectionEvidence) -> str | None:
+    """Return how rounding errors of f explain a gap, or None if they do not.
+
+    The function runs in other rounding modes. Its difference quotient changes if rounding errors have changed its
+    Jacobian, as those of the factorization of an ill-conditioned matrix do. If the gap is visible at fine steps only,
+    and changes f there by no more than its rounding error, f may be a staircase at these steps.
+    """
+    step = _coarsest_step(direction)
+    if step is None:
+        return None
+    in_f = rounding_error(partial(audit.difference_along, group, direction, step))
+    in_derivative = rounding_error(partial(audit.slope_along, group, direction))
+    if in_f < LEAST_AMPLIFIED_SHARE * in_derivative:  # only the derivative under test has errors: it is at fault
+        in_derivative = 0.0
+    error = in_f + in_derivative
+    if direction.size <= ROUNDING_FACTOR * error:
+        return (
+            f"in another rounding mode the derivatives of f change by {error / direction.scale:.1e}: "
+            "f amplifies rounding errors, the problem is too ill-conditioned to tell"
+        )
+    error = rounding_error(partial(audit.functional, group, direction))
+    is_contradicted = step < direction.steps[0]
+    if is_contradicted and direction.size * step <= ROUNDING_FACTOR * error:
+        return f"only at steps up to {step:.0e}, at which rounding errors of f hide its derivative"
+    return None
+
+
+def _coarsest_step(direction: DirectionEvidence) -> float | None:
+    """Return the coarsest step that, like all steps down to the best one, shows its gap; None if there is none."""
+    coarsest = None
+    for step, gap in zip(direction.steps[::-1], direction.gaps[::-1]):
+        if step < direction.step:
+            continue
+        if abs(gap - direction.gap) > SAME_GAP_SHARE * direction.size:
+            break
+        coarsest = float(step)
+    return coarsest
 
 
 def _drop_absolute_steps(audit: Any) -> None:

@@ -1,0 +1,76 @@
+"""Rounding errors that other rounding modes of the processor show, and derivatives of ill-conditioned solves."""
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+import sparsedp as dp
+from sparsedp.check.rounding_modes import _available_modes, rounding_error
+
+needs_modes = pytest.mark.skipif(not _available_modes(), reason="this computer has no other rounding modes")
+B = np.cos(1.0 + np.arange(12.0))
+
+
+def graded(decades):
+    """Return a nonsymmetric matrix with singular values of 1 to 10^-decades."""
+    rng = np.random.default_rng(5)
+    left, _ = np.linalg.qr(rng.normal(size=(12, 12)))
+    right, _ = np.linalg.qr(rng.normal(size=(12, 12)))
+    return left * np.logspace(0.0, -decades, 12) @ right
+
+
+MATRICES = {
+    "Hilbert": scipy.linalg.hilbert(12),
+    "Vandermonde": np.vander(np.linspace(1.0, 2.0, 12)),
+    "graded": graded(13),
+}
+
+
+def check(A, transposed=True, factor=1.0, **options):
+    matrix = A.T if transposed else A
+    return dp.check.vjp(lambda b: np.linalg.solve(A, b), lambda b, g: factor * np.linalg.solve(matrix, g), B, **options)
+
+
+@needs_modes
+def test_the_rounding_error_of_a_number():
+    ones = np.full(1000, 0.1)
+    error = rounding_error(lambda: float(np.cumsum(ones)[-1]))
+    assert 1e-14 < error < 1e-11
+    assert rounding_error(lambda: float(np.sum(np.ones(1000)))) == 0.0
+    A = MATRICES["Hilbert"]
+    assert rounding_error(lambda: np.linalg.solve(A, A @ np.ones(12))[5]) > 1e-4
+
+
+@needs_modes
+def test_the_usual_rounding_mode_returns():
+    tenth = np.array([1.0, -1.0]) / 10.0
+    runs = iter([0.0])
+    with pytest.raises(StopIteration):  # raised by the second run, in another mode
+        rounding_error(lambda: next(runs))
+    np.testing.assert_array_equal(np.array([1.0, -1.0]) / 10.0, tenth)
+
+
+@needs_modes
+@pytest.mark.parametrize("name", MATRICES)
+def test_right_derivatives_of_ill_conditioned_solves_are_no_error(name):
+    """The error of a factorization is the same at all points, so that differences show it as a smooth gap."""
+    result = check(MATRICES[name])
+    assert result.verdict == "inconclusive" and "f amplifies rounding errors" in result.reason, result
+    A = MATRICES[name]
+    both = check(A, jvp=lambda b, t: np.linalg.solve(A, t))
+    assert both.verdict == "inconclusive" and "amplifies rounding errors" in both.reason, both
+
+
+@needs_modes
+def test_a_staircase_of_rounding_errors():
+    """With partial pivoting the entries of this matrix grow to 2^39, and the last digits of x are lost."""
+    A = np.eye(40) - np.tril(np.ones((40, 40)), -1)
+    A[:, -1] = 1.0
+    x = np.random.default_rng(11).normal(size=40)
+    result = dp.check.vjp(lambda b: np.linalg.solve(A, b), lambda b, g: np.linalg.solve(A.T, g), x, rng=0)
+    assert result.verdict == "inconclusive", result
+
+
+@pytest.mark.parametrize("wrong", [{"factor": 1.1}, {"transposed": False}])
+def test_wrong_derivatives_of_ill_conditioned_solves_disagree(wrong):
+    assert check(graded(12), **wrong).verdict == "disagrees"
