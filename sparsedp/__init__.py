@@ -31,6 +31,7 @@ _PUBLIC_NAMES = {
     "optimize.regularization": "smoothness total_variation",
     "operators.masks_and_lift": "diagonal identity interior lift mask",
     "solvers.inverse": "inverse",
+    "solvers.continuation": "continuation",
     "solvers.eigenpairs": "eigenpairs",
     "solvers.parametric": "elliptic_solver matrix_solver",
     "solvers.roots": "implicit steady",

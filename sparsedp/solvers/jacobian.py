@@ -102,6 +102,10 @@ class Linearisation:
         """Return the Newton step -J^-1 F, to the relative residual `forcing` where that can be reached."""
         return self._on_field(self.solver.approximate, -F, max(forcing, self.solver.system.rtol))
 
+    def approximate(self, b: Any, transposed: bool = False) -> Any:
+        """Return J^-1 b or J^-T b to the tolerance where that can be reached, else the best iterate."""
+        return self._on_field(self.solver.approximate, b, self.solver.system.rtol, transposed)
+
     def solve(self, b: Any, transposed: bool) -> tuple[Any, SolveInfo | None]:
         """Solve J x = b or J^T x = b to the full tolerance.
 

@@ -114,7 +114,7 @@ def implicit(
 
     See Also
     --------
-    inverse, steady, differentiable, stepper
+    inverse, steady, continuation, differentiable, stepper
 
     Notes
     -----
@@ -189,7 +189,7 @@ def steady(residual: Callable[..., Any], guess: Any, *params: Any, **options: An
 
     See Also
     --------
-    implicit
+    implicit, continuation
 
     Notes
     -----
@@ -304,11 +304,11 @@ class Root(Reconstructible):
             x = thread.solve_hooks[-1].root(self, equation, guess, leaves)
         else:
             x = self.newton_solve(equation, guess, leaves)
-        description = self._jacobians_of(equation).description or "not needed"
+        description = self.jacobians_of(equation).description or "not needed"
         note(self.name, "method", f"Newton's method, Jacobian {description}")
         return x
 
-    def _jacobians_of(self, equation: Equation) -> Jacobians:
+    def jacobians_of(self, equation: Equation) -> Jacobians:
         """Return the Jacobians object for the backend that stores the unknowns of this equation."""
         backend = equation.unknowns.backend
         jacobians = self._jacobians.get(backend)
@@ -326,14 +326,14 @@ class Root(Reconstructible):
         F = equation.value(x, leaves) - residual
         if not np.any(F):
             return x
-        return x + self._jacobians_of(equation).evaluate(equation, x, leaves).step(F, forcing)
+        return x + self.jacobians_of(equation).evaluate(equation, x, leaves).step(F, forcing)
 
     def newton_solve(self, equation: Equation, guess: Any, leaves: Sequence[Any]) -> Any:
         """Solve by Newton's method on flat unknowns, and record the solve."""
         run = Run()
         series = self._series.get(get_ident())
         is_time_step = series is not None
-        jacobians = self._jacobians_of(equation)
+        jacobians = self.jacobians_of(equation)
         newton = Newton(equation, leaves, jacobians, self.rtol, self.maxiter, run, is_time_step)
         try:
             return newton.solve(guess, (series or {}).get(equation.size))
@@ -416,7 +416,7 @@ class Root(Reconstructible):
         return solve_rule(self.name, self._solve, _negative_gradient, _product, transposed)
 
     def _solve(self, transposed, checked, b, equation, x, *leaves):
-        linearisation = self._jacobians_of(equation).cached(equation, x, leaves)
+        linearisation = self.jacobians_of(equation).cached(equation, x, leaves)
         self._note_setup(linearisation)
         s, info = linearisation.solve(b, transposed)
         if transposed and info is not None:

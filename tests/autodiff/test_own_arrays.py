@@ -257,6 +257,7 @@ def test_every_builder_is_here():
     )
     calls = "matrix_function from_blackbox minimize laplace certify certified explain stress work_precision rollout"
     calls += " eigenpairs jit grad value_and_grad vjp jvp hvp differentiable set_threads steady distribute gather"
+    calls += " continuation"
     shown = "animate plot convergence v_curve update_direction save load from_image"
     public = {name for name in dir(dp) if callable(getattr(dp, name)) and name.islower() and name[0] != "_"}
     public -= {"dirichlet", "neumann"}  # a call of them is refused with advice

@@ -343,6 +343,7 @@ NOTHING_TO_CALL = {
     "hvp",
     "sponge",
     "steady",
+    "continuation",
     "distribute",
     "gather",
     "flatten",

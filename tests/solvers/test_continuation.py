@@ -1,0 +1,236 @@
+"""Continuation: exact branches and folds, published folds, branch points, gradients of points, what is refused."""
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+from test_steady import bratu, bratu_exact
+
+import sparsedp as dp
+from sparsedp.errors import ConvergenceError, DerivativeError, JitError, NonFiniteError, UnstableStepError
+
+BRATU_FOLD = {1: 3.513830719, 2: 6.808124423}
+
+
+def cubic(x, p, scale=1.0):
+    """p = x^3 - 3 x in units of the scale: folds at x = -1 and 1, p = 2 and -2."""
+    return p / scale + 3 * x - x**3
+
+
+def test_folds_of_a_cubic_are_exact():
+    branch = dp.continuation(cubic, -3.0, -4.0, 4.0, step=2.0, largest_step=4.0)
+    assert branch.status == "reached_stop"
+    assert branch.parameter[0] == -4.0
+    assert branch.parameter[-1] == 4.0
+    x = np.array(branch.states)
+    np.testing.assert_allclose(branch.parameter, x**3 - 3 * x, rtol=0, atol=1e-8)
+    assert np.all(np.diff(x) > 0)
+    assert [fold.parameter for fold in branch.folds] == pytest.approx([2.0, -2.0], rel=1e-14)
+    assert [fold.state for fold in branch.folds] == pytest.approx([-1.0, 1.0], abs=1e-7)
+    assert [branch.states[fold.index] for fold in branch.folds] == [fold.state for fold in branch.folds]
+    assert abs(branch.folds[0].null_vector) == 1.0
+    assert repr(branch) == f"<branch of {len(branch)} steady states, parameter -4 to 4, 2 folds, reached_stop>"
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("unit", [2.0**-500, 2.0**500])
+def test_units_of_the_state_do_not_matter(unit):
+    def scaled(x, p):
+        return cubic(x / unit, p)
+
+    branch = dp.continuation(scaled, -3.0 * unit, -4.0, 4.0, step=1.0, largest_step=2.0, maxsteps=9)
+    plain = dp.continuation(cubic, -3.0, -4.0, 4.0, step=1.0, largest_step=2.0, maxsteps=9)
+    np.testing.assert_allclose(branch.parameter, plain.parameter, rtol=1e-13)
+    np.testing.assert_allclose(branch.states, np.array(plain.states) * unit, rtol=1e-13)
+
+
+@pytest.mark.whole
+def test_units_of_the_parameter_do_not_matter():
+    def scaled(x, p):
+        return cubic(x, p * 2.0**500)
+
+    branch = dp.continuation(scaled, -3.0, -(2.0**-498), 2.0**-498)
+    assert [fold.parameter * 2.0**500 for fold in branch.folds] == pytest.approx([2.0, -2.0], rel=1e-14)
+
+
+@pytest.mark.whole
+def test_a_branch_may_go_down():
+    branch = dp.continuation(cubic, 3.0, 4.0, -4.0, largest_step=2.0)
+    assert [fold.parameter for fold in branch.folds] == pytest.approx([-2.0, 2.0], rel=1e-14)
+    assert branch.parameter[-1] == -4.0
+
+
+@pytest.mark.whole
+def test_bratu_in_1d_returns_on_the_upper_branch():
+    folds = []
+    for n in (32, 64):
+        branch = dp.continuation(bratu(n), np.zeros(n), 1.0, 4.0)
+        assert branch.status == "returned_to_start"
+        assert branch.parameter[-1] == 1.0
+        folds.append(branch.folds[0].parameter)
+        assert folds[-1] == np.max(branch.parameter)
+    assert (4 * folds[1] - folds[0]) / 3 == pytest.approx(BRATU_FOLD[1], rel=1e-6)
+    (x,) = dp.Grid(64, size=1.0).centres()
+    np.testing.assert_allclose(branch.states[0], bratu_exact(x, 1.0), rtol=0, atol=1e-4)
+    theta = dp.implicit(lambda t: t - np.sqrt(2.0) * anp.cosh(t / 4))(11.0)
+    upper = -2 * np.log(np.cosh((x - 0.5) * theta / 2) / np.cosh(theta / 4))
+    np.testing.assert_allclose(branch.states[-1], upper, rtol=0, atol=0.01)
+
+
+@pytest.mark.whole
+def test_bratu_in_2d_has_the_published_fold():
+    folds = []
+    for n in (16, 32):
+        branch = dp.continuation(bratu(n, 2), np.zeros((n, n)), 1.0, 8.0)
+        folds.append(branch.folds[0].parameter)
+    assert (4 * folds[1] - folds[0]) / 3 == pytest.approx(BRATU_FOLD[2], rel=1e-5)
+
+
+def test_the_symmetric_branch_passes_a_pitchfork():
+    """L u + p u - u^3 = 0: u = 0 crosses another branch at the first eigenvalue of -L, where J is singular."""
+    n = 12
+    grid = dp.Grid(n, size=1.0)
+    L = dp.laplacian(grid, dp.dirichlet)
+    first = 4 * n**2 * np.sin(np.pi / (2 * n)) ** 2
+
+    def residual(u, p):
+        return L(u) + p * u - u**3
+
+    # the third step ends at the branch point
+    branch = dp.continuation(residual, np.zeros(n), 0.0, 2 * first, step=first / 7, largest_step=2 * first)
+    assert branch.status == "reached_stop"
+    assert not branch.folds
+    assert not np.any(branch.states)
+    mode = np.sin(np.pi * grid.centres()[0])
+    other = dp.continuation(residual, 0.6 * mode, first + 0.3, 2 * first)
+    assert other.status == "reached_stop"
+    assert other.states[0] @ mode / (mode @ mode) == pytest.approx(np.sqrt(0.3 * 4 / 3), rel=0.01)
+
+
+def test_the_jacobian_may_be_singular_at_a_point():
+    """The first step ends at the branch point x = 0, p = 1."""
+    branch = dp.continuation(lambda x, p: (p - 1) * x, 0.0, 0.0, 2.0, step=1.0, largest_step=1.0)
+    assert list(branch.parameter) == [0.0, 1.0, 2.0]
+    assert branch.states == [0.0, 0.0, 0.0]
+
+
+def test_natural_steps_have_the_length_given():
+    branch = dp.continuation(cubic, -3.0, -4.0, 1.5, method="natural", step=0.5, largest_step=0.5)
+    np.testing.assert_allclose(branch.parameter, np.arange(-4.0, 1.6, 0.5), rtol=0, atol=1e-14)
+    assert branch.status == "reached_stop"
+
+
+@pytest.mark.whole
+def test_natural_steps_do_not_pass_a_fold():
+    with pytest.raises(
+        ConvergenceError,
+        match=r"continuation stopped at parameter 2 after \d+ steps, as shorter steps fail as well: "
+        r"a fold may be near, write method='arclength'; the last failure was: .*",
+    ) as failure:
+        dp.continuation(cubic, -3.0, -4.0, 4.0, method="natural")
+    assert failure.value.best == pytest.approx(-1.0, abs=0.1)
+
+
+def test_a_point_has_derivatives():
+    """dx/dp = -1 / (3 - 3 x^2), and x depends on p / scale alone."""
+    branch = dp.continuation(cubic, -3.0, -4.0, 4.0, 1.0, largest_step=2.0)
+    middle = int(np.argmin(np.abs(branch.states)))
+    p = branch.parameter[middle]
+    slopes = dp.grad(lambda q: branch.solve(middle, q["p"], q["scale"]))({"p": p, "scale": 1.0})
+    x = branch.states[middle]
+    assert slopes["p"] == pytest.approx(1 / (3 * x**2 - 3), rel=1e-9)
+    assert slopes["scale"] == pytest.approx(-p * slopes["p"], rel=1e-9)
+
+
+@pytest.mark.whole
+def test_the_gradient_of_a_point_agrees():
+    L = dp.laplacian(dp.Grid(12, size=1.0), dp.dirichlet)
+    branch = dp.continuation(
+        lambda u, lam, k: k * L(u) + lam * anp.exp(u), np.zeros(12), 1.0, 3.0, np.ones(12), rtol=1e-13
+    )
+
+    def energy(q):
+        return anp.sum(branch.solve(-1, q["lam"], q["k"]) ** 2)
+
+    assert dp.check.gradient(energy, {"lam": 2.9, "k": np.linspace(1.0, 1.1, 12)}).verdict == "agrees"
+
+
+def test_trees_and_dtypes_are_those_of_the_guess():
+    """u = w^2 and p + 3 w - w^3 = 0; the residual is a list, and u has another unit."""
+
+    def residual(x, p, unit):
+        return [x["u"] / unit - x["w"] ** 2, cubic(x["w"], p)]
+
+    guess = {"u": np.float32([9e6]), "w": np.array([-3.0])}
+    branch = dp.continuation(residual, guess, -4.0, 4.0, 1e6)
+    assert [fold.parameter for fold in branch.folds] == pytest.approx([2.0, -2.0], rel=1e-13)
+    state = branch.folds[1].state
+    assert state["u"].dtype == np.float32
+    assert state["w"].dtype == np.float64
+    assert state["u"][0] == pytest.approx(1e6, rel=1e-6)
+    assert set(branch.folds[1].null_vector) == {"u", "w"}
+
+
+@pytest.mark.whole
+def test_a_step_into_an_undefined_place_is_repeated():
+    def residual(x, p):
+        if p > 2.5:
+            raise UnstableStepError("too far")
+        return cubic(x, p)
+
+    branch = dp.continuation(residual, -3.0, -4.0, 4.0, step=7.0, largest_step=7.0, maxsteps=30)
+    assert branch.rejected > 0
+    assert branch.folds[0].parameter == pytest.approx(2.0, rel=1e-14)
+
+
+def test_the_number_of_steps_is_limited():
+    branch = dp.continuation(cubic, -3.0, -4.0, 4.0, maxsteps=3)
+    assert branch.status == "max_steps"
+    assert len(branch) == 4
+
+
+def test_a_branch_is_not_continued_from_a_singular_point():
+    with pytest.raises(
+        ConvergenceError,
+        match="continuation cannot start at parameter 0, where the Jacobian is singular; start at another one, or fix "
+        "what is free by a constant",
+    ):
+        dp.continuation(lambda x, p: x**2 - p, 0.0, 0.0, 1.0)
+    L = dp.laplacian(dp.Grid(80), dp.neumann)
+    with pytest.raises(ConvergenceError, match="continuation cannot start at parameter 1, where the Jacobian"):
+        dp.continuation(lambda u, p: p * L(u), np.zeros(80), 1.0, 2.0)
+
+
+@pytest.mark.whole
+def test_a_branch_that_ends_is_reported():
+    """x = sqrt(p - 1) ends at p = 1 with a vertical tangent in the wrong direction: NaN behind it."""
+    with pytest.raises(
+        ConvergenceError,
+        match=r"continuation stopped at parameter .* after \d+ steps, as shorter steps fail as well: start from "
+        "another guess or smooth kinks of the residual; the last failure was: .*",
+    ):
+        dp.continuation(lambda x, p: x - anp.sqrt(p - 1), 1.0, 2.0, 0.0)
+
+
+def test_wrong_arguments_are_refused():
+    with pytest.raises(ValueError, match="continuation needs a range of the parameter, got start = stop = 1"):
+        dp.continuation(cubic, 1.0, 1.0, 1.0)
+    with pytest.raises(ValueError, match="method of continuation must be one of arclength, natural, got 'arc'"):
+        dp.continuation(cubic, 1.0, 0.0, 1.0, method="arc")
+    with pytest.raises(TypeError, match="continuation takes a function, got float"):
+        dp.continuation(1.0, 1.0, 0.0, 1.0)
+    with pytest.raises(NonFiniteError, match="stop must be finite"):
+        dp.continuation(cubic, 1.0, 0.0, np.inf)
+    with pytest.raises(NonFiniteError, match="guess"):
+        dp.continuation(cubic, np.nan, 0.0, 1.0)
+    with pytest.raises(ValueError, match="step must be > 0"):
+        dp.continuation(cubic, 1.0, 0.0, 1.0, step=-1.0)
+    with pytest.raises(
+        DerivativeError,
+        match=r"continuation returns plain numbers; differentiate branch\.solve\(index, p, \*params\), which solves "
+        "for the steady state near a point",
+    ):
+        dp.grad(lambda s: dp.continuation(cubic, -3.0, -4.0, 4.0, s).states[-1])(1.0)
+    with pytest.raises(
+        JitError, match="dp.jit cannot record continuation, whose steps depend on values; call it without dp.jit"
+    ):
+        dp.jit(lambda s: dp.continuation(cubic, -3.0, -4.0, 4.0, s).states[-1])(1.0)
