@@ -179,7 +179,9 @@ class Command(NamedTuple):
 
 
 ARGUMENTS: dict[str, Any] = {
-    "scene": {"help": "FILE.py, FILE.py:loss, FILE.py:loss:start, or MODULE:loss; default names: loss, and start or x"},
+    "scene": {
+        "help": "FILE.py:NAME, FILE.py:NAME:POINT or MODULE:NAME; default names: loss, and start or x for the point"
+    },
     "--input": {"type": Path, "metavar": "FILE", "help": "a 2-D field as .npy, .npz or .png (default: terrain)"},
     "--size": {"type": int, "default": 64, "metavar": "N", "help": "cells along the longest side (default: 64)"},
     "--out": {"type": Path, "metavar": "DIR", "help": "folder for the results (default: a new folder sparsedp-...)"},
@@ -189,7 +191,7 @@ ARGUMENTS: dict[str, Any] = {
     "--jvp": {"metavar": "NAME", "help": "jvp(x, t)"},
     "--jacobian": {"metavar": "NAME", "help": "the Jacobian matrix, or a function J(x) that returns it"},
     "--hessian": {"metavar": "NAME", "help": "the Hessian of the loss: a matrix, H(x) or H(x, v)"},
-    "--quick": {"action": "store_true", "help": "check two directions only, for a loss that takes minutes"},
+    "--quick": {"action": "store_true", "help": "examine fewer directions: 40 to 60 runs if the derivative is right"},
 }
 COMMANDS = {
     "demo": Command(

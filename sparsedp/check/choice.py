@@ -22,9 +22,13 @@ from sparsedp.operators.operator import Operator
 __all__ = ["DERIVATIVES", "check_derivative"]
 
 DERIVATIVES = ("gradient", "vjp", "jvp", "jacobian", "hessian")
-CHECKS = (check_gradient, check_vjp, check_jvp, check_jacobian, check_hessian)
+CHECKS: dict[str, Callable[..., Any]] = dict(
+    gradient=check_gradient, vjp=check_vjp, jvp=check_jvp, jacobian=check_jacobian, hessian=check_hessian
+)
 PAIRS = ({"vjp", "jvp"}, {"gradient", "hessian"})  # derivatives that one check compares with each other
-ARGUMENTS = sorted({name for check in CHECKS for name in inspect.signature(check).parameters} | set(DERIVATIVES))
+ARGUMENTS = {kind: [*inspect.signature(check).parameters] for kind, check in CHECKS.items()}
+ALL_ARGUMENTS = sorted({*DERIVATIVES, *(name for names in ARGUMENTS.values() for name in names)})
+POSITIONAL = ("f", "loss", "x", "J", "H", "quick")  # arguments of checks that are not among the options
 DIRECTIONS = 3  # random directions of a complete check of a derivative of a vector function
 
 
@@ -64,30 +68,47 @@ def check_derivative(
     TypeError
         If derivatives are given that no check compares.
     """
+    __tracebackhide__ = True  # pytest shows the line of the test
     derivatives = {"gradient": gradient, "vjp": vjp, "jvp": jvp, "jacobian": jacobian, "hessian": hessian}
     given = {name for name, derivative in derivatives.items() if derivative is not None}
     if len(given) > 1 and given not in PAIRS:
         names = " and ".join(name for name in DERIVATIVES if name in given)
         raise TypeError(f"one derivative is checked at a time, got {names}; write one call for each")
-    for name in options:
-        if name not in ARGUMENTS:
-            raise TypeError(f"no check of a derivative has the argument {name!r}{advice_near(name, ARGUMENTS)}")
-    if given == {"gradient"} or (not given and _is_loss(f, x)):
+    kind = _kind(f, x, given, options)
+    if kind == "gradient":
         return check_gradient(f, x, gradient, quick=quick, **options)
     if not quick:
         options = {"directions": DIRECTIONS, **options}
-    if "hessian" in given:
+    if kind == "hessian":
         return check_hessian(f, hessian, x, gradient=gradient, **options)
-    if "jacobian" in given:
+    if kind == "jacobian":
         return check_jacobian(f, jacobian, x, **options)
-    if given == {"jvp"}:
+    if kind == "jvp":
         return check_jvp(f, jvp, x, **options)
     return check_vjp(f, vjp, x, jvp=jvp, **options)
 
 
+def _kind(f: Any, x: Any, given: set[str], options: dict[str, Any]) -> str:
+    """Return the check for the derivatives that are given. Raise an error for an option that it does not have."""
+    __tracebackhide__ = True
+    for name in options:
+        if name not in ALL_ARGUMENTS:
+            raise TypeError(f"no check of a derivative has the argument {name!r}{advice_near(name, ALL_ARGUMENTS)}")
+    kind = next((kind for kind in ("hessian", "jacobian") if kind in given), "vjp")
+    if given == {"jvp"}:
+        kind = "jvp"
+    elif given == {"gradient"} or (not given and _is_loss(f, x)):
+        kind = "gradient"
+    for name in options:
+        if name not in ARGUMENTS[kind] or name in POSITIONAL:
+            known = [word for word in ARGUMENTS[kind] if word not in (*DERIVATIVES, *POSITIONAL)]
+            raise TypeError(f"check.{kind} has no argument {name!r}; it takes {', '.join(known)}")
+    return kind
+
+
 def _is_loss(f: Any, x: Any) -> bool:
     """Return whether f is a function with a real scalar result that is not written with torch or JAX."""
-    if x is None or isinstance(f, Operator) or not callable(f) or hasattr(f, "matvec"):
+    if x is None or isinstance(f, (Operator, type)) or not callable(f) or hasattr(f, "matvec"):
         return False
     if library_of(f, x).name != "numpy":
         return False

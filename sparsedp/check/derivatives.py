@@ -5,8 +5,7 @@ from __future__ import annotations
 import inspect
 import time
 from collections.abc import Callable, Sequence
-from math import inf
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,11 +15,12 @@ from sparsedp.autodiff.backend import require_arrays
 from sparsedp.check.chain import Chain
 from sparsedp.check.derivative_audit import DerivativeAudit, Options
 from sparsedp.check.direction_evidence import CONFIRMING_WORDS
-from sparsedp.check.gradient_check import FEWEST_STEPS, Audit
+from sparsedp.check.gradient_check import Audit
 from sparsedp.check.hessian_audit import GradientHessianAudit, LossHessianAudit
-from sparsedp.check.matrices import Products, flattened, unflattened
+from sparsedp.check.matrices import Products, adjoint_product, flattened, unflattened
 from sparsedp.check.point import audit_generator
 from sparsedp.check.programs import CONVENTIONS, Program, library_of
+from sparsedp.check.step_sizes import checked_steps
 from sparsedp.check.table import Table
 from sparsedp.grid.grid import Grid
 from sparsedp.grid.space import Space
@@ -90,9 +90,32 @@ def vjp(
     DerivativeCheck
         `.verdict` is "agrees", "disagrees" or "inconclusive"; bool() is True only for "agrees".
 
+    Raises
+    ------
+    TypeError
+        If `f`, `vjp` or `jvp` is not a function of this kind, if there is no point `x`, or if ``f(x)`` is not a tree of
+        arrays.
+    ValueError
+        If `convention`, `directions`, `noise` or `steps` is not valid, or there is no stage.
+    DerivativeError
+        If no `vjp` is given and `f` has no derivative of its own.
+    Exception
+        Every exception that `f` raises at `x`. Near `x`, ValueError, ArithmeticError and RuntimeError (also those of
+        this library) only make a step unusable.
+
     See Also
     --------
     check.jvp, check.jacobian, check.gradient, testing.assert_gradient
+
+    Notes
+    -----
+    For weights w of the result and a direction d in x, the number <w, J d> = <J^T w, d> is the derivative of
+    <w, f(x)> along d. The right-hand side, with J^T w = ``vjp(x, w)``, is compared with finite differences of
+    <w, f(x + t d)>. For complex numbers <a, b> is the sum of the products of real parts and of imaginary parts.
+
+    A cotangent of `x` has the structure and the shapes of `x`. A tuple or list with one entry is accepted if `x` is one
+    array, and so are complex numbers for a real `x` if their imaginary parts are rounding errors, as an FFT leaves
+    them.
 
     Examples
     --------
@@ -103,11 +126,7 @@ def vjp(
     'disagrees'
     """
     options = _options("check.vjp", directions, steps, rng, grid, noise, beside)
-    if stages is not None:
-        chain = Chain(stages, "vjp")
-        f, vjp = chain.completed(f, vjp)
-        return _with_stage(_checked("vjp", f, vjp, jvp, x, options, convention), chain, x, options, convention)
-    return _checked("vjp", f, vjp, jvp, x, options, convention)
+    return _checked_with_stages("vjp", f, {"vjp": vjp, "jvp": jvp}, x, options, convention, stages)
 
 
 def jvp(
@@ -148,9 +167,19 @@ def jvp(
     DerivativeCheck
         `.verdict` is "agrees", "disagrees" or "inconclusive"; bool() is True only for "agrees".
 
+    Raises
+    ------
+    TypeError, ValueError, DerivativeError, Exception
+        As for `check.vjp`.
+
     See Also
     --------
     check.vjp
+
+    Notes
+    -----
+    For weights w of the result and a direction d in x, the left-hand side of <w, J d> = <J^T w, d>, with
+    J d = ``jvp(x, d)``, is compared with finite differences of <w, f(x + t d)>.
 
     Examples
     --------
@@ -159,11 +188,7 @@ def jvp(
     'agrees'
     """
     options = _options("check.jvp", directions, steps, rng, grid, noise, beside)
-    if stages is not None:
-        chain = Chain(stages, "jvp")
-        f, jvp = chain.completed(f, jvp)
-        return _with_stage(_checked("jvp", f, vjp, jvp, x, options, convention), chain, x, options, convention)
-    return _checked("jvp", f, vjp, jvp, x, options, convention)
+    return _checked_with_stages("jvp", f, {"vjp": vjp, "jvp": jvp}, x, options, convention, stages)
 
 
 def jacobian(
@@ -196,11 +221,26 @@ def jacobian(
     Returns
     -------
     DerivativeCheck
-        `.verdict` is "agrees", "disagrees" or "inconclusive"; bool() is True only for "agrees".
+        `.verdict` is "agrees", "disagrees" or "inconclusive"; bool() is True only for "agrees". A matrix of another
+        shape disagrees.
+
+    Raises
+    ------
+    TypeError
+        If `J` is neither a matrix nor a function, or as for `check.vjp`.
+    DerivativeError
+        If `J` is a LinearOperator without `rmatvec`.
+    ValueError, Exception
+        As for `check.vjp`.
 
     See Also
     --------
     check.vjp, check.hessian
+
+    Notes
+    -----
+    The products J^T w and J d are compared with finite differences as by `check.vjp`, and with each other by
+    <w, J d> = <J^T w, d>.
 
     Examples
     --------
@@ -210,7 +250,7 @@ def jacobian(
     """
     products = Products(J, "the Jacobian")
     options = _options("check.jacobian", directions, steps, rng, grid, noise, beside and products.is_function)
-    f, x, _, _ = _function_and_point("check.jacobian", f, x, options.rng, None)
+    subject = _subject("check.jacobian", f, x, options.rng)
 
     def pull(tree: Any, g: Any) -> Any:
         vector = flattened(program.result.variables(g))
@@ -224,7 +264,7 @@ def jacobian(
         slopes = products.product(program.library.tensors(tree), vector, rows)
         return program.result.build(unflattened(slopes, program.result.values))
 
-    program = Program(f, x, pull, push, "transpose")
+    program = Program(subject.function, subject.x, pull, push, "transpose")
     program.takes_arrays = True
     return _audited(DerivativeAudit(program, options, "vjp", True, "the Jacobian"), "jacobian")
 
@@ -268,7 +308,9 @@ def hessian(
     Raises
     ------
     TypeError
-        If `f` or `gradient` is not a function, or `x` is complex.
+        If `f` or `gradient` is not a function, `H` is neither a matrix nor a function, or `x` is missing or complex.
+    ValueError
+        If `f` has several values and there is no `gradient`, or if an option is not valid.
 
     See Also
     --------
@@ -290,7 +332,7 @@ def hessian(
     product = H
     is_function = True
     if not has_products:
-        matrix = Products(H, "the Hessian")
+        matrix = Products(H, "the Hessian", rows="x")
         is_function = matrix.is_function
 
         def product(tree: Any, v: Any) -> Any:
@@ -300,6 +342,7 @@ def hessian(
 
     options = _options("check.hessian", directions, steps, rng, grid, noise, beside and is_function)
     require_arrays("check.hessian", leaves(x))
+    _require_point("check.hessian", x)
     program = Program(f if gradient is None else gradient, x, None, product, None)
     program.takes_arrays = not has_products
     program.jvp_name = "H(x, v)"
@@ -340,7 +383,7 @@ def _options(
     check_number(f"noise of {name}", noise, ">= 0")
     return Options(
         directions=check_whole(f"directions of {name}", directions, 1, "; the default is 1"),
-        steps=_checked_steps(steps),
+        steps=checked_steps(steps),
         rng=audit_generator(rng),
         spaces=_spaces(grid),
         noise=float(noise),
@@ -348,20 +391,42 @@ def _options(
     )
 
 
-def _checked(
-    kind: str, f: Any, vjp: Any, jvp: Any, x: Any, options: Options, convention: str | None
+def _checked_with_stages(
+    kind: str,
+    f: Any,
+    derivatives: dict[str, Any],
+    x: Any,
+    options: Options,
+    convention: str | None,
+    stages: Sequence[Any] | None,
 ) -> DerivativeCheck:
-    """Check the VJP or JVP of a program."""
+    """Check the VJP or JVP of a program, and of its stages if the whole is wrong."""
+    if stages is None:
+        return _checked(kind, f, derivatives, x, options, convention)
+    chain = Chain(stages, kind)
+    f, derivative = chain.completed(f, derivatives[kind])
+    result = _checked(kind, f, {**derivatives, kind: derivative}, x, options, convention)
+    if result.verdict != "disagrees":
+        return result
+    return _with_stage(result, chain, x, options, convention)
+
+
+def _checked(
+    kind: str, f: Any, derivatives: dict[str, Any], x: Any, options: Options, convention: str | None
+) -> DerivativeCheck:
+    """Check the VJP or JVP of a program. The given derivatives, by name, take the place of its own ones."""
     name = f"check.{kind}"
     if convention is not None:
         check_choice("convention", convention, CONVENTIONS)
-    both = vjp is not None and jvp is not None
-    for word, function in (("vjp", vjp), ("jvp", jvp)):
-        if function is not None:
-            check_function(f"{word} of {name}", function, EXAMPLES[word], 2)
-    f, x, methods, convention = _function_and_point(name, f, x, options.rng, convention)
-    program = Program(f, x, vjp or methods.get("vjp"), jvp or methods.get("jvp"), convention)
-    return _audited(DerivativeAudit(program, options, kind, both), kind)
+    given = {word: function for word, function in derivatives.items() if function is not None}
+    for word, function in given.items():
+        check_function(f"{word} of {name}", function, EXAMPLES[word], 2)
+    subject = _subject(name, f, x, options.rng)
+    chosen = {**subject.methods, **given}
+    program = Program(
+        subject.function, subject.x, chosen.get("vjp"), chosen.get("jvp"), convention or subject.convention
+    )
+    return _audited(DerivativeAudit(program, options, kind, len(given) == len(DERIVATIVES)), kind)
 
 
 def _audited(audit: DerivativeAudit, title: str) -> DerivativeCheck:
@@ -374,14 +439,10 @@ def _audited(audit: DerivativeAudit, title: str) -> DerivativeCheck:
 def _with_stage(
     result: DerivativeCheck, chain: Chain, x: Any, options: Options, convention: str | None
 ) -> DerivativeCheck:
-    """Return the result of a check, with the first stage that is wrong if the whole is wrong."""
-    if result.verdict != "disagrees":
-        return result
+    """Return the result of a check of a program that is wrong, with the first stage that is wrong."""
     undecided = []
     for stage, point in chain.inputs(x):
-        function, derivative = stage.function, stage.derivative
-        derivatives = {"vjp": None, "jvp": None, chain.kind: derivative}
-        found = _checked(chain.kind, function, derivatives["vjp"], derivatives["jvp"], point, options, convention)
+        found = _checked(chain.kind, stage.function, {chain.kind: stage.derivative}, point, options, convention)
         if found.verdict == "disagrees":
             gaps = tuple(f"{stage.name}: {gap}" for gap in found.gaps)
             result_gaps = tuple(f"{stage.name}: {gap}" for gap in found.result_gaps)
@@ -415,16 +476,6 @@ def _gap_notes(gaps: Sequence[str], result_gaps: Sequence[str]) -> list[str]:
     return notes
 
 
-def _checked_steps(steps: Sequence[float] | None) -> tuple[float, ...]:
-    """Return the steps of a sweep; raise an error if there are too few."""
-    if steps is None:
-        return ()
-    chosen = tuple(map(float, steps))
-    if len(set(chosen)) < FEWEST_STEPS or not all(0 < step < inf for step in chosen):
-        raise ValueError(f"a sweep needs at least {FEWEST_STEPS} different positive steps, got {chosen}")
-    return chosen
-
-
 def _spaces(grid: Any) -> list[Any]:
     """Return the spaces of a grid, a space, or a sequence of them."""
     if grid is None:
@@ -440,28 +491,43 @@ def _spaces(grid: Any) -> list[Any]:
     )
 
 
-def _function_and_point(
-    name: str, f: Any, x: Any, rng: np.random.Generator, convention: str | None
-) -> tuple[Callable[[Any], Any], Any, dict[str, Any], str | None]:
-    """Return the function of a program, its point, its own derivatives by name, and the convention of its VJP."""
+class Subject(NamedTuple):
+    """What is checked: a function, its point, its own derivatives by name, and the convention of its VJP."""
+
+    function: Any
+    x: Any
     methods: dict[str, Any] = {}
+    convention: str | None = None
+
+
+def _subject(name: str, f: Any, x: Any, rng: np.random.Generator) -> Subject:
+    """Return the function and the point of a program, which may be an operator, a module or an object with methods."""
     require_arrays(name, leaves(x))
+    if isinstance(f, type):
+        raise TypeError(
+            f"{name} takes a function or an object, got the class {f.__name__}; write {f.__name__}(...), "
+            "or one of its functions"
+        )
     if isinstance(f, Operator):
         f.backend.check(name)
-        if x is None:
-            x = rng.standard_normal(f.domain.shape)
-    elif hasattr(f, "matvec") and hasattr(f, "shape"):
-        f, x, methods = _linear_operator(f, x, rng)
-        convention = convention or "adjoint"
-    elif library_of(f).name == "torch" and hasattr(f, "named_parameters"):
-        f, x = library_of(f).with_parameters(f, x)
-    elif _is_simulator(f):
+        return Subject(f, rng.standard_normal(f.domain.shape) if x is None else x)
+    if hasattr(f, "matvec") and hasattr(f, "shape"):
+        return _linear_operator(f, x, rng)
+    methods = {}
+    if _is_simulator(f):
         methods = {word: _method(f, word) for word in DERIVATIVES if hasattr(f, word)}
         f = getattr(f, "apply", f)
     check_function(name, f, f"dp.{name}(f, x=x) with a function or an object with apply and vjp")
+    _require_point(name, x)
+    if library_of(f).name == "torch" and hasattr(f, "named_parameters"):
+        f, x = library_of(f).with_parameters(f, x)
+    return Subject(f, x, methods)
+
+
+def _require_point(name: str, x: Any) -> None:
+    """Raise an error if no point is given."""
     if x is None:
         raise TypeError(f"{name} needs the point x at which the derivative is checked; write x=...")
-    return f, x, methods, convention
 
 
 def _method(simulator: Any, name: str) -> Callable[[Any, Any], Any]:
@@ -487,14 +553,15 @@ def _is_simulator(f: Any) -> bool:
     return any(hasattr(f, word) for word in (*DERIVATIVES, "apply")) and not isinstance(f, type)
 
 
-def _linear_operator(op: Any, x: Any, rng: np.random.Generator) -> tuple[Any, Any, dict[str, Any]]:
-    """Return function, point and derivatives of a SciPy LinearOperator."""
+def _linear_operator(op: Any, x: Any, rng: np.random.Generator) -> Subject:
+    """Return a SciPy LinearOperator as a function with derivatives."""
 
     def apply(u: Any) -> Any:
         return op.matvec(u)
 
     def pull(u: Any, g: Any) -> Any:
-        return op.rmatvec(g)
+        slopes = adjoint_product(op, g)
+        return slopes if np.iscomplexobj(u) else np.real(slopes)
 
     def push(u: Any, t: Any) -> Any:
         return op.matvec(t)
@@ -503,7 +570,7 @@ def _linear_operator(op: Any, x: Any, rng: np.random.Generator) -> tuple[Any, An
         x = rng.standard_normal(op.shape[1])
         if np.dtype(op.dtype or float).kind == "c":
             x = x + 1j * rng.standard_normal(op.shape[1])
-    return apply, x, {"vjp": pull, "jvp": push}
+    return Subject(apply, x, {"vjp": pull, "jvp": push}, "adjoint")
 
 
 # ------------------------------------------------------------ the result
@@ -516,15 +583,18 @@ def _result(audit: DerivativeAudit, title: str, seconds: float) -> DerivativeChe
     if audit.verdict == "agrees":
         digits = min(int(line.digits) for line in lines if line.word in CONFIRMING_WORDS)
     notes = [note for word, note in audit.findings if word == "note"]
-    if audit.culprit:
-        notes.append(f"culprit: {audit.culprit}")
+    culprit = audit.culprit
+    if audit.verdict == "disagrees" and culprit is None and audit.program.less_precise:
+        culprit = audit.program.less_precise
+    if culprit:
+        notes.append(f"culprit: {culprit}")
     notes += _gap_notes(audit.gaps, audit.result_gaps)
     return DerivativeCheck(
         kind=title,
         verdict=audit.verdict,
         reason=audit.reason,
         digits=digits,
-        culprit=audit.culprit,
+        culprit=culprit,
         hessian=None,
         gaps=audit.gaps,
         result_gaps=audit.result_gaps,
@@ -560,6 +630,9 @@ class DerivativeCheck(Audit):
         The same for the entries of ``f(x)``.
     culprit : str or None
         The stage whose derivative is wrong, or the kind of the mistake if it is known, such as a missing conjugate.
+    hessian : None
+        An audit of `check.gradient` has a verdict on products with the Hessian here; the checks of this class have
+        none.
     identities : tuple of Row
         The tested identities: linearity, equal results of equal calls, <g, J t> = <J^T g, t>.
     runs : dict
@@ -575,6 +648,8 @@ class DerivativeCheck(Audit):
         Further observations.
     lines : tuple of DirectionResult
         One for each direction and each functional <w, f(x)>.
+    rows : tuple of dict
+        One for each of these lines and each step, with the values of the first table.
     """
 
     _plain: tuple[str, ...] = (

@@ -23,7 +23,8 @@ from sparsedp.errors import SparsedpError
 
 __all__ = ["EVALUATION_ERRORS", "FLOAT_TINY", "UNCHANGED", "Evaluations", "Level", "Line", "solvers_of"]
 
-EVALUATION_ERRORS = (SparsedpError, ValueError, ArithmeticError)  # exceptions that a loss may raise at a trial point
+# Exceptions that a loss may raise at a trial point, where it has no value. The solvers of SciPy raise RuntimeError.
+EVALUATION_ERRORS = (SparsedpError, ValueError, ArithmeticError, RuntimeError)
 UNCHANGED = "the loss does not change"
 FLOAT_TINY = float(np.finfo(float).tiny)
 LOST_SHARE = 0.1  # a step is unusable if the rounding of x changes the displacement by more than this share

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
-from math import inf, isinf, isnan
+from math import isinf, isnan
 from typing import Any
 
 import numpy as np
@@ -22,13 +22,13 @@ from sparsedp.check.loss_noise import POINTS
 from sparsedp.check.other_derivatives import check_complex_step, check_hessian_product, compare_modes
 from sparsedp.check.overall_verdict import overall_verdict
 from sparsedp.check.point import QUICK_DIRECTIONS, Point, audit_generator, is_random
+from sparsedp.check.step_sizes import checked_steps
 from sparsedp.check.summary import Result
 from sparsedp.check.table import Table, table_of
 from sparsedp.check.thresholds import THRESHOLDS
 
 __all__ = ["Audit", "gradient"]
 
-FEWEST_STEPS = 8
 NOT_EXAMINED = "other directions, single leaves and entries, complex steps and the Hessian product were not looked at"
 
 
@@ -133,7 +133,8 @@ def gradient(
     direction is above the same limit. The entry with the largest gradient has a direction of its own.
 
     All conditions are relative, so that a loss multiplied by 1e-200 or 1e200 has the same verdict. If the loss raises
-    an exception at a trial point (unstable step, no convergence, NaN or infinity, ValueError), this step is not used.
+    an exception at a trial point (unstable step, no convergence, NaN or infinity; ValueError, ArithmeticError,
+    RuntimeError), this step is not used. Every other exception is raised.
     At a kink the central difference does not converge to the gradient, and the verdict is "inconclusive".
 
     For complex leaves see docs/guides/complex_numbers.md.
@@ -149,12 +150,7 @@ def gradient(
     """
     check_function("check.gradient", loss, "lambda x: np.sum(x**2)")
     count = check_whole("directions of check.gradient", directions, 0, "; the default is 3")
-    chosen_steps: tuple[float, ...] = ()
-    if steps is not None:
-        chosen_steps = tuple(map(float, steps))
-        is_positive = all(0 < step < inf for step in chosen_steps)
-        if len(set(chosen_steps)) < FEWEST_STEPS or not is_positive:
-            raise ValueError(f"a sweep needs at least {FEWEST_STEPS} different positive steps, got {chosen_steps}")
+    chosen_steps = checked_steps(steps)
     point = Point(x)
     is_wanted = None
     if quick:

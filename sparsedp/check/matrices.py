@@ -9,9 +9,10 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from sparsedp.check.programs import WrongResult
+from sparsedp.errors import DerivativeError
 from sparsedp.operators.operator import Operator
 
-__all__ = ["Products", "flattened", "unflattened"]
+__all__ = ["Products", "adjoint_product", "flattened", "unflattened"]
 
 
 class Products:
@@ -23,6 +24,8 @@ class Products:
         A callable ``matrix(x)`` returns one of the others.
     name : str
         Name in messages.
+    rows : str
+        What the rows belong to, for messages.
 
     Attributes
     ----------
@@ -30,8 +33,9 @@ class Products:
         Whether the matrix depends on x.
     """
 
-    def __init__(self, matrix: Any, name: str) -> None:
+    def __init__(self, matrix: Any, name: str, rows: str = "f(x)") -> None:
         self.name = name
+        self.rows = rows
         self.is_function = callable(matrix) and not _is_matrix(matrix)
         self._matrix = matrix
         if not self.is_function:
@@ -45,7 +49,7 @@ class Products:
         if array.dtype.kind not in "biufc":
             raise TypeError(
                 f"{self.name} takes an array, a sparse matrix, an operator, or a function of x that returns one, "
-                f"got {type(matrix).__name__}"
+                f"got {type(matrix).__name__}; write an array with one column for each entry of x"
             )
         return array
 
@@ -68,7 +72,7 @@ class Products:
         if isinstance(matrix, Operator):
             return np.ravel(matrix.T.apply(vector.reshape(matrix.codomain.shape)))
         if hasattr(matrix, "rmatvec"):
-            return np.conj(np.ravel(matrix.rmatvec(np.conj(vector))))
+            return np.conj(np.ravel(adjoint_product(matrix, np.conj(vector))))
         return np.ravel(matrix.T @ vector)
 
     def _fitted(self, x: Any, rows: int, columns: int) -> Any:
@@ -78,13 +82,33 @@ class Products:
         if isinstance(matrix, np.ndarray) and matrix.size == rows * columns and matrix.ndim != 2:
             return matrix.reshape(rows, columns)
         if shape != (rows, columns):
-            raise WrongResult(f"{self.name} has shape {shape}, expected {(rows, columns)}")
+            raise WrongResult(
+                f"{self.name} has shape {shape}, expected {(rows, columns)}; "
+                f"write one row for each entry of {self.rows}, and one column for each entry of x"
+            )
         return matrix
 
 
 def _is_matrix(thing: Any) -> bool:
     """Return whether a value is a matrix or operator that has products."""
     return isinstance(thing, (np.ndarray, Operator)) or sp.issparse(thing) or hasattr(thing, "matvec")
+
+
+def adjoint_product(op: Any, g: Any) -> Any:
+    """Return the product of the conjugate transpose of a LinearOperator with a vector.
+
+    Raises
+    ------
+    DerivativeError
+        If it has no `rmatvec`.
+    """
+    try:
+        return op.rmatvec(g)
+    except NotImplementedError as error:  # SciPy raises it for an operator without rmatvec
+        raise DerivativeError(
+            "the LinearOperator has no rmatvec, the product with its conjugate transpose; "
+            "write LinearOperator(shape, matvec=..., rmatvec=...)"
+        ) from error
 
 
 def flattened(arrays: list[NDArray[Any]]) -> NDArray[Any]:

@@ -14,17 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sparsedp._utils.pytree import TreeStructure, keys, leaves, mapped
+from sparsedp._utils.validation import advise
 from sparsedp.autodiff.derivative import jvp as forward_derivative
 from sparsedp.autodiff.flattening import Packing, joined
 from sparsedp.autodiff.tape import is_variable
 from sparsedp.check.point import Point
 from sparsedp.check.summary import error_text
-from sparsedp.errors import DerivativeError, ShapeError
+from sparsedp.errors import DerivativeError, ShapeError, SparsedpError
 from sparsedp.interop.recording import recorded
 
 __all__ = ["CONVENTIONS", "Library", "Program", "WrongResult", "library_of"]
 
 CONVENTIONS = ("transpose", "adjoint")
+LONGEST_REASON = 200  # characters of the message of another library
+IMAGINARY_SHARE = 1e-6  # larger imaginary parts of real numbers, relative to the largest number, are an error
+IMAGINARY_EPS = 100.0  # the same in units of machine epsilon; matters in single precision
 
 
 class WrongResult(Exception):
@@ -77,13 +81,22 @@ def _tape_vjp(f: Callable[[Any], Any], x: Any, g: Any) -> Any:
     def of_arrays(arrays: Any) -> Any:
         return f(structure.build(arrays))
 
-    _, _, gradients = recorded(of_arrays, arrays, [True] * len(arrays))
+    values, _, gradients = recorded(of_arrays, arrays, [True] * len(arrays))
+    _refuse_hidden_traces(values)
     return structure.build(gradients([g_leaf if is_variable(g_leaf) else None for g_leaf in leaves(g)]))
 
 
 def _tape_jvp(f: Callable[[Any], Any], x: Any, t: Any) -> Any:
     """Return the JVP by the tape of this library."""
-    return forward_derivative(f, x, t)[1]
+    value, tangent = forward_derivative(f, x, t)
+    _refuse_hidden_traces(leaves(value))
+    return tangent
+
+
+def _refuse_hidden_traces(values: Any) -> None:
+    """Raise an error if NumPy has stored traced numbers in an array, because their derivatives are lost."""
+    if any(np.asarray(value).dtype == object for value in values):
+        raise TypeError("NumPy has stored traced numbers in an array")
 
 
 NUMPY = Library("numpy", _unchanged, _unchanged, _tape_vjp, _tape_jvp, "transpose")
@@ -148,6 +161,10 @@ class Program:
         The structure of the JVP if it is not that of f(x).
     takes_arrays : bool
         Whether the derivatives under test take and return NumPy arrays for every library of `f`.
+    less_precise : str
+        A sentence about a cotangent whose dtype has less precision than x; empty if there is none.
+    x_is_list : bool
+        Whether x is a list or tuple of numbers, which a function of arrays may take for an array.
     """
 
     result: Packing
@@ -170,6 +187,8 @@ class Program:
         self.jvp_name = "jvp(x, t)"
         self.jvp_result: Packing | None = None
         self.takes_arrays = False
+        self.less_precise = ""
+        self.x_is_list = isinstance(x, (tuple, list)) and all(isinstance(leaf, (int, float)) for leaf in leaves(x))
         self.runs = {"f": 0, "vjp": 0, "jvp": 0}
         self.changed: dict[str, str] = {}
 
@@ -177,18 +196,35 @@ class Program:
 
     def start(self) -> NDArray[Any]:
         """Run f at the point for the first time, and return its value as a vector."""
-        value = self._run(self.point.fresh())
+        value = self._first_value()
         if self.library is NUMPY:
             library = library_of(*leaves(value))
             if library is not NUMPY:  # a function of NumPy arrays that computes with another library
                 self._change_library(library)
-                value = self._run(self.point.fresh())
+                value = self._first_value()
         arrays = self.library.arrays(value)
         for leaf in leaves(arrays):
             if np.asarray(leaf).dtype == object:
-                raise TypeError(f"f(x) must be an array or a tree of arrays, got {type(leaf).__name__}; return arrays")
+                kind = "an array of objects" if isinstance(leaf, np.ndarray) else type(leaf).__name__
+                raise TypeError(f"f(x) must be an array or a tree of arrays, got {kind}; return arrays of numbers")
         self.result = Packing(mapped(np.array, arrays), "f(x)")
         return joined(self.result.values)
+
+    def _first_value(self) -> Any:
+        """Run f at the point. If it does not take lists, or the dtype of x, the error says what to write."""
+        try:
+            return self._run(self.point.fresh())
+        except TypeError as error:
+            advise(error)
+            raise
+        except RuntimeError as error:
+            if self.library.name != "torch" or "dtype" not in str(error):
+                raise
+            dtypes = sorted({str(values.dtype) for values in self.point.values})
+            raise TypeError(
+                f"f does not take x of dtype {' and '.join(dtypes)}: {error}; "
+                "convert x by x.float(), or f by f.double()"
+            ) from error
 
     def _change_library(self, library: Library) -> None:
         """Let the arguments be arrays of another library, in the dtypes that it gives them."""
@@ -222,7 +258,7 @@ class Program:
             if np.iscomplexobj(y):
                 part = part.astype(np.result_type(y, complex))
             else:
-                part = np.real(part)
+                part = _real_part(leaf, part)
             parts.append(part)
         return parts
 
@@ -280,9 +316,21 @@ class Program:
         if (self.convention == "adjoint") != conjugate_result:
             slopes = mapped(_conjugated, slopes)
         try:
+            self._check_leaves(slopes)
             return self.point.gradient(slopes)
-        except DerivativeError as error:
+        except (DerivativeError, ShapeError) as error:
             raise WrongResult(str(error).replace("gradient", "vjp(x, g)", 1)) from error
+
+    def _check_leaves(self, slopes: Any) -> None:
+        """Raise an error for a complex cotangent of a real leaf of x, and note one that has less precision than x."""
+        names = self.point.names_under("gradient")
+        parts = self.point.variables(slopes, "gradient", advice="; return a tree like x", error=DerivativeError)
+        for name, part, values in zip(names, parts, self.point.values, strict=True):
+            part = np.asarray(part)
+            if not np.iscomplexobj(values):
+                _real_part(name, part)
+            if part.dtype.kind in "fc" and np.finfo(part.dtype).eps > np.finfo(values.dtype).eps:
+                self.less_precise = f"vjp(x, g) returns {part.dtype}, but x has {values.dtype}"
 
     def push(self, tree: Any, tangent: NDArray[Any]) -> NDArray[Any]:
         """Return J tangent at a tree by the JVP under test.
@@ -308,9 +356,14 @@ class Program:
         """Return a cotangent of x. JAX returns a tuple with one entry for a function of one argument."""
         if slopes is None:
             raise WrongResult(f"{name}: expected a tree like x, got None; return the cotangent of x")
-        is_single = keys(self.point.template) is None
-        if is_single and isinstance(slopes, (tuple, list)) and len(slopes) == 1:
+        template = self.point.template
+        if keys(template) is None and isinstance(slopes, (tuple, list)) and len(slopes) == 1:
             return slopes[0]
+        if self.x_is_list and isinstance(slopes, np.ndarray):
+            kind = type(template).__name__
+            raise TypeError(
+                f"{name} returns an array, but x is a {kind} of numbers; write x=np.asarray(x), or return a {kind}"
+            )
         return slopes
 
     def _own(self, name: str, tree: Any, direction: Any) -> Any:
@@ -318,12 +371,41 @@ class Program:
         derivative = getattr(self.library, name)
         try:
             value = derivative(self.f, self.library.tensors(tree), self.library.tensors(direction))
-        except TypeError as error:
+        except (TypeError, ValueError, AttributeError, RuntimeError) as error:
+            if _is_of_a_rule(error):
+                raise
+            reason = error_text(error)[:LONGEST_REASON]
+            if self.library is NUMPY:  # its error would name traced numbers, of which the caller knows nothing
+                reason = "its code is for NumPy arrays only"
             arguments = {"vjp": "vjp(x, g)", "jvp": "jvp(x, t)"}[name]
             raise DerivativeError(
-                f"f cannot be differentiated without {name} ({error_text(error)}); give a function {arguments}"
-            ) from error
+                f"f cannot be differentiated without {name}: {reason}; give a function {arguments}"
+            ) from None
         return self.library.arrays(value)
+
+
+def _is_of_a_rule(error: BaseException) -> bool:
+    """Return whether an error is one of a derivative rule, and not of code that takes no traced numbers."""
+    return isinstance(error, SparsedpError) and "traced value" not in str(error)
+
+
+def _real_part(name: str, part: NDArray[Any]) -> NDArray[Any]:
+    """Return the real part of numbers that have to be real. An FFT leaves imaginary parts of rounding errors.
+
+    Raises
+    ------
+    ShapeError
+        If the imaginary parts are larger than rounding errors.
+    """
+    if not np.iscomplexobj(part):
+        return part
+    largest = np.max(np.abs(part.imag), initial=0.0)
+    share = max(IMAGINARY_SHARE, IMAGINARY_EPS * float(np.finfo(part.dtype).eps))
+    if largest > share * np.max(np.abs(part), initial=0.0):
+        raise ShapeError(
+            f"{name}: expected real numbers, got imaginary parts of up to {largest:.1e}; return the real part"
+        )
+    return np.real(part)
 
 
 def _bytes_of(tree: Any) -> list[bytes]:

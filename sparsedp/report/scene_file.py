@@ -68,30 +68,60 @@ def load_scene(target: str, derivatives: Mapping[str, str] | None = None) -> Sce
     ValueError
         If the file or module does not exist or raises an error, or if a name is missing.
     """
-    parts = re.fullmatch(r"(.+\.py)(?::([^:]+))?(?::([^:]+))?", target)
-    module = re.fullmatch(r"([\w.]+):([^:]+)(?::([^:]+))?", target)
-    if parts is not None:
-        names = _run(Path(parts[1]))
-    elif module is not None:
-        parts = module
-        names = _import(module[1])
-    else:
-        raise ValueError(f"{target!r} names no scene; write FILE.py:loss, FILE.py:loss:start, or MODULE:loss")
-    file = Path(parts[1])
-    loss_name = parts[2] or "loss"
-    point_names = (parts[3],) if parts[3] else POINT_NAMES
-    loss = names.get(loss_name)
+    source = _source(target)
+    loss = source.names.get(source.loss)
     if not callable(loss) and not hasattr(loss, "apply"):
-        raise ValueError(f"{file} has no function {loss_name!r}; write {file}:NAME of the function to examine")
+        raise ValueError(
+            f"{source.file} has no function {source.loss!r}; write {source.file}:NAME of the function to examine"
+        )
     chosen = {}
     for kind, name in (derivatives or {}).items():
-        if name not in names:
-            raise ValueError(f"{file} has no {name!r}; write --{kind} NAME with a name that it defines")
-        chosen[kind] = names[name]
-    point_name = next((name for name in point_names if name in names), None)
-    if point_name is None:
-        expected = " or ".join(point_names)
-        raise ValueError(f"{file} has no {expected!r}, the point; write {file}:{loss_name}:NAME")
+        if name not in source.names:
+            raise ValueError(f"{source.file} has no {name!r}; write --{kind} NAME with a name that it defines")
+        chosen[kind] = source.names[name]
+    point = _point(source)
+    name = source.file.stem
+    if source.loss != "loss":
+        name = f"{name}-{source.loss}"
+    return SceneFile(name, _with_one_argument(loss, point), point, chosen, _options(source))
+
+
+class Source(NamedTuple):
+    """A file or a module that has run: its global names, and the names of the loss and of the point in it."""
+
+    file: Path
+    names: dict[str, Any]
+    loss: str
+    points: tuple[str, ...]
+
+
+def _source(target: str) -> Source:
+    """Run the file, or import the module, that a command line names."""
+    file = re.fullmatch(r"(.+\.py)(?::([^:]+))?(?::([^:]+))?", target)
+    module = re.fullmatch(r"([\w.]+):([^:]+)(?::([^:]+))?", target)
+    parts = file or module
+    if parts is None:
+        raise ValueError(f"{target!r} names no function; write FILE.py:NAME, FILE.py:NAME:POINT, or MODULE:NAME")
+    names = _run(Path(parts[1])) if file else _import(parts[1])
+    return Source(Path(parts[1]), names, parts[2] or "loss", (parts[3],) if parts[3] else POINT_NAMES)
+
+
+def _point(source: Source) -> Any:
+    """Return the point that a file defines, or the result of the function that it defines for it."""
+    name = next((name for name in source.points if name in source.names), None)
+    if name is None:
+        expected = " or ".join(source.points)
+        raise ValueError(f"{source.file} has no {expected!r}, the point; write {source.file}:{source.loss}:NAME")
+    point = source.names[name]
+    if isinstance(point, FunctionType):
+        with errors_as_value_error(file=f"{source.file}:{name}"):
+            return point()
+    return point
+
+
+def _options(source: Source) -> dict[str, dict[str, Any]]:
+    """Return the arguments for `work_precision` and `stress` that a file defines."""
+    names = source.names
     if "workprec_options" in names:
         names.setdefault("work_precision_options", names["workprec_options"])
         warn_deprecated("workprec_options", "work_precision_options", "0.5")
@@ -100,17 +130,9 @@ def load_scene(target: str, derivatives: Mapping[str, str] | None = None) -> Sce
         arguments = names.get(f"{instrument}_options", {})
         if not isinstance(arguments, dict):
             kind = type(arguments).__name__
-            raise ValueError(f"{instrument}_options in {file} must be a dict of arguments, got {kind}")
+            raise ValueError(f"{instrument}_options in {source.file} must be a dict of arguments, got {kind}")
         options[instrument] = arguments
-    if loss_name == "loss":
-        name = file.stem
-    else:
-        name = f"{file.stem}-{loss_name}"
-    point = names[point_name]
-    if isinstance(point, FunctionType):
-        with errors_as_value_error(file=f"{file}:{point_name}"):
-            point = point()
-    return SceneFile(name, _with_one_argument(loss, point), point, chosen, options)
+    return options
 
 
 def _import(module: str) -> dict[str, Any]:

@@ -52,10 +52,16 @@ def write_report(scene: SceneFile, folder: Path, force: bool = False) -> tuple[s
     Raises
     ------
     ValueError
-        If a report exists already and `force` is not set, the folder cannot be written, or the loss ends the program.
+        If the scene has no function, if a report exists already and `force` is not set, if the folder cannot be
+        written, or if the loss ends the program.
     OSError
         If a file cannot be written.
     """
+    if not callable(scene.loss):
+        raise ValueError(
+            f"a report is on a function that returns one number, got an object of the class {type(scene.loss).__name__}"
+            "; write python -m sparsedp check for its derivative"
+        )
     claim_folder(folder, PAGES, force)
     with errors_as_value_error(scene.name):
         results = [_attempt(chapter, scene) for chapter in CHAPTERS]

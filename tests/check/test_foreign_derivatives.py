@@ -421,7 +421,9 @@ def test_jacobians():
     assert dp.check.jacobian(lambda z: M @ z**2, lambda z: 2 * M * z, X + 0.5j)
     assert dp.check.jacobian(np.sin, 1.001 * slopes, X).verdict == "disagrees"
     wrong = dp.check.jacobian(np.sin, M, X)
-    assert wrong.verdict == "disagrees" and wrong.reason == "the Jacobian has shape (5, 12), expected (12, 12)"
+    assert wrong.verdict == "disagrees" and wrong.reason.startswith(
+        "the Jacobian has shape (5, 12), expected (12, 12); "
+    )
 
 
 @pytest.mark.whole
@@ -447,37 +449,3 @@ def test_a_hessian_that_is_not_symmetric():
         wrong = dp.check.hessian(lambda u: u @ A @ u, 2 * A, X, **options)
         assert wrong.verdict == "disagrees" and "the Hessian is not symmetric" in wrong.reason
         assert dp.check.hessian(lambda u: u @ A @ u, A + A.T, X, **options)
-
-
-# ---- messages ------------------------------------------------------------------------------------------------------
-
-
-def test_messages():
-    with pytest.raises(
-        TypeError, match=r"^grid takes a Grid, a Space, or a list of them, got int; write grid=dp.Grid\(...\)$"
-    ):
-        VJP(cube, cube_vjp, X, grid=3)
-    with pytest.raises(TypeError, match="check.vjp needs the point x at which the derivative is checked; write x=..."):
-        VJP(cube, cube_vjp)
-    with pytest.raises(TypeError, match=r"^f\(x\) must be an array or a tree of arrays, got Grid; return arrays"):
-        VJP(lambda u: dp.Grid(3), cube_vjp, X)
-    with pytest.raises(
-        dp.errors.DerivativeError,
-        match=r"^f cannot be differentiated without vjp \(DerivativeError: .*\); give a function vjp\(x, g\)$",
-    ):
-        VJP(lambda u: np.asarray(u, float), x=X)
-    with pytest.raises(
-        TypeError,
-        match="check.hessian takes real x, got complex numbers; split them into real and imaginary parts",
-    ):
-        dp.check.hessian(lambda u: abs(u), 1.0, 1j)
-    with pytest.raises(
-        ValueError,
-        match=r"^check.hessian needs a loss f\(x\) with one value, got several; give gradient=f instead",
-    ):
-        dp.check.hessian(cube, lambda u, v: v, X)
-    with pytest.raises(
-        TypeError,
-        match="the Jacobian takes an array, a sparse matrix, an operator, or a function of x that returns one, got str",
-    ):
-        dp.check.jacobian(cube, "J", X)

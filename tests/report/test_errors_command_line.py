@@ -252,8 +252,19 @@ def test_a_derivative_that_is_not_there(tmp_path, monkeypatch, capsys):
     assert "one derivative is checked at a time, got gradient and vjp" in capsys.readouterr().err
 
 
+def test_a_report_of_an_object(tmp_path, monkeypatch, capsys):
+    (tmp_path / "some_model.py").write_text(FOREIGN, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    assert main(["report", "some_model.py:simulator"]) == 2
+    message = (
+        "a report is on a function that returns one number, got an object of the class Simulator; "
+        "write python -m sparsedp check for its derivative"
+    )
+    assert message in capsys.readouterr().err and not (tmp_path / "sparsedp-report").exists()
+
+
 REFUSALS = [
-    ("poisson", "'poisson' names no scene; write FILE.py:loss, FILE.py:loss:start, or MODULE:loss"),
+    ("poisson", "'poisson' names no function; write FILE.py:NAME, FILE.py:NAME:POINT, or MODULE:NAME"),
     ("none.py", "there is no file none.py; name one that is there"),
     ("poisson.py:nothing", "poisson.py has no function 'nothing'; write poisson.py:NAME of the function to examine"),
     ("poisson.py:start", "poisson.py has no function 'start'; write poisson.py:NAME of the function to examine"),
@@ -476,7 +487,7 @@ LONG = "a" * 5000
 @pytest.mark.parametrize(
     "arguments, sentence",
     [
-        (["check", LONG], r"'a+\.\.\. names no scene; write FILE.py:loss, FILE.py:loss:start, or MODULE:loss"),
+        (["check", LONG], r"'a+\.\.\. names no function; write FILE.py:NAME, FILE.py:NAME:POINT, or MODULE:NAME"),
         (["check", f"{LONG}.py"], r"there is no file a+\.\.\. name one that is there"),
         (["check", f"scene.py:{LONG}"], r"scene.py has no function 'a+\.\.\. write scene.py:NAME of the function to e"),
         (["check", f"scene.py:loss:{LONG}"], r"scene.py has no 'a+\.\.\. the point; write scene.py:loss:NAME"),

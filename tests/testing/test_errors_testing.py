@@ -28,6 +28,21 @@ MESSAGES = [
         "no check of a derivative has the argument 'vpj'; write 'vjp'",
     ),
     (
+        lambda: assert_gradient(total, X, gradient=SLOPE, convention="adjoint"),
+        TypeError,
+        "check.gradient has no argument 'convention'; it takes steps, directions, rng",
+    ),
+    (
+        lambda: assert_gradient(total, X, jacobian=SLOPE, stages=[total]),
+        TypeError,
+        "check.jacobian has no argument 'stages'; it takes directions, steps, rng, grid, noise, beside",
+    ),
+    (
+        lambda: assert_gradient(np.float64, X),
+        TypeError,
+        "check.vjp takes a function or an object, got the class float64; write float64(...), or one of its functions",
+    ),
+    (
         lambda: assert_gradient(total),
         TypeError,
         "check.vjp needs the point x at which the derivative is checked; write x=...",
