@@ -135,6 +135,7 @@ def public(written: str, advice: Callable | None = None) -> Callable[[Function],
     def decorate(function):
         @wraps(function)
         def call(*args, **options):
+            __tracebackhide__ = True  # pytest shows the line that calls the function
             try:
                 return function(*args, **options)
             except Exception as error:

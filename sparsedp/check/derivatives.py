@@ -26,7 +26,7 @@ from sparsedp.grid.grid import Grid
 from sparsedp.grid.space import Space
 from sparsedp.operators.operator import Operator
 
-__all__ = ["DerivativeCheck", "hessian", "jacobian", "jvp", "vjp"]
+__all__ = ["DerivativeCheck", "hessian", "jacobian", "jvp", "transposed_products", "vjp"]
 
 DERIVATIVES = ("vjp", "jvp")
 EXAMPLES = {"vjp": "lambda x, g: ...", "jvp": "lambda x, t: ..."}
@@ -267,6 +267,23 @@ def jacobian(
     program = Program(subject.function, subject.x, pull, push, "transpose")
     program.takes_arrays = True
     return _audited(DerivativeAudit(program, options, "vjp", True, "the Jacobian"), "jacobian")
+
+
+def transposed_products(op: Operator) -> DerivativeCheck:
+    """Compare an Operator with its transpose as a derivative, to find the entries at which the transpose is wrong."""
+    options = Options(beside=False)
+    x = options.rng.standard_normal(op.domain.shape)
+    if op.dtype.kind == "c":
+        x = x + 1j * options.rng.standard_normal(op.domain.shape)
+
+    def pull(u: Any, g: Any) -> Any:
+        return op.T.apply(g)
+
+    program = Program(op.apply, x, pull, None, "transpose")
+    found = _audited(DerivativeAudit(program, options, "vjp", False, "the transpose"), "transpose")
+    if found.culprit:
+        return _changed(found, culprit=found.culprit.replace("the Jacobian", "the operator"))
+    return found
 
 
 def hessian(

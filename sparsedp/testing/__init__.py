@@ -6,11 +6,13 @@ hypothesis. plugin.py is the plugin of pytest: fixtures of the same names, and t
 
 The functions work in projects that use no other part of sparsedp. Each is imported when it is first used, because
 pytest imports the plugin, and with it this file, in every project of an environment in which sparsedp is installed.
+
+Unlike other public modules, this one is not callable: pytest would take ``from sparsedp import testing`` for a test.
 """
 
 from importlib import import_module
 
-from sparsedp._utils.calls import advice_near, describe_module, public_name
+from sparsedp._utils.calls import advice_near, public_name
 
 __all__ = ["assert_gradient", "assert_transpose", "fields", "grids"]
 
@@ -28,6 +30,3 @@ def __getattr__(name):
     function = getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
     globals()[name] = public_name(function, __name__, name)
     return globals()[name]
-
-
-describe_module(__name__, "dp.testing.assert_gradient(loss, x)")

@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
+import sys
+import time
 from collections.abc import Callable
+from math import inf
 from typing import Any
 
 import numpy as np
 
+from sparsedp._utils.calls import frames_inside
 from sparsedp.check.choice import check_derivative
+from sparsedp.check.derivatives import transposed_products
 from sparsedp.check.gradient_check import Audit
 from sparsedp.check.operators import transpose as check_transpose
-from sparsedp.check.summary import Result, Summary
+from sparsedp.check.summary import Result, Row, Summary
 from sparsedp.operators.given import from_functions, from_linear_operator
 from sparsedp.operators.operator import Operator
+from sparsedp.testing.observers import OBSERVERS, are_complete
 
-__all__ = [
-    "assert_gradient",
-    "assert_transpose",
-    "check_transpose_of",
-    "kind_of",
-    "raise_unless_accepted",
-    "reason_of",
-]
+__all__ = ["assert_gradient", "assert_transpose", "kind_of", "reason_of"]
 
 
 def assert_gradient(
@@ -33,7 +32,7 @@ def assert_gradient(
     jvp: Callable[[Any, Any], Any] | None = None,
     jacobian: Any = None,
     hessian: Any = None,
-    quick: bool = True,
+    quick: bool | None = None,
     allow_inconclusive: bool = False,
     **options: Any,
 ) -> Audit:
@@ -53,8 +52,8 @@ def assert_gradient(
     jacobian : array, sparse matrix, LinearOperator, Operator, or callable, optional
     hessian : array, sparse matrix, LinearOperator, Operator, or callable, optional
         With `gradient`, the Hessian is compared with differences of the gradient.
-    quick : bool
-        If True, few directions are examined. The fixture of pytest sets it to False for ``pytest --gradients``.
+    quick : bool, optional
+        Whether few directions are examined. Default: True, but False in a test of ``pytest --gradients``.
     allow_inconclusive : bool
         Whether the verdict "inconclusive" passes: at a kink, or for a function with much noise.
     **options
@@ -93,6 +92,9 @@ def assert_gradient(
     AssertionError: the vjp disagrees...
     """
     __tracebackhide__ = True  # pytest shows the line of the test
+    if quick is None:
+        quick = not are_complete()
+    start = time.perf_counter()
     result = check_derivative(
         f,
         x,
@@ -104,7 +106,7 @@ def assert_gradient(
         quick=quick,
         **options,
     )
-    raise_unless_accepted(result, allow_inconclusive, complete=not quick)
+    _conclude(result, time.perf_counter() - start, allow_inconclusive, complete=not quick)
     return result
 
 
@@ -123,7 +125,7 @@ def assert_transpose(
     op : Operator, LinearOperator or callable
         A linear map. A LinearOperator with complex numbers is compared with its conjugate transpose, `rmatvec`.
     transpose : callable, optional
-        ``transpose(g)``, if `op` is a function ``op(u)``.
+        ``transpose(g)``, if `op` is a function ``op(u)``: the transpose without conjugation, also for complex numbers.
     shape : int or tuple of int, optional
         Shape of ``u``, if `op` is a function.
     seeds : int
@@ -153,21 +155,15 @@ def assert_transpose(
     'agrees'
     """
     __tracebackhide__ = True
-    result = check_transpose_of(op, transpose, shape=shape, seeds=seeds, rng=rng)
-    raise_unless_accepted(result)
+    start = time.perf_counter()
+    operator = _as_operator(op, transpose, shape)
+    result = _difference_of_shapes(operator, transpose)
+    if result is None:
+        result = check_transpose(operator, seeds, rng)
+        if not result:
+            result = _with_entries(result, operator)
+    _conclude(result, time.perf_counter() - start, complete=are_complete())
     return result
-
-
-def check_transpose_of(
-    op: Any,
-    transpose: Callable[[Any], Any] | None = None,
-    *,
-    shape: int | tuple[int, ...] | None = None,
-    seeds: int = 5,
-    rng: int | np.random.Generator | None = None,
-) -> Summary:
-    """Return the result of `check.transpose` for an Operator, a LinearOperator, or two functions."""
-    return check_transpose(_as_operator(op, transpose, shape), seeds, rng)
 
 
 def _as_operator(op: Any, transpose: Callable[[Any], Any] | None, shape: int | tuple[int, ...] | None) -> Operator:
@@ -182,21 +178,49 @@ def _as_operator(op: Any, transpose: Callable[[Any], Any] | None, shape: int | t
             f"got {type(op).__name__}; write assert_transpose(apply, transpose, shape=u.shape)"
         )
     result = np.asarray(op(np.zeros(shape)))
-    return from_functions(op, transpose, shape, result.shape, getattr(op, "__name__", "operator"))
+    dtype = complex if np.iscomplexobj(result) else float
+    return from_functions(op, transpose, shape, result.shape, getattr(op, "__name__", "operator"), dtype)
 
 
-def raise_unless_accepted(result: Result, allow_inconclusive: bool = False, complete: bool = True) -> None:
-    """Raise an AssertionError if a check disagrees, or is inconclusive and that is not allowed.
+def _difference_of_shapes(operator: Operator, transpose: Callable[[Any], Any] | None) -> Summary | None:
+    """Return a result that disagrees if a function returns another shape than that of u; None if not."""
+    if transpose is None:
+        return None
+    found = np.shape(transpose(np.zeros(operator.codomain.shape)))
+    expected = operator.domain.shape
+    if found == expected:
+        return None
+    note = f"transpose(g) has shape {found}, expected {expected}, the shape of u"
+    return Summary(f"transpose of {operator.name}", [Row("shape", inf, None, False, note)])
+
+
+def _with_entries(result: Summary, operator: Operator) -> Summary:
+    """Return the result of a wrong transpose with the entries of u and of A u at which it is wrong."""
+    try:
+        found = transposed_products(operator)
+    except Exception:  # a wrong function may raise any exception; its transpose is wrong anyway
+        return result
+    return Summary(result.title, result.rows, culprit=found.culprit, gaps=found.gaps, result_gaps=found.result_gaps)
+
+
+def _conclude(result: Result, seconds: float, allow_inconclusive: bool = False, complete: bool = False) -> None:
+    """Tell the observer of the test about a check, and raise an AssertionError if it is not accepted.
 
     Parameters
     ----------
     result : Result
+    seconds : float
     allow_inconclusive : bool
+        Whether an inconclusive check is accepted.
     complete : bool
         Whether the tables of the check are part of the message.
     """
     __tracebackhide__ = True
-    if result or (allow_inconclusive and result.verdict == "inconclusive"):
+    is_accepted = bool(result) or (allow_inconclusive and result.verdict == "inconclusive")
+    frame = sys._getframe(frames_inside())
+    for observer in OBSERVERS[-1:]:
+        observer.note(result, seconds, is_accepted, frame.f_code.co_filename, frame.f_lineno)
+    if is_accepted:
         return
     kind = kind_of(result)
     reason = reason_of(result)
@@ -216,8 +240,19 @@ def kind_of(result: Result) -> str:
 
 def reason_of(result: Result) -> str:
     """Return why a check failed, and on further lines the culprit and the entries with the largest gaps."""
-    if isinstance(result, Summary):
-        return ", ".join(result.failed)
-    culprit = [f"culprit: {result.culprit}"] if result.culprit else []
-    gaps = [f"largest gap: {gap}" for gap in result.gaps]
-    return "\n  ".join([result.reason, *culprit, *gaps])
+    reason = _reason_of_transpose(result) if isinstance(result, Summary) else result.reason
+    given = vars(result)
+    culprit = [f"culprit: {given['culprit']}"] if given.get("culprit") else []
+    gaps = [f"largest gap: {gap}" for gap in given.get("gaps", ())]
+    in_result = [f"largest gap in the result: {gap}" for gap in given.get("result_gaps", ())]
+    return "\n  ".join([reason, *culprit, *gaps, *in_result])
+
+
+def _reason_of_transpose(result: Summary) -> str:
+    """Return why a transpose is wrong: the exception or the shape if there is one, or else the dtypes."""
+    failed = [row for row in result.rows if row.ok is False]
+    notes = [row.note for row in failed if row.note]
+    if notes:
+        return notes[0]
+    dtypes = ", ".join(row.name.partition(", ")[2] for row in failed)
+    return f"<g, A u> and <A^T g, u> differ by {failed[0].figure:.1e} rounding errors, in {dtypes}"

@@ -1,4 +1,4 @@
-"""The plugin of pytest: fixtures `assert_gradient` and `assert_transpose`, and the options of their reports.
+"""The plugin of pytest: fixtures `assert_gradient` and `assert_transpose`, and the reports of all checks of a test.
 
 pytest loads this module in every project of an environment in which sparsedp is installed (entry point `pytest11`).
 It therefore imports nothing but the standard library and pytest until a fixture is used.
@@ -7,19 +7,18 @@ It therefore imports nothing but the standard library and pytest until a fixture
 from __future__ import annotations
 
 import os
-import sys
-import time
 from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
 
+from sparsedp.testing.observers import OBSERVERS
+
 __all__ = ["GradientCheck", "GradientChecks", "annotation"]
 
 CHECKS = pytest.StashKey["list[dict[str, Any]]"]()  # the checks of a test, in the order of the calls
 ANNOTATIONS = ("auto", "github", "none")
-LONGEST_LINE = 110  # characters of a line of the summary
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -63,6 +62,8 @@ class GradientCheck(NamedTuple):
     line : int
     passed : bool
         Whether the assertion holds: an inconclusive check may be allowed.
+    times : int
+        Number of calls of this line in the test.
     """
 
     test: str
@@ -75,10 +76,17 @@ class GradientCheck(NamedTuple):
     file: str
     line: int
     passed: bool
+    times: int = 1
+
+
+VERDICTS = ("agrees", "inconclusive", "disagrees")  # from best to worst
+PROPERTIES = ("kind", "verdict", "digits", "runs", "seconds", "times")
 
 
 class GradientChecks:
-    """The checks of one test: both fixtures call it, and it writes down each result.
+    """The observer of a test: it writes down each check, for the reports and as properties in a JUnit file.
+
+    Checks of the same line are one entry, so that a loop, or a test with many examples of hypothesis, has one.
 
     Parameters
     ----------
@@ -89,38 +97,10 @@ class GradientChecks:
     def __init__(self, item: pytest.Item) -> None:
         self.item = item
         self.is_complete = bool(item.config.getoption("--gradients"))
-        item.stash.setdefault(CHECKS, [])
+        self.checks: dict[tuple[str, str, int], GradientCheck] = {}
 
-    def assert_gradient(
-        self, f: Any, x: Any = None, *, quick: bool | None = None, allow_inconclusive: bool = False, **options: Any
-    ) -> Any:
-        """Call `sparsedp.testing.assert_gradient`; the check is complete with the option ``--gradients``."""
-        from sparsedp.check.choice import check_derivative
-        from sparsedp.testing.assertions import raise_unless_accepted
-
-        __tracebackhide__ = True
-        if quick is None:
-            quick = not self.is_complete
-        start = time.perf_counter()
-        result = check_derivative(f, x, quick=quick, **options)
-        is_accepted = bool(result) or (allow_inconclusive and result.verdict == "inconclusive")
-        self._note(result, time.perf_counter() - start, sys._getframe(1), is_accepted)
-        raise_unless_accepted(result, allow_inconclusive, complete=not quick)
-        return result
-
-    def assert_transpose(self, op: Any, transpose: Callable[[Any], Any] | None = None, **options: Any) -> Any:
-        """Call `sparsedp.testing.assert_transpose`."""
-        from sparsedp.testing.assertions import check_transpose_of, raise_unless_accepted
-
-        __tracebackhide__ = True
-        start = time.perf_counter()
-        result = check_transpose_of(op, transpose, **options)
-        self._note(result, time.perf_counter() - start, sys._getframe(1), bool(result))
-        raise_unless_accepted(result)
-        return result
-
-    def _note(self, result: Any, seconds: float, frame: Any, is_accepted: bool) -> None:
-        """Write down a check: for the reports of this plugin, and as properties of the test in a JUnit file."""
+    def note(self, result: Any, seconds: float, is_accepted: bool, file: str, line: int) -> None:
+        """Note the result of a check that the given line of a file has called."""
         from sparsedp.testing.assertions import kind_of, reason_of
 
         check = GradientCheck(
@@ -131,16 +111,47 @@ class GradientChecks:
             runs=getattr(result, "evaluations", None),
             seconds=round(seconds, 6),
             message="" if is_accepted else reason_of(result),
-            file=_relative(frame.f_code.co_filename, self.item.config.rootpath),
-            line=frame.f_lineno,
+            file=_relative(file, self.item.config.rootpath),
+            line=line,
             passed=is_accepted,
         )
-        checks = self.item.stash[CHECKS]
-        checks.append(check._asdict())
-        for name in ("kind", "verdict", "digits", "runs", "seconds"):
-            value = getattr(check, name)
-            if value is not None:
-                self.item.user_properties.append((f"gradient_{len(checks)}_{name}", value))
+        key = check.kind, check.file, check.line
+        if key in self.checks:
+            check = _together(self.checks[key], check)
+        self.checks[key] = check
+        self.item.stash[CHECKS] = [entry._asdict() for entry in self.checks.values()]
+        others = [entry for entry in self.item.user_properties if not entry[0].startswith("gradient_")]
+        self.item.user_properties[:] = [*others, *self._properties()]
+
+    def _properties(self) -> list[tuple[str, object]]:
+        """Return the properties of the test for a JUnit file."""
+        properties: list[tuple[str, object]] = []
+        for number, check in enumerate(self.checks.values(), start=1):
+            for name in PROPERTIES:
+                value = getattr(check, name)
+                if value is not None:
+                    properties.append((f"gradient_{number}_{name}", value))
+        return properties
+
+
+def _together(first: GradientCheck, second: GradientCheck) -> GradientCheck:
+    """Return one entry for two checks of the same line: the worse verdict, and the last message."""
+    verdict = max(first.verdict, second.verdict, key=VERDICTS.index)
+    digits = None
+    if first.digits is not None and second.digits is not None:
+        digits = min(first.digits, second.digits)
+    runs = None
+    if first.runs is not None and second.runs is not None:
+        runs = first.runs + second.runs
+    return second._replace(
+        verdict=verdict,
+        digits=digits,
+        runs=runs,
+        seconds=round(first.seconds + second.seconds, 6),
+        message=second.message or first.message,
+        passed=first.passed and second.passed,
+        times=first.times + second.times,
+    )
 
 
 def _relative(file: str, root: Path) -> str:
@@ -152,25 +163,40 @@ def _relative(file: str, root: Path) -> str:
 
 
 @pytest.fixture
-def assert_gradient(request: pytest.FixtureRequest) -> Callable[..., Any]:
-    """Return `sparsedp.testing.assert_gradient`, whose checks appear in the reports of pytest."""
-    return GradientChecks(request.node).assert_gradient
+def assert_gradient() -> Callable[..., Any]:
+    """Return `sparsedp.testing.assert_gradient`."""
+    from sparsedp import testing
+
+    return testing.assert_gradient
 
 
 @pytest.fixture
-def assert_transpose(request: pytest.FixtureRequest) -> Callable[..., Any]:
-    """Return `sparsedp.testing.assert_transpose`, whose checks appear in the reports of pytest."""
-    return GradientChecks(request.node).assert_transpose
+def assert_transpose() -> Callable[..., Any]:
+    """Return `sparsedp.testing.assert_transpose`."""
+    from sparsedp import testing
+
+    return testing.assert_transpose
 
 
 # ------------------------------------------------------------ reports
 
 
 @pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, Any, None]:
+    """Observe the checks of a test, whether they are called by a fixture or as functions."""
+    observer = GradientChecks(item)
+    OBSERVERS.append(observer)
+    try:
+        yield
+    finally:
+        OBSERVERS.remove(observer)
+
+
+@pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_makereport(item: pytest.Item, call: Any) -> Generator[None, Any, None]:
     """Attach the checks of a test to its report, which pytest-xdist sends to the process that prints the summary."""
     outcome = yield
-    if call.when == "call":
+    if call.when == "call" or (call.when == "setup" and call.excinfo is not None):
         outcome.get_result().gradient_checks = item.stash.get(CHECKS, [])
 
 
@@ -201,8 +227,9 @@ def _summary(checks: list[GradientCheck]) -> list[str]:
     for check in checks:
         digits = "-" if check.digits is None else check.digits
         runs = "-" if check.runs is None else check.runs
-        line = f"{check.verdict:<12} {digits:>6} {runs:>6} {check.seconds:>8.2f}  {check.kind} in {check.test}"
-        lines.append(line if len(line) <= LONGEST_LINE else f"{line[: LONGEST_LINE - 3]}...")
+        times = f", {check.times} times" if check.times > 1 else ""
+        numbers = f"{check.verdict:<12} {digits:>6} {runs:>6} {check.seconds:>8.2f}"
+        lines.append(f"{numbers}  {check.kind} in {check.test}{times}")
     failed = sum(not check.passed for check in checks)
     lines.append(f"{len(checks)} checks, {failed} failed, {sum(check.seconds for check in checks):.2f} s")
     return lines

@@ -5,7 +5,7 @@ import hypothesis
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from scipy.sparse.linalg import aslinearoperator
+from scipy.sparse.linalg import LinearOperator, aslinearoperator
 
 import sparsedp as dp
 from sparsedp.testing import assert_gradient, assert_transpose, fields, grids
@@ -94,8 +94,32 @@ def test_transposes_of_operators_and_functions():
     assert assert_transpose(dp.gradient(dp.Grid((3, 4)), dp.dirichlet))
     assert assert_transpose(aslinearoperator(matrix))
     assert assert_transpose(lambda u: matrix @ u, lambda g: matrix.T @ g, shape=4)
-    with pytest.raises(AssertionError, match="^the transpose disagrees: transpose, float64"):
+    assert assert_transpose(np.fft.fft, np.fft.fft, shape=4)
+
+
+def test_a_wrong_transpose_is_named_with_its_entries():
+    """The message has the dtypes once, and the entries."""
+    matrix = np.arange(12.0).reshape(3, 4)
+    words = (
+        r"^the transpose disagrees: <g, A u> and <A\^T g, u> differ by .* rounding errors, in float64, complex128, "
+        r"float32, complex64\n  largest gap: every entry of x: the transpose is too large, by a factor of 1.001"
+    )
+    with pytest.raises(AssertionError, match=words):
         assert_transpose(lambda u: matrix @ u, lambda g: 1.001 * (matrix.T @ g), shape=4)
+    wall = np.array([1.0, 1.0, 0.0, 1.0])
+    with pytest.raises(AssertionError, match=r"\n  largest gap: x\[2\]: .* by differences, 0 by the transpose"):
+        assert_transpose(lambda u: matrix @ u, lambda g: wall * (matrix.T @ g), shape=4)
+    shift = np.eye(4) + np.eye(4, k=1)
+    with pytest.raises(AssertionError, match="\n  culprit: it multiplies by the operator instead of its transpose"):
+        assert_transpose(lambda u: shift @ u, lambda g: shift @ g, shape=4)
+
+
+def test_a_transpose_of_another_shape_or_without_one():
+    words = r"^the transpose disagrees: transpose\(g\) has shape \(3,\), expected \(4,\), the shape of u$"
+    with pytest.raises(AssertionError, match=words):
+        assert_transpose(np.diff, lambda g: g, shape=4)
+    with pytest.raises(AssertionError, match="^the transpose disagrees: DerivativeError: operator has no transpose: "):
+        assert_transpose(LinearOperator((3, 3), matvec=lambda u: u, dtype=float))
 
 
 # ---- strategies ------------------------------------------------------------------------------------------------------

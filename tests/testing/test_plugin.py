@@ -13,6 +13,7 @@ from sparsedp.testing.plugin import GradientCheck, annotation
 PROJECT = """
 import numpy as np
 from hypothesis import given
+from sparsedp import testing
 from sparsedp.testing import fields
 
 x = np.linspace(1.0, 2.0, 5)
@@ -34,7 +35,16 @@ def test_kink(assert_gradient):
 
 @given(fields(4))
 def test_fields(u):
-    assert u.shape == (4,)
+    testing.assert_gradient(lambda v: v**3, u, vjp=lambda v, g: 3 * v**2 * g, allow_inconclusive=True)
+
+def test_arguments(assert_gradient):
+    assert_gradient(loss, x, gradeint=x)
+
+def test_user_error(assert_gradient):
+    def broken(u, g):
+        return g @ np.ones(3)
+
+    assert_gradient(np.exp, x, vjp=broken)
 """
 
 
@@ -59,7 +69,7 @@ def run(folder, *options, **variables):
         check=False,
     )
     assert done.returncode == 1, done.stdout + done.stderr
-    assert "2 failed, 3 passed" in done.stdout
+    assert "4 failed, 3 passed" in done.stdout
     return done.stdout
 
 
@@ -69,8 +79,13 @@ def test_failures_are_short_by_default(project):
     assert "E       AssertionError: the gradient disagrees: " in printed
     assert "E         largest gap: x[2]: 3.375 by differences, 3.038 by the gradient" in printed
     assert "= gradients =" not in printed and "::error" not in printed
-    assert len(printed.splitlines()) < 50  # neither tables of gaps nor frames of this library
-    assert "assertions.py" not in printed and "plugin.py:" not in printed
+    for name, most in (("wrong", 10), ("transpose", 12), ("arguments", 9), ("user_error", 25)):
+        shown = printed.partition(f"_ test_{name} _")[2].partition("\n___")[0].partition("\n===")[0]
+        assert 3 < len(shown.splitlines()) <= most, shown  # neither tables of gaps nor frames of this library
+    assert "Warning" not in printed
+    for file in ("assertions", "plugin", "choice", "derivatives", "calls", "programs"):
+        assert f"{file}.py:" not in printed
+    assert "E       TypeError: no check of a derivative has the argument 'gradeint'; write 'gradient'" in printed
 
 
 @pytest.mark.whole
@@ -78,18 +93,21 @@ def test_all_checks_in_a_table_in_junit_and_as_annotations(project, tmp_path):
     file = tmp_path / "junit.xml"
     printed = run(project, "--gradients", "-n", "2", f"--junitxml={file}", GITHUB_ACTIONS="true")
     table = printed.partition("= gradients =")[2].splitlines()[1:]
-    verdicts = {line.split("::")[1]: line.split()[0] for line in table[1:5]}
+    verdicts = {line.split("::")[1].partition(",")[0]: line.split()[0] for line in table[1:6]}
     assert verdicts == {
+        "test_fields": "inconclusive",  # at some of its examples, all of them in one line
         "test_right": "agrees",
         "test_wrong": "disagrees",
         "test_transpose": "disagrees",
         "test_kink": "inconclusive",
     }
-    assert table[5].startswith("4 checks, 2 failed, ")
+    assert table[6].startswith("5 checks, 2 failed, ")
+    (fields,) = (line for line in table if "::test_fields, " in line)
+    assert int(fields.rpartition(", ")[2].removesuffix(" times")) >= 20
     assert "verdict: disagrees" in printed  # the tables of a complete check
     annotations = [line for line in printed.splitlines() if line.startswith("::error ")]
     assert len(annotations) == 2
-    assert "file=test_model.py,line=15,title=gradient disagrees::along " in annotations[1]
+    assert "file=test_model.py,line=16,title=gradient disagrees::along " in annotations[1]
     assert "%0A  largest gap: x[2]: 3.375 by differences" in annotations[1]
     case = next(case for case in ElementTree.parse(file).iter("testcase") if case.get("name") == "test_right")
     properties = {entry.get("name"): entry.get("value") for entry in case.iter("property")}
