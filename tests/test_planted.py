@@ -5,11 +5,10 @@ They are caught by what runs by default. All of it:  python -m pytest -m slow te
 
 import os
 import shutil
-import subprocess
-import sys
 from typing import NamedTuple
 
 import pytest
+from fresh_process import run_python
 from launch import MISSING
 from planted_on_ranks import BUGS_ON_RANKS
 from sources import ROOT
@@ -1329,8 +1328,8 @@ def failures(folder, tests, compiled=False):
     environment = {**os.environ, "PYTHONPATH": str(folder), "SPARSEDP_NUMBA": str(int(compiled))}
     for name in ("PYTHONDONTWRITEBYTECODE", "PYTHONPYCACHEPREFIX"):  # bytecode goes with the copy
         environment.pop(name, None)
-    command = [sys.executable, "-m", "pytest", "-n0", "-x", "-p", "no:cacheprovider", "--tb=line", *tests.split()]
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=1800)
+    arguments = ["-n0", "-x", "-p", "no:cacheprovider", "--tb=line", *tests.split()]
+    done = run_python("pytest", arguments, folder, environment)
     return done.returncode, done.stdout
 
 

@@ -1,12 +1,11 @@
 """The examples as processes of their own, small; each runs once in a session, on the worker that looks at it."""
 
 import os
-import subprocess
-import sys
 from functools import cache
 from importlib.util import find_spec
 
 import pytest
+from fresh_process import run_python
 from sources import ROOT
 
 from sparsedp.kernels.team import NOTICE
@@ -87,9 +86,8 @@ def example(name):
 @cache
 def done(name, *options_of_its_own):
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
-    command = [sys.executable, str(ROOT / "examples" / name), SMALL.get(name, "16"), *options_of_its_own]
-    options = {"capture_output": True, "text": True, "timeout": 600, "check": False}  # for what hangs
-    return subprocess.run(command, env=environment, **options)
+    arguments = [SMALL.get(name, "16"), *options_of_its_own]
+    return run_python(str(ROOT / "examples" / name), arguments, ROOT, environment, timeout=600)  # for what hangs
 
 
 def run(name, *options):
