@@ -111,7 +111,8 @@ def run_check(options: argparse.Namespace) -> int:
     names = {kind: getattr(options, kind) for kind in DERIVATIVES if getattr(options, kind) is not None}
     scene = load_scene(options.scene, names)
     with errors_as_value_error(options.scene):
-        audit = check_derivative(scene.loss, scene.x, quick=options.quick, **scene.derivatives)
+        chosen = {} if options.convention is None else {"convention": options.convention}
+        audit = check_derivative(scene.loss, scene.x, quick=options.quick, **scene.derivatives, **chosen)
     print(audit)
     return EXIT_CODES[audit.verdict]
 
@@ -191,6 +192,10 @@ ARGUMENTS: dict[str, Any] = {
     "--jvp": {"metavar": "NAME", "help": "jvp(x, t)"},
     "--jacobian": {"metavar": "NAME", "help": "the Jacobian matrix, or a function J(x) that returns it"},
     "--hessian": {"metavar": "NAME", "help": "the Hessian of the loss: a matrix, H(x) or H(x, v)"},
+    "--convention": {
+        "choices": ("transpose", "adjoint"),
+        "help": "inner product of complex cotangents, for --vjp (default: that of the library of the function)",
+    },
     "--quick": {"action": "store_true", "help": "examine fewer directions: 40 to 60 runs if the derivative is right"},
 }
 COMMANDS = {
@@ -203,7 +208,7 @@ COMMANDS = {
         run_check,
         "check the gradient of a loss in a file or a module, or another derivative of any function. "
         "Exit code: 0 agrees, 1 disagrees, 3 inconclusive, 2 invalid input, 130 interrupted",
-        ("scene", "--gradient", "--vjp", "--jvp", "--jacobian", "--hessian", "--quick"),
+        ("scene", "--gradient", "--vjp", "--jvp", "--jacobian", "--hessian", "--convention", "--quick"),
     ),
     "report": Command(
         run_report,

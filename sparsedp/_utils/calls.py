@@ -28,6 +28,7 @@ __all__ = [
     "public",
     "public_name",
     "shortened",
+    "without_own_frames",
     "warn_deprecated",
     "wrapped_functions",
 ]
@@ -248,15 +249,45 @@ def shortened(error: Exception) -> Exception:
     return error
 
 
+def without_own_frames(error: Exception) -> Exception:
+    """Remove all frames of this library from the traceback of an error, also the one that raised it.
+
+    The message of an error about a wrong argument says what to write; the line of the caller is all that is needed.
+    Other errors keep the frame that raised them.
+
+    Returns
+    -------
+    Exception
+        The same object.
+    """
+    error = shortened(error)
+    entries = _frames(error.__traceback__)
+    is_full = os.environ.get("SPARSEDP_TRACEBACK") == "full"
+    is_own = entries[-1].tb_frame.f_globals.get("__name__", "").startswith("sparsedp.")
+    if is_own and not is_full and isinstance(error, (TypeError, ValueError)):
+        error.__traceback__ = _joined_frames(entries[:-1])
+    return error
+
+
 def _without_internal_frames(traceback):
     """Return a traceback with the frames of the user's code and the last frame."""
+    entries = _frames(traceback)
+    return _joined_frames([entry for entry in entries[:-1] if _is_of_the_user(entry.tb_frame)] + entries[-1:])
+
+
+def _frames(traceback):
+    """Return the entries of a traceback as a list."""
     entries = []
     while traceback is not None:
         entries.append(traceback)
         traceback = traceback.tb_next
-    kept = [entry for entry in entries[:-1] if _is_of_the_user(entry.tb_frame)] + entries[-1:]
+    return entries
+
+
+def _joined_frames(entries):
+    """Return a traceback with these entries."""
     following = None
-    for entry in reversed(kept):
+    for entry in reversed(entries):
         following = TracebackType(following, entry.tb_frame, entry.tb_lasti, entry.tb_lineno)
     return following
 

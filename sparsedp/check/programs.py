@@ -7,7 +7,8 @@ real numbers in each vector, so that every inner product is an ordinary dot prod
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,9 +24,10 @@ from sparsedp.check.summary import error_text
 from sparsedp.errors import DerivativeError, ShapeError, SparsedpError
 from sparsedp.interop.recording import recorded
 
-__all__ = ["CONVENTIONS", "Library", "Program", "WrongResult", "library_of"]
+__all__ = ["CONVENTIONS", "Library", "Program", "WrongResult", "library_of", "plain_numpy_refused"]
 
 CONVENTIONS = ("transpose", "adjoint")
+ARGUMENTS = {"gradient": "gradient(x)", "vjp": "vjp(x, g)", "jvp": "jvp(x, t)"}
 LONGEST_REASON = 200  # characters of the message of another library
 IMAGINARY_SHARE = 1e-6  # larger imaginary parts of real numbers, relative to the largest number, are an error
 IMAGINARY_EPS = 100.0  # the same in units of machine epsilon; matters in single precision
@@ -374,14 +376,32 @@ class Program:
         except (TypeError, ValueError, AttributeError, RuntimeError) as error:
             if _is_of_a_rule(error):
                 raise
-            reason = error_text(error)[:LONGEST_REASON]
             if self.library is NUMPY:  # its error would name traced numbers, of which the caller knows nothing
-                reason = "its code is for NumPy arrays only"
-            arguments = {"vjp": "vjp(x, g)", "jvp": "jvp(x, t)"}[name]
+                raise _plain_numpy_error(name) from None
+            reason = error_text(error)[:LONGEST_REASON]
             raise DerivativeError(
-                f"f cannot be differentiated without {name}: {reason}; give a function {arguments}"
+                f"f cannot be differentiated without {name}: {reason}; give a function {ARGUMENTS[name]}"
             ) from None
         return self.library.arrays(value)
+
+
+def _plain_numpy_error(name: str) -> DerivativeError:
+    """Return the error for a function that has no derivative by the tape, and no derivative of this name."""
+    return DerivativeError(
+        f"f cannot be differentiated without {name}: its code is for NumPy arrays only; give a function "
+        f"{ARGUMENTS[name]}, or write f with autograd.numpy"
+    )
+
+
+@contextmanager
+def plain_numpy_refused(name: str) -> Iterator[None]:
+    """Replace errors about traced numbers by one that asks for the derivative of this name."""
+    try:
+        yield
+    except DerivativeError as error:
+        if "traced value" in str(error):
+            raise _plain_numpy_error(name) from None
+        raise
 
 
 def _is_of_a_rule(error: BaseException) -> bool:

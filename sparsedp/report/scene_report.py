@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 from sparsedp import check
 from sparsedp.check.summary import Result, error_text
+from sparsedp.errors import DerivativeError
 from sparsedp.io.atomic_files import write_file
 from sparsedp.report import plots
 from sparsedp.report.certificate import certify
@@ -114,10 +115,21 @@ def _chapter_in_markdown(chapter: Chapter, sentences: list[str], files: list[Pat
 
 
 def _attempt(chapter: Chapter, scene: SceneFile) -> Any:
-    """Return the result of a chapter, or the error as text, so that a failed chapter does not stop the others."""
+    """Return the result of a chapter, or the error as text, so that a failed chapter does not stop the others.
+
+    Raises
+    ------
+    ValueError
+        If the loss cannot be differentiated by reverse mode.
+    """
     try:
         return chapter.run(scene.loss, scene.x, **scene.options.get(chapter.stem, {}))
     except Exception as error:  # the user's loss may raise any exception
+        if isinstance(error, DerivativeError) and "traced value" in str(error):
+            raise ValueError(
+                "its code is for NumPy arrays only, and a report is on gradients by reverse mode; write it with "
+                "autograd.numpy, or write python -m sparsedp check with --gradient NAME"
+            ) from error
         return error_text(error)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sparsedp._utils.calls import frames_inside
+from sparsedp._utils.calls import frames_inside, without_own_frames
 from sparsedp.check.choice import check_derivative
 from sparsedp.check.derivatives import transposed_products
 from sparsedp.check.gradient_check import Audit
@@ -57,8 +57,8 @@ def assert_gradient(
     allow_inconclusive : bool
         Whether the verdict "inconclusive" passes: at a kink, or for a function with much noise.
     **options
-        Further arguments of `check.gradient` for a loss, and of `check.vjp`, `check.jvp`, `check.jacobian` and
-        `check.hessian` for the others: `rng`, `steps`, `grid`, `noise` and others.
+        Further arguments of the check: `rng`, `steps` and `directions`; for all derivatives except `gradient` also
+        `grid`, `noise` and `beside`, and for `vjp` and `jvp` also `convention` and `stages`.
 
     Returns
     -------
@@ -95,17 +95,11 @@ def assert_gradient(
     if quick is None:
         quick = not are_complete()
     start = time.perf_counter()
-    result = check_derivative(
-        f,
-        x,
-        gradient=gradient,
-        vjp=vjp,
-        jvp=jvp,
-        jacobian=jacobian,
-        hessian=hessian,
-        quick=quick,
-        **options,
-    )
+    derivatives = {"gradient": gradient, "vjp": vjp, "jvp": jvp, "jacobian": jacobian, "hessian": hessian}
+    try:
+        result = check_derivative(f, x, quick=quick, **derivatives, **options)
+    except Exception as error:
+        raise without_own_frames(error)  # noqa: B904 SPARSEDP_TRACEBACK=full keeps all frames
     _conclude(result, time.perf_counter() - start, allow_inconclusive, complete=not quick)
     return result
 
@@ -156,12 +150,15 @@ def assert_transpose(
     """
     __tracebackhide__ = True
     start = time.perf_counter()
-    operator = _as_operator(op, transpose, shape)
-    result = _difference_of_shapes(operator, transpose)
-    if result is None:
-        result = check_transpose(operator, seeds, rng)
-        if not result:
-            result = _with_entries(result, operator)
+    try:
+        operator = _as_operator(op, transpose, shape)
+        result = _difference_of_shapes(operator, transpose)
+        if result is None:
+            result = check_transpose(operator, seeds, rng)
+    except Exception as error:
+        raise without_own_frames(error)  # noqa: B904 SPARSEDP_TRACEBACK=full keeps all frames
+    if not result:
+        result = _with_entries(result, operator)
     _conclude(result, time.perf_counter() - start, complete=are_complete())
     return result
 
@@ -200,7 +197,7 @@ def _with_entries(result: Summary, operator: Operator) -> Summary:
         found = transposed_products(operator)
     except Exception:  # a wrong function may raise any exception; its transpose is wrong anyway
         return result
-    return Summary(result.title, result.rows, culprit=found.culprit, gaps=found.gaps, result_gaps=found.result_gaps)
+    return Summary(result.title, result.rows, culprit=found.culprit, gaps=found.gaps)
 
 
 def _conclude(result: Result, seconds: float, allow_inconclusive: bool = False, complete: bool = False) -> None:
@@ -244,8 +241,7 @@ def reason_of(result: Result) -> str:
     given = vars(result)
     culprit = [f"culprit: {given['culprit']}"] if given.get("culprit") else []
     gaps = [f"largest gap: {gap}" for gap in given.get("gaps", ())]
-    in_result = [f"largest gap in the result: {gap}" for gap in given.get("result_gaps", ())]
-    return "\n  ".join([reason, *culprit, *gaps, *in_result])
+    return "\n  ".join([reason, *culprit, *gaps])
 
 
 def _reason_of_transpose(result: Summary) -> str:

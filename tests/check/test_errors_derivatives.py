@@ -120,17 +120,20 @@ MESSAGES = [
     (
         lambda: VJP(loop, x=X),
         dp.errors.DerivativeError,
-        "f cannot be differentiated without vjp: its code is for NumPy arrays only; give a function vjp(x, g)",
+        "f cannot be differentiated without vjp: its code is for NumPy arrays only; give a function vjp(x, g), "
+        "or write f with autograd.numpy",
     ),
     (
         lambda: VJP(gathered, x=X),
         dp.errors.DerivativeError,
-        "f cannot be differentiated without vjp: its code is for NumPy arrays only; give a function vjp(x, g)",
+        "f cannot be differentiated without vjp: its code is for NumPy arrays only; give a function vjp(x, g), "
+        "or write f with autograd.numpy",
     ),
     (
         lambda: dp.check.jvp(gathered, x=X),
         dp.errors.DerivativeError,
-        "f cannot be differentiated without jvp: its code is for NumPy arrays only; give a function jvp(x, t)",
+        "f cannot be differentiated without jvp: its code is for NumPy arrays only; give a function jvp(x, t), "
+        "or write f with autograd.numpy",
     ),
     (
         lambda: dp.check.hessian(lambda u: abs(u), 1.0, 1j),

@@ -252,6 +252,18 @@ def test_a_derivative_that_is_not_there(tmp_path, monkeypatch, capsys):
     assert "one derivative is checked at a time, got gradient and vjp" in capsys.readouterr().err
 
 
+def test_the_convention_of_complex_cotangents(tmp_path, monkeypatch, capsys):
+    text = (
+        "import numpy as np\n\nx = np.exp(1j * np.arange(4.0))\n\n\ndef square(z):\n    return z**2\n\n\n"
+        "def adjoint(z, g):\n    return np.conj(2 * z) * g\n"
+    )
+    (tmp_path / "waves.py").write_text(text, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    assert main(["check", "waves.py:square", "--vjp", "adjoint"]) == 1
+    assert "write convention='adjoint'" in capsys.readouterr().out
+    assert main(["check", "waves.py:square", "--vjp", "adjoint", "--convention", "adjoint"]) == 0
+
+
 def test_a_report_of_an_object(tmp_path, monkeypatch, capsys):
     (tmp_path / "some_model.py").write_text(FOREIGN, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
@@ -261,6 +273,14 @@ def test_a_report_of_an_object(tmp_path, monkeypatch, capsys):
         "write python -m sparsedp check for its derivative"
     )
     assert message in capsys.readouterr().err and not (tmp_path / "sparsedp-report").exists()
+    text = "import numpy as np\n\nx = np.ones(4)\n\n\ndef loss(u):\n    return np.sum(np.pad(u, 1)[2:] * u)\n"
+    (tmp_path / "plain.py").write_text(text, encoding="utf-8")
+    assert main(["report", "plain.py"]) == 2
+    message = (
+        "its code is for NumPy arrays only, and a report is on gradients by reverse mode; write it with "
+        "autograd.numpy, or write python -m sparsedp check with --gradient NAME"
+    )
+    assert f"plain cannot be audited: ValueError: {message}" in capsys.readouterr().err
 
 
 REFUSALS = [

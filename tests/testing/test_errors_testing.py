@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 
+from sparsedp.errors import DerivativeError
 from sparsedp.testing import assert_gradient, assert_transpose, fields, grids
 
 X = np.linspace(1.0, 2.0, 5)
@@ -41,6 +42,12 @@ MESSAGES = [
         lambda: assert_gradient(np.float64, X),
         TypeError,
         "check.vjp takes a function or an object, got the class float64; write float64(...), or one of its functions",
+    ),
+    (
+        lambda: assert_gradient(lambda u: np.sum(np.pad(u, 1)[2:] * u), X),
+        DerivativeError,
+        "f cannot be differentiated without gradient: its code is for NumPy arrays only; give a function gradient(x), "
+        "or write f with autograd.numpy",
     ),
     (
         lambda: assert_gradient(total),

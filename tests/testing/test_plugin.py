@@ -40,6 +40,9 @@ def test_fields(u):
 def test_arguments(assert_gradient):
     assert_gradient(loss, x, gradeint=x)
 
+def test_shape(assert_gradient):
+    assert_gradient(loss, x, gradient=x[:3])
+
 def test_user_error(assert_gradient):
     def broken(u, g):
         return g @ np.ones(3)
@@ -69,7 +72,7 @@ def run(folder, *options, **variables):
         check=False,
     )
     assert done.returncode == 1, done.stdout + done.stderr
-    assert "4 failed, 3 passed" in done.stdout
+    assert "5 failed, 3 passed" in done.stdout
     return done.stdout
 
 
@@ -79,11 +82,11 @@ def test_failures_are_short_by_default(project):
     assert "E       AssertionError: the gradient disagrees: " in printed
     assert "E         largest gap: x[2]: 3.375 by differences, 3.038 by the gradient" in printed
     assert "= gradients =" not in printed and "::error" not in printed
-    for name, most in (("wrong", 10), ("transpose", 12), ("arguments", 9), ("user_error", 25)):
+    for name, most in (("wrong", 10), ("transpose", 12), ("arguments", 9), ("shape", 9), ("user_error", 25)):
         shown = printed.partition(f"_ test_{name} _")[2].partition("\n___")[0].partition("\n===")[0]
         assert 3 < len(shown.splitlines()) <= most, shown  # neither tables of gaps nor frames of this library
     assert "Warning" not in printed
-    for file in ("assertions", "plugin", "choice", "derivatives", "calls", "programs"):
+    for file in ("assertions", "plugin", "choice", "derivatives", "calls", "programs", "flattening"):
         assert f"{file}.py:" not in printed
     assert "E       TypeError: no check of a derivative has the argument 'gradeint'; write 'gradient'" in printed
 
