@@ -326,7 +326,7 @@ TABLE = [
     (
         lambda: dp.stepper("radau", fast, 0.1)(np.ones(600)),
         SHAPE,
-        "stepper(radau) solves full systems of at most 500 unknowns, got 600; take tr_bdf2",
+        "stepper(radau) solves full systems of at most 500 unknowns, got 600; take rodas5p",
     ),
     (
         lambda: dp.stepper("radau", lambda u, p: u**2, 50.0)(np.ones(1)),

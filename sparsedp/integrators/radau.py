@@ -24,11 +24,7 @@ params and the time. Then
 
     K dz = h A (J_i du + P_i dp + q_i (dt + c_i dh)) + z/h dh,          K = 1 - h A J_i   (3 n unknowns),
 
-and the backward pass is the transpose of this map. As in adaptive.py, step lengths have a derivative dh = d with
-respect to the state, and two perturbed solutions estimate the error of the derivative. There are two differences. The
-first perturbed solution has the derivative of u + z_3 + EPSILON e. The sum of all d is subtracted in the last step
-only, by means of the derivative of this step; the rate at its end is not used, as it contains large errors of stiff
-components.
+and the backward pass is the transpose of this map. Step lengths and perturbed solutions are those of embedded.py.
 
 For derivatives of higher order the tape records each step separately. Its stages are the known values z*, improved by
 iterations of Newton's method with the constant matrix K*,
@@ -45,39 +41,31 @@ E. Hairer, G. Wanner, Solving Ordinary Differential Equations II (1996), IV.8.
 
 from __future__ import annotations
 
-from copy import copy
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp._utils.pytree import flatten, leaves
+from sparsedp._utils.pytree import leaves
 from sparsedp._utils.validation import check_shape
-from sparsedp.autodiff.backend import require_arrays
-from sparsedp.autodiff.tape import cast, dtype_of, is_variable, isbox, linear, plain, traces_of
-from sparsedp.autodiff.tape_constants import constant
-from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError, UnstableStepError
+from sparsedp.autodiff.tape import linear, plain, traces_of
+from sparsedp.errors import ConvergenceError
 from sparsedp.integrators.adaptive import (
     WEIGHT_REDUCTIONS,
-    WINDOW,
     AcceptedStep,
-    Adaptive,
     FlatDeviation,
-    length_shift,
-    relative_sizes,
     with_values,
 )
-from sparsedp.integrators.discontinuities import RateInspector
+from sparsedp.integrators.embedded import EVALUATION_ERRORS, Embedded, norm
 from sparsedp.integrators.jacobians import jacobians_of
-from sparsedp.integrators.problem import SidedParams, combine, like, untraced, without_side
-from sparsedp.integrators.runge_kutta import Scheme, as_matrix
+from sparsedp.integrators.problem import SidedParams, without_side
+from sparsedp.integrators.runge_kutta import as_matrix
 from sparsedp.solvers.direct import dense_lu
-from sparsedp.solvers.newton import Unknowns
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable
 
+    from sparsedp.integrators.discontinuities import RateInspector
     from sparsedp.integrators.events import Event
     from sparsedp.integrators.problem import Problem
     from sparsedp.solvers.choose_method import SolveSettings
@@ -105,63 +93,12 @@ NEWTON = 1e-3  # error of Newton's method in units of the tolerance; 0.03 made H
 ROUNDING = 1e-15  # smallest tolerance of the relative correction in Newton's method
 STALLED = 1e-11  # a relative correction below this that does not decrease any more is regarded as rounding
 ITERATIONS = 10  # largest number of iterations of Newton's method in a step with error control
-EVALUATION_ERRORS = UnstableStepError, NonFiniteError, ConvergenceError  # exceptions of a rate outside its domain
 BATCH_STEPS = 32  # largest number of steps whose derivatives are computed in one batch
 ENTRIES = 2**20  # largest number of entries of an array in such a batch
 FAST = 0.03  # keep the Jacobian for the next step if the ratio of successive corrections is below this
 
 
-class FlatProblem:
-    """A problem whose state is one flat array, and its derivatives.
-
-    Parameters
-    ----------
-    problem : Problem
-    u : tree
-        A state; only the shapes and dtypes of its leaves are used.
-    name : str
-        Name in error messages.
-    """
-
-    def __init__(self, problem: Problem, u: Any, name: str) -> None:
-        require_arrays(name, map(plain, leaves(u)))
-        self.problem = problem
-        self.timed = problem.timed
-        self.unknowns = Unknowns(u, name)
-        self.size = self.unknowns.size
-        if self.size > UNKNOWNS:
-            raise ShapeError(
-                f"{name} solves full systems of at most {UNKNOWNS} unknowns, got {self.size}; take tr_bdf2"
-            )
-        self.is_vector = self.unknowns.shapes == [(self.size,)]
-
-    def state(self, v: Any) -> Any:
-        """Convert a flat array to the tree of the user's state."""
-        if self.is_vector:
-            return v
-        return self.unknowns.split(v)
-
-    def flat(self, tree: Any) -> Any:
-        """Convert a tree like the state, traced or not, to a flat array of floats."""
-        return self.unknowns.space.join(*(cast(leaf, float) for leaf in leaves(tree)))
-
-    def __call__(self, v: Any, params: Any, t: Any) -> Any:
-        """Return the rate as a flat array."""
-        rate = self.problem(self.state(v), params, t)
-        if self.is_vector:
-            return rate
-        if any(map(isbox, leaves(rate))):
-            return self.flat(rate)
-        return self.unknowns.flat(rate)
-
-    def rows(self, points: Iterable[tuple], params: Any, moving: Sequence[bool]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rates at points (v, t), and their derivatives with respect to state, moving params and time."""
-        trees = [(self.state(v), params, t) for v, t in points]
-        is_differentiated = [*[True] * len(self.unknowns.shapes), *moving, True]
-        return jacobians_of(lambda tree: self.problem(*tree), trees, is_differentiated)
-
-
-class Radau(Adaptive):
+class Radau(Embedded):
     """Steps of Radau IIA, for states that are trees of real arrays with few entries, and their derivatives.
 
     Parameters
@@ -178,8 +115,6 @@ class Radau(Adaptive):
 
     Attributes
     ----------
-    params, moving : tree, list of bool
-        Plain params of an interval, and for each leaf whether it is traced. Each interval uses a copy of this object.
     v : flat array or None
         The state at the start of the step.
     f : flat array
@@ -196,14 +131,8 @@ class Radau(Adaptive):
         Whether the Jacobian was computed at the current state, and whether Newton's method was slow in the last step.
     """
 
-    window = 10 * WINDOW  # a jump with a small tolerance takes thousands of steps, which are cheap
-    # The embedded formula of order 3 overestimates errors of steps of order 5, by more in higher derivatives: second
-    # derivatives with errors of 1e-8 had estimates of up to twice the limit of first ones.
-    allowance = 10.0
-    follows_path = False
+    largest_size = UNKNOWNS
     quadrature = tuple(C), tuple(A[2])
-    params: Any
-    moving: Any
     v: Any = None
     J: Any = None
     factored_length: Any = None
@@ -220,9 +149,8 @@ class Radau(Adaptive):
         settings: SolveSettings,
         max_step: float | None = None,
     ) -> None:
-        super().__init__(Scheme(problem, "radau", 5), tolerance, floor, max_step)
+        super().__init__(problem, "radau", 5, EMBEDDED, tolerance, floor, max_step)
         self.user_jacobian = jacobian
-        self.taken = [1.0]
         if tolerance:
             self.newton_tolerance = NEWTON * tolerance
         else:
@@ -231,66 +159,6 @@ class Radau(Adaptive):
             self.max_iterations = ITERATIONS
         else:
             self.max_iterations = settings.maxiter or 50
-        self.compared = EMBEDDED
-        self.ratio = 1.0
-        self.weight = 1.0
-
-    def __call__(self, u: Any, params: Any, t: Any, h: Any) -> Any:
-        """Return the state after the interval h."""
-        run, arguments = self.interval(u, params, t, h)
-        if not run.problem.size:
-            return u
-        new = run._state_after(arguments, is_variable)
-        self.taken = run.taken
-        return run.rounded(new)
-
-    def interval(self, u: Any, params: Any, t: Any, h: Any) -> tuple[Radau, tuple]:
-        """Return a copy of this object for one time interval, and the arguments to call it with.
-
-        The arguments are the flat state, the traced params, the start time and the length of the interval.
-        """
-        run = copy(self)
-        run.problem = FlatProblem(self.problem, u, self.name)
-        run.params = constant(untraced(params))
-        run.moving = [isbox(leaf) for leaf in leaves(params)]
-        v = run.problem.flat(u)
-        if v.size:
-            run.check(u, params, t, h)
-        moving = [leaf for leaf in leaves(params) if isbox(leaf)]
-        return run, (v, moving, 0.0 if t is None else t + 0.0, h)
-
-    def replay(self, path: list[AcceptedStep], starts: Sequence[tuple], event: Event | None) -> list[tuple]:
-        """Return the ends of accepted steps: (state, time of the event or None) for each perturbed solution."""
-        runs, flat_starts = zip(*(self.interval(*start) for start in starts), strict=True)
-        run = runs[0]
-        arguments = untraced(flat_starts[0])
-        sizes = [*run.sizes(path[0].u), *map(relative_sizes, leaves(arguments[1:]))]
-        start = FlatDeviation(flat_starts[0], is_variable, sizes)
-        last = path[-1]
-        sizes = run.sizes(path[0].u, last.new)
-        if event:
-            time = arguments[2] + (last.done + last.length) * arguments[3]
-            end = FlatDeviation((last.new, time), is_variable, [*sizes, arguments[3]])
-        else:
-            end = FlatDeviation(last.new, is_variable, sizes)
-        entered = anp.array([start.deviation(one) for one in flat_starts])
-        deviations = run._deviations_at_end(path, arguments, start, end, entered, event)
-        ends = []
-        for number in range(len(starts)):
-            new = end.tree(deviations[number])
-            time = None
-            if event:
-                new, time = new
-            ends.append((run.rounded(new), time))
-        return ends
-
-    def tree(self, v: Any) -> Any:
-        """Convert the flat state of a step to the tree of the user's state."""
-        return self.problem.state(v)
-
-    def rounded(self, v: Any) -> Any:
-        """Convert the flat state at the end of an interval to a tree with the dtypes of the user's state."""
-        return self.problem.unknowns.rounded(v)
 
     def partial_step(self, step: AcceptedStep, arguments: tuple, length: float) -> AcceptedStep | None:
         """Repeat a step with another length, with stages converged to rounding; return None if the trial fails."""
@@ -303,28 +171,6 @@ class Radau(Adaptive):
         finally:
             self.newton_tolerance = newton_tolerance
             self.max_iterations = max_iterations
-
-    def check(self, *arguments: Any) -> None:
-        """Raise an error for a state, a rate, or derivatives that the method does not support."""
-        u, _, t, h = untraced(arguments)
-        rate = self.problem.problem(u, self.params, t)
-        require_arrays(self.name, leaves(rate))
-        like(combine(u, (0.0, rate)), u)  # raise an error for a wrong shape or a complex rate
-        if any(map(isbox, leaves(rate))):
-            raise DerivativeError(
-                f"the rate of {self.name} uses a traced value that is not an argument; put it into params"
-            )
-        if any(dtype_of(leaf).kind == "c" for leaf in leaves(arguments) if isbox(leaf)):
-            raise DerivativeError(f"{self.name} has derivatives in real params; give real and imaginary part as two")
-        if self.tolerance is not None:
-            self.check_tolerance(u)
-
-    def inspector(self, arguments: tuple) -> RateInspector | None:
-        """Return an object that detects jumps of the rate; None without error control or if the rate cannot jump."""
-        problem = self.problem.problem
-        if self.tolerance is None or (problem.rate is None and not problem.source_takes_time):
-            return None
-        return RateInspector(self, self.params, *arguments[2:])
 
     def inner_state(self, step: AcceptedStep) -> tuple[Any, float]:
         """Return the state at the second stage, and its position as a fraction of the step."""
@@ -365,15 +211,6 @@ class Radau(Adaptive):
                     pass  # the step is too long
             ratio = norm(error / units)
         return z, v + z[2], ratio if np.isfinite(ratio) else np.inf
-
-    def sizes(self, *states: Any) -> list:
-        """Return |u| + floor, the unit of errors, as a flat array; |u| is the largest of several states."""
-        return [np.concatenate([*map(np.ravel, super().sizes(*map(self.problem.state, states)))])]
-
-    def units(self, v: Any, w: Any) -> np.ndarray:
-        """Return |v| + floor, the unit of errors, with the larger of two states; 1 in place of 0."""
-        (size,) = self.sizes(v, w)
-        return np.where(size > 0, size, 1.0)
 
     # ------------------------------------------------------------ Newton's method
 
@@ -460,12 +297,6 @@ class Radau(Adaptive):
         return z
 
     # ------------------------------------------------------------ the derivative of the accepted steps
-
-    def perturbed_solutions(self, count: int, arguments: tuple) -> tuple[Callable, Callable]:
-        """Return the functions `perturb` and `evaluate`; without error control there are no perturbed solutions."""
-        if self.tolerance:
-            return super().perturbed_solutions(count, arguments)
-        return (lambda x: x[None]), (lambda x: x[0])
 
     def _deviations_at_end(
         self,
@@ -624,54 +455,9 @@ class Radau(Adaptive):
 
     # ------------------------------------------------------------ derivatives of higher order
 
-    def _recorded_deviations(
-        self,
-        path: list,
-        arguments: tuple,
-        start: FlatDeviation,
-        end: FlatDeviation,
-        entered: Any,
-        event: Event | None,
-    ) -> Any:
-        """Return what `_deviations_at_end` returns, with a record of each step, for derivatives of every order."""
-        *_, t, h = arguments
-        records = [_RecordedStep(self, step, t, h) for step in path]
-        ends = []
-        for less, deviation in zip(WEIGHT_REDUCTIONS, entered, strict=False):  # one solution without error control
-            v, moving, *times = start.tree(deviation)
-            new, time = self._recorded_end(records, less, event, v, self.with_moving(moving), *times)
-            ends.append(end.deviation((new, time) if event else new))
-        return anp.array(ends)
-
-    def with_moving(self, moving: Sequence) -> Any:
-        """Return the params with these leaves in place of the moving ones."""
-        entries, rebuild = flatten(self.params)
-        replacements = iter(moving)
-        is_moving = [*self.moving, *[False] * (len(entries) - len(self.moving))]
-        return rebuild([next(replacements) if moves else leaf for leaf, moves in zip(entries, is_moving, strict=True)])
-
-    def _recorded_end(
-        self, records: list[_RecordedStep], less: float, event: Event | None, v: Any, params: Any, t: Any, h: Any
-    ) -> tuple[Any, Any]:
-        """Record the accepted steps; return the last state and the time of the event or None.
-
-        `less` is the weight of the error in the derivative of each new state.
-        """
-        shift: Any = 0.0  # the sum of all d
-        for record in records:
-            length = record.step.length * h
-            start = t + record.step.done * h + shift
-            if record is not records[-1]:
-                change = length_shift(v, [record.section])
-                v = record.state_after(less, v, params, start, length + change)
-                shift = shift + change
-            elif event:
-                advance = partial(record.state_after, less)
-                half = 0.5 * plain(length)
-                return self._state_at_event(event, record.step, less, v, params, start, half, advance)
-            else:
-                v = record.state_after(less, v, params, start, length - shift)
-        return v, None
+    def record(self, step: AcceptedStep, t: float, h: float) -> _RecordedStep:
+        """Return the record of an accepted step: see `Embedded`."""
+        return _RecordedStep(self, step, t, h)
 
 
 class _RecordedStep:
@@ -731,8 +517,3 @@ def _constant_solve(name: str, matrix: np.ndarray) -> Callable:
 def solved(matrices: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Solve a linear system with several right-hand sides for each matrix."""
     return np.array([dense_lu(matrix)[0](part, False) for matrix, part in zip(matrices, b, strict=True)])
-
-
-def norm(x: np.ndarray) -> float:
-    """Return the root mean square of a vector; for an array of stages, the root of the sum of their mean squares."""
-    return float(np.sqrt(np.vdot(x, x) / x.shape[-1]))

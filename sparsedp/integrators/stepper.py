@@ -46,14 +46,15 @@ if TYPE_CHECKING:
 
 __all__ = ["METHODS", "Step", "stepper"]
 
-# The arguments that each method does not use. Only the methods of IMPLICIT take further options.
+# The arguments that each method does not use. Only the methods of WITH_OPTIONS take further options.
 UNUSED = {
     **dict.fromkeys(EXPLICIT, ("jacobian", "damping")),
-    **dict.fromkeys((*IMPLICIT, "radau"), ("damping",)),
+    **dict.fromkeys((*IMPLICIT, "radau", "rodas5p"), ("damping",)),
     "etdrk4": ("jacobian", "damping"),
     "leapfrog": ("linear", "source", "timed", "tolerance", "max_step", "breaks", "events", "jacobian"),
 }
 METHODS = tuple(UNUSED)
+WITH_OPTIONS = (*IMPLICIT, "rodas5p")  # methods that take options of `inverse` or `implicit`
 KEPT = 2  # number of cached set-ups of linear solves, one for each step length
 KEPT_WITH_TOLERANCE = 12  # the same with error control, where step lengths vary
 ROUNDING = 1e-12  # relative tolerance of the stability limit, so that a dt equal to it is accepted despite rounding
@@ -93,6 +94,7 @@ def stepper(
         tr_bdf2                 2     L-stable, two stages that share one factorisation
         imex                    2     `linear` and source implicit (L-stable), the rate explicit
         radau                   5     L-stable, dense LU: for stiff systems of up to 500 unknowns, best with a tolerance
+        rodas5p                 5     L-stable, sparse LU: for stiff systems of many unknowns, as reactions on grids
         etdrk4                  4     `linear` exact by transforms (separable operators), the rate explicit
         leapfrog                2     waves: two staggered fields, the rate of each depends on the other; reversible
         ======================= ===== ==============================================================
@@ -157,7 +159,8 @@ def stepper(
     jacobian : callable, optional
         ``jacobian(u, params)`` or ``jacobian(u, params, t)``: the derivative of the rate with respect to u, for
         implicit steps of a nonlinear rate. By default it is computed by automatic differentiation, with a colouring of
-        its sparsity pattern. radau computes it from one tape by default, and uses it only in Newton's method.
+        its sparsity pattern. radau computes it from one tape by default, and uses it only in Newton's method. That of
+        rodas5p must be exact: its order depends on it.
     damping : pair, optional
         For leapfrog: the decay rates [1 / time] of the two fields, for example the pair that `sponge` returns. Default:
         no damping.
@@ -204,11 +207,11 @@ def stepper(
     max_step, breaks, events            None         all but leapfrog; they need a tolerance
     floor                               None         all; it has an effect with a tolerance
     unstable                            "raise"      all; it has an effect on euler, heun, ssprk3, rk4, leapfrog
-    jacobian                            None         backward_euler, crank_nicolson, tr_bdf2, radau; no effect on imex
+    jacobian                            None         the implicit methods, radau, rodas5p; no effect on imex
     damping                             None         leapfrog
     solver                              "auto"       all; radau accepts only "auto" and "direct"
     rtol, maxiter                       1e-10, None  all; they have an effect on solves
-    options of `inverse` or `implicit`  none         backward_euler, crank_nicolson, tr_bdf2, imex
+    options of `inverse` or `implicit`  none         backward_euler, crank_nicolson, tr_bdf2, imex, rodas5p
     ==================================  ===========  ================================================================
 
     Derivatives are those of the discrete step. A linear stage solves (1 - z L) x = b with z = c dt. Its cotangents are
@@ -221,16 +224,18 @@ def stepper(
     more times in an interval at most; steps across a jump or a pulse are shortened. The derivative is that of these
     steps. The contribution of the extrapolation to it, relative to the params and to its largest entry, must be less
     than 6 tolerance^(p / (p + 1)) with the order p (crank_nicolson: less than 10 tolerance); otherwise a
-    DerivativeError is raised. This may also happen for a derivative that is small because terms cancel. radau uses an
-    embedded formula instead of the extrapolation (p = 3 in the bound). For each order above the first its bound is ten
-    times larger.
+    DerivativeError is raised. This may also happen for a derivative that is small because terms cancel. radau and
+    rodas5p use an embedded formula instead of the extrapolation (p = 3 and p = 4 in the bound). For each order above
+    the first their bound is ten times larger.
 
     Cost: n linear steps and their gradient take one set-up and 2 n solves (tr_bdf2: 4 n). With a tolerance a gradient
     takes about six times the steps of its value, and three times the time of a gradient without the error estimate.
     radau evaluates three Jacobians for the derivative of a step, batches them over many steps, and records one rule on
     the tape for an interval; a gradient takes 1.5 to 3.2 times as long as the value, and 3 to 5 times if the rate is
     vectorized. For derivatives of higher order radau records each step: a Hessian product of two parameters takes 50
-    times as long as a gradient.
+    times as long as a gradient. A step of rodas5p takes one Jacobian, one factorisation and eight solves; the gradient
+    takes one Jacobian and one factorisation more for each step, and 24 transposed solves. On grids with 1e4 unknowns it
+    takes 2 to 5 times as long as the value, for a few unknowns ten times (take radau there).
 
     Breaks and events: du/db = f_- - f_+ just after a break b, where f_- and f_+ are the rates before and after it. The
     derivative of the time of an event g = 0 follows from the implicit function theorem,
@@ -242,8 +247,8 @@ def stepper(
     of events in the last interval as constants. To differentiate the time of an event, use the time that a terminal
     event returns, or write the time into the state by a jump.
 
-    Ranks: all methods except radau and etdrk4 accept distributed fields (see `distribute`). Nonlinear implicit steps
-    then have the limits of `implicit`, for example no `sparsity`.
+    Ranks: all methods except radau, rodas5p and etdrk4 accept distributed fields (see `distribute`). Nonlinear implicit
+    steps then have the limits of `implicit`, for example no `sparsity`.
 
     References
     ----------
@@ -277,7 +282,7 @@ def stepper(
     check_choice("method", method, METHODS, "; write stepper('rk4', rate, dt)" if callable(method) else "")
     check_choice("unstable", unstable, ("raise", "allow"))
     for word in options:
-        if method not in IMPLICIT:
+        if method not in WITH_OPTIONS:
             near = advice_near(word, [name for name in arguments if name not in ("options", *UNUSED[method])])
             raise TypeError(f"{method} does not use {word}{near or '; leave it out'}")
     settings = _solver_settings(solver, rtol, maxiter, arguments["options"])
@@ -352,6 +357,11 @@ def _scheme(method: str, arguments: dict, settings: SolveSettings) -> Any:
 
         radau = Radau(problem, arguments["jacobian"], tolerance, floor, settings, max_step)
         return _with_interruptions(radau, arguments)
+    if method == "rodas5p":
+        from sparsedp.integrators.rosenbrock import Rosenbrock
+
+        rosenbrock = Rosenbrock(problem, arguments["jacobian"], tolerance, floor, settings, max_step)
+        return _with_interruptions(rosenbrock, arguments)
     scheme = _fixed_scheme(method, problem, arguments["jacobian"], settings, tolerance is not None)
     if tolerance is None:
         return scheme
@@ -433,7 +443,9 @@ class Step(Reconstructible):
         self.info = scheme.info
         self._is_recorded = False  # whether the last call was recorded by dp.jit
         # Whether values decide about the computation, as in error control and Newton's method.
-        self.decides = arguments["tolerance"] is not None or method == "radau" or isinstance(scheme, Nonlinear)
+        self.decides = (
+            arguments["tolerance"] is not None or method in ("radau", "rodas5p") or isinstance(scheme, Nonlinear)
+        )
         self.is_interrupted = arguments["breaks"] is not None or arguments["events"] is not None
         self.constructor_call = _reconstruct_step, (arguments,)
 

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from sparsedp.solvers.choose_method import SolveSettings
     from sparsedp.solvers.jacobian import Linearisation
 
-__all__ = ["Root", "implicit", "steady"]
+__all__ = ["Root", "implicit", "negative_gradient", "product_with", "steady"]
 
 CHANGED_ROOT = 1e-4  # relative change of a root by one more Newton step that shows that its residual has changed
 CHANGED_ROOT_TOLERANCES = 1e4  # the same in units of the tolerance
@@ -413,7 +413,7 @@ class Root(Reconstructible):
 
     def _linear_solve(self, transposed):
         """Return the Rule of (b, equation, x, *leaves) for s with J s = b or J^T s = b."""
-        return solve_rule(self.name, self._solve, _negative_gradient, _product, transposed)
+        return solve_rule(self.name, self._solve, negative_gradient, product_with, transposed)
 
     def _solve(self, transposed, checked, b, equation, x, *leaves):
         linearisation = self.jacobians_of(equation).cached(equation, x, leaves)
@@ -434,17 +434,17 @@ class Root(Reconstructible):
         return "\n".join([repr(self), *map(str, used or [self._default_jacobians])])
 
 
-def _negative_gradient(point, places, y, s):
+def negative_gradient(point: Sequence[Any], places: Sequence[int], y: Any, s: Any) -> Any:
     """Return -grad <y, J s> = -grad <s, J^T y> in the arguments of J at these places."""
 
     def product(*point):
-        return _product(True, y, *point)
+        return product_with(True, y, *point)
 
     varied, chosen = vary(product, point, places)
     return pullback(varied, chosen)[1](-s)
 
 
-def _product(transposed, s, equation, x, *leaves):
+def product_with(transposed: bool, s: Any, equation: Equation, x: Any, *leaves: Any) -> Any:
     """Return J s or J^T s."""
     if transposed:
         return equation.transposed(x, leaves)(s)

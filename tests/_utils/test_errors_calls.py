@@ -186,8 +186,8 @@ TABLE = [
     (
         lambda: dp.stepper(square, 0.1),
         ValueError,
-        "method must be one of euler, heun, ssprk3, rk4, backward_euler, crank_nicolson, tr_bdf2, imex, radau, etdrk4, "
-        f"leapfrog, got {square!r}; write stepper('rk4', rate, dt)",
+        "method must be one of euler, heun, ssprk3, rk4, backward_euler, crank_nicolson, tr_bdf2, imex, radau, "
+        f"rodas5p, etdrk4, leapfrog, got {square!r}; write stepper('rk4', rate, dt)",
     ),
 ]
 

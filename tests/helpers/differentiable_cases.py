@@ -164,6 +164,7 @@ STEPPERS = {
     "crank_nicolson": {},
     "tr_bdf2": {},
     "radau": {},
+    "rodas5p": {},
     "imex": {"linear": dp.laplacian(LINE)},
     "etdrk4": {"linear": dp.laplacian(LINE)},
 }

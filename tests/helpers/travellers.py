@@ -193,6 +193,7 @@ STEPS = {
     "crank_nicolson": dict(rate=burgers),
     "tr_bdf2": dict(linear=(dp.laplacian(LINE, dp.dirichlet), half), source=heating),
     "radau": dict(rate=forced),
+    "rodas5p": dict(rate=forced),
     "imex": dict(linear=(dp.laplacian(LINE), 0.1), rate=burgers),
     "etdrk4": dict(linear=dp.laplacian(LINE), rate=burgers),
 }

@@ -25,7 +25,13 @@ TABLE = [
         lambda: dp.stepper("rk5", decay, 0.1),
         VALUE,
         "method must be one of euler, heun, ssprk3, rk4, backward_euler, crank_nicolson, tr_bdf2, imex, "
-        "radau, etdrk4, leapfrog, got 'rk5'; write 'rk4'",
+        "radau, rodas5p, etdrk4, leapfrog, got 'rk5'; write 'rk4'",
+    ),
+    (
+        lambda: dp.stepper("rodas5p", lambda u, p: u / 0.21193756319429014, 1.0)(np.ones(2)),
+        dp.errors.ConvergenceError,
+        "stepper(rodas5p): the matrix of a step is singular, as the Jacobian of the rate has the eigenvalue "
+        "1 / (0.212 dt); take a smaller dt, or give stepper a tolerance",
     ),
     (lambda: dp.stepper("euler", L, 0.1, unstable="warn"), VALUE, "unstable must be one of raise, allow, got 'warn'"),
     (

@@ -27,6 +27,7 @@ def first(step, start=0.0):
         pytest.param("heun", 1e-3, 1e-3, marks=pytest.mark.whole),
         ("rk4", 1e-6, 1e-5),
         ("radau", 1e-6, 1e-6),
+        pytest.param("rodas5p", 1e-6, 1e-5, marks=pytest.mark.whole),
         pytest.param("ssprk3", 1e-5, 1e-5, marks=pytest.mark.whole),
         pytest.param("tr_bdf2", 1e-4, 1e-4, marks=pytest.mark.whole),
         pytest.param("euler", 1e-3, 2e-3, marks=pytest.mark.whole),

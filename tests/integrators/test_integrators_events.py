@@ -82,6 +82,7 @@ def landing_time(drag, speed=30.0):
     [
         ("heun", 1e-1),
         ("radau", 1e-6),
+        pytest.param("rodas5p", 1e-6, marks=pytest.mark.whole),
         *(pytest.param(m, 1e-3, marks=pytest.mark.whole) for m in ("rk4", "ssprk3", "tr_bdf2", "crank_nicolson")),
     ],
 )
@@ -108,6 +109,7 @@ def test_a_bouncing_ball_bends():
     [
         ("rk4", 1e-6, 1e-5),
         ("radau", 1e-6, 1e-6),
+        pytest.param("rodas5p", 1e-6, 1e-5, marks=pytest.mark.whole),
         pytest.param("heun", 1e-5, 1e-4, marks=pytest.mark.whole),
         pytest.param("tr_bdf2", 1e-5, 1e-4, marks=pytest.mark.whole),
     ],
@@ -143,6 +145,7 @@ def switching(u, p, t):
     [
         ("rk4", 1e-6, 1e-5),
         ("radau", 1e-6, 1e-6),
+        pytest.param("rodas5p", 1e-6, 1e-5, marks=pytest.mark.whole),
         pytest.param("heun", 1e-3, 1e-3, marks=pytest.mark.whole),
         pytest.param("tr_bdf2", 1e-4, 1e-4, marks=pytest.mark.whole),
     ],

@@ -20,7 +20,19 @@ U, V, W = np.random.default_rng(3).standard_normal((3, 4, 3))
 STATE = {"u": U, "v": V, "w": W}
 PARAMS = {"D": 0.3, "F": 0.7, "dt": 0.02}
 LINEAR = {"w": None, "v": (-1e-3 * M @ M, lambda p: 0.5 * p["D"]), "u": (L, lambda p: p["D"])}  # in another order
-METHODS = ["euler", "heun", "ssprk3", "rk4", "backward_euler", "crank_nicolson", "tr_bdf2", "radau", "imex", "etdrk4"]
+METHODS = [
+    "euler",
+    "heun",
+    "ssprk3",
+    "rk4",
+    "backward_euler",
+    "crank_nicolson",
+    "tr_bdf2",
+    "radau",
+    "rodas5p",
+    "imex",
+    "etdrk4",
+]
 
 
 def react(x, p):

@@ -11,8 +11,9 @@ import sparsedp as dp
 from sparsedp.autodiff.derivative import pushforward, value_and_grad
 from sparsedp.errors import ConvergenceError, DerivativeError, NonFiniteError, ShapeError
 from sparsedp.integrators import jacobians
+from sparsedp.integrators.embedded import FlatProblem
 from sparsedp.integrators.problem import untraced
-from sparsedp.integrators.radau import A, C, FlatProblem, Radau
+from sparsedp.integrators.radau import A, C, Radau
 
 RATES = np.array([0.04, 1e4, 3e7])
 SMALL = {"Robertson": np.array([1e-6, 1e-11, 1e-2])}
@@ -387,7 +388,7 @@ REFUSED = [
     (
         lambda: dp.stepper("radau", DECAY, 1.0)(np.ones(501), 1.0),
         ShapeError,
-        "stepper(radau) solves full systems of at most 500 unknowns, got 501; take tr_bdf2",
+        "stepper(radau) solves full systems of at most 500 unknowns, got 501; take rodas5p",
     ),
     (
         lambda: dp.stepper("radau", DECAY, 1.0)(ONES + 1j, 1.0),

@@ -119,7 +119,19 @@ def test_derivatives_of_functions():
 
 # ---- linear steps, against the dense matrix, in loops --------------------------------------------------------------
 
-METHODS = ["euler", "heun", "ssprk3", "rk4", "backward_euler", "crank_nicolson", "tr_bdf2", "radau", "imex", "etdrk4"]
+METHODS = [
+    "euler",
+    "heun",
+    "ssprk3",
+    "rk4",
+    "backward_euler",
+    "crank_nicolson",
+    "tr_bdf2",
+    "radau",
+    "rodas5p",
+    "imex",
+    "etdrk4",
+]
 
 
 @pytest.mark.parametrize("method", METHODS)
