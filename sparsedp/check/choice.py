@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from sparsedp._utils.calls import advice_near
-from sparsedp._utils.pytree import copied
+from sparsedp._utils.pytree import copied, leaves
+from sparsedp.check.derivatives import gradient_as_vjp
 from sparsedp.check.derivatives import hessian as check_hessian
 from sparsedp.check.derivatives import jacobian as check_jacobian
 from sparsedp.check.derivatives import jvp as check_jvp
@@ -80,6 +81,8 @@ def check_derivative(
             return check_gradient(f, x, gradient, quick=quick, **options)
     if not quick:
         options = {"directions": DIRECTIONS, **options}
+    if given == {"gradient"}:
+        return gradient_as_vjp(f, gradient, x, **options)
     if kind == "hessian":
         return check_hessian(f, hessian, x, gradient=gradient, **options)
     if kind == "jacobian":
@@ -98,7 +101,7 @@ def _kind(f: Any, x: Any, given: set[str], options: dict[str, Any]) -> str:
     kind = next((kind for kind in ("hessian", "jacobian") if kind in given), "vjp")
     if given == {"jvp"}:
         kind = "jvp"
-    elif given == {"gradient"} or (not given and _is_loss(f, x)):
+    elif (given == {"gradient"} and library_of(f, *leaves(x)).name == "numpy") or (not given and _is_loss(f, x)):
         kind = "gradient"
     for name in options:
         if name not in ARGUMENTS[kind] or name in POSITIONAL:
@@ -111,7 +114,9 @@ def _is_loss(f: Any, x: Any) -> bool:
     """Return whether f is a function with a real scalar result that is not written with torch or JAX."""
     if x is None or isinstance(f, (Operator, type)) or not callable(f) or hasattr(f, "matvec"):
         return False
-    if library_of(f, x).name != "numpy":
+    if library_of(f, *leaves(x)).name != "numpy" or any(hasattr(f, word) for word in ("vjp", "jvp")):
         return False
     value = f(copied(x))  # f may change its argument in place
-    return library_of(value).name == "numpy" and np.shape(value) == () and np.isrealobj(value)
+    if library_of(value).name != "numpy" or isinstance(value, dict) or np.shape(value) != ():
+        return False
+    return np.asarray(value).dtype.kind in "biuf"

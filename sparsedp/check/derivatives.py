@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sparsedp._utils.pytree import copied, leaves
+from sparsedp._utils.pytree import copied, leaves, mapped
 from sparsedp._utils.validation import check_choice, check_function, check_number, check_whole
 from sparsedp.autodiff.backend import require_arrays
 from sparsedp.check.chain import Chain
@@ -26,7 +26,7 @@ from sparsedp.grid.grid import Grid
 from sparsedp.grid.space import Space
 from sparsedp.operators.operator import Operator
 
-__all__ = ["DerivativeCheck", "hessian", "jacobian", "jvp", "transposed_products", "vjp"]
+__all__ = ["DerivativeCheck", "gradient_as_vjp", "hessian", "jacobian", "jvp", "transposed_products", "vjp"]
 
 DERIVATIVES = ("vjp", "jvp")
 EXAMPLES = {"vjp": "lambda x, g: ...", "jvp": "lambda x, t: ..."}
@@ -62,7 +62,7 @@ def vjp(
     x : array, or tree of arrays
         The point. For an operator it may be omitted.
     jvp : callable, optional
-        ``jvp(x, t)``. If it is given, it is compared with the VJP by <g, J t> = <J^T g, t>.
+        ``jvp(x, t)``. If it is given, or is a method of `f`, it is compared with the VJP by <g, J t> = <J^T g, t>.
     directions : int
         Number of random directions at `x`.
     steps : sequence of float, optional
@@ -156,7 +156,7 @@ def jvp(
     x : array, or tree of arrays
         The point. For an operator it may be omitted.
     vjp : callable, optional
-        ``vjp(x, g)``. If it is given, it is compared with the JVP by <g, J t> = <J^T g, t>.
+        ``vjp(x, g)``. If it is given, or is a method of `f`, it is compared with the JVP by <g, J t> = <J^T g, t>.
     directions, steps, rng, grid, noise, convention, beside
         As for `check.vjp`.
     stages : sequence, optional
@@ -267,6 +267,17 @@ def jacobian(
     program = Program(subject.function, subject.x, pull, push, "transpose")
     program.takes_arrays = True
     return _audited(DerivativeAudit(program, options, "vjp", True, "the Jacobian"), "jacobian")
+
+
+def gradient_as_vjp(f: Any, gradient: Any, x: Any, **options: Any) -> DerivativeCheck:
+    """Check the gradient of a loss of another library as its VJP, g * gradient(x)."""
+
+    def pull(x: Any, g: Any) -> Any:
+        slopes = gradient(x) if callable(gradient) else gradient
+        return mapped(lambda slope: g * slope, slopes)
+
+    options = {"beside": callable(gradient), **options}
+    return _changed(vjp(f, pull, x, **options), kind="gradient")
 
 
 def transposed_products(op: Operator) -> DerivativeCheck:
@@ -443,7 +454,8 @@ def _checked(
     program = Program(
         subject.function, subject.x, chosen.get("vjp"), chosen.get("jvp"), convention or subject.convention
     )
-    return _audited(DerivativeAudit(program, options, kind, len(given) == len(DERIVATIVES)), kind)
+    both = all(word in chosen for word in DERIVATIVES)
+    return _audited(DerivativeAudit(program, options, kind, both), kind)
 
 
 def _audited(audit: DerivativeAudit, title: str) -> DerivativeCheck:
@@ -531,12 +543,13 @@ def _subject(name: str, f: Any, x: Any, rng: np.random.Generator) -> Subject:
     if hasattr(f, "matvec") and hasattr(f, "shape"):
         return _linear_operator(f, x, rng)
     methods = {}
-    if _is_simulator(f):
+    is_module = library_of(f).name == "torch" and hasattr(f, "named_parameters")
+    if _is_simulator(f) and not is_module:  # a module of torch has a method `apply` for another purpose
         methods = {word: _method(f, word) for word in DERIVATIVES if hasattr(f, word)}
         f = getattr(f, "apply", f)
     check_function(name, f, f"dp.{name}(f, x=x) with a function or an object with apply and vjp")
     _require_point(name, x)
-    if library_of(f).name == "torch" and hasattr(f, "named_parameters"):
+    if is_module:
         f, x = library_of(f).with_parameters(f, x)
     return Subject(f, x, methods)
 

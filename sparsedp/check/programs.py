@@ -218,6 +218,8 @@ class Program:
             return self._run(self.point.fresh())
         except TypeError as error:
             advise(error)
+            if isinstance(self.point.template, tuple) and "positional argument" in str(error):
+                error.args = (f"{error}; write lambda x: f(*x), because f(x) is called with the whole tuple",)
             raise
         except RuntimeError as error:
             if self.library.name != "torch" or "dtype" not in str(error):

@@ -136,6 +136,12 @@ MESSAGES = [
         "or write f with autograd.numpy",
     ),
     (
+        lambda: VJP(cube_vjp, cube_vjp, (X, X)),
+        TypeError,
+        "cube_vjp() missing 1 required positional argument: 'g'; write lambda x: f(*x), because f(x) is called with "
+        "the whole tuple",
+    ),
+    (
         lambda: dp.check.hessian(lambda u: abs(u), 1.0, 1j),
         TypeError,
         "check.hessian takes real x, got complex numbers; split them into real and imaginary parts",

@@ -37,6 +37,55 @@ def test_right_derivatives_pass(name):
     assert assert_gradient(f, X, **derivatives)
 
 
+class Outer:
+    """An object that is called, with a tree as its result."""
+
+    def __call__(self, p):
+        return {"y": p["A"] @ p["b"]}
+
+    def vjp(self, p, g):
+        return {"A": np.outer(g["y"], p["b"]), "b": p["A"].T @ g["y"]}
+
+
+class Cumulative:
+    """An object whose VJP is right, and whose JVP is wrong."""
+
+    def apply(self, u):
+        return np.cumsum(u**2)
+
+    def vjp(self, u, g):
+        return 2 * u * np.cumsum(g[::-1])[::-1]
+
+    def jvp(self, u, t):
+        return np.cumsum(2.2 * u * t)
+
+
+def test_objects():
+    assert assert_gradient(Outer(), {"A": np.eye(3) + 0.1, "b": np.arange(3.0)})
+    with pytest.raises(AssertionError, match="^the vjp disagrees: vjp is not the transpose of jvp: "):
+        assert_gradient(Cumulative(), X)
+
+
+@pytest.mark.whole
+def test_losses_and_modules_of_torch():
+    torch = pytest.importorskip("torch")
+    x = torch.tensor(X)
+
+    class Net(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.layer = torch.nn.Linear(5, 2).double()
+
+        def forward(self, u):
+            return torch.tanh(self.layer(u))
+
+    assert assert_gradient(Net(), x)
+    assert assert_gradient(lambda u: torch.sum(u**3), x, gradient=lambda u: 3 * u**2)
+    assert assert_gradient(lambda u: torch.sum(u**3), x, gradient=3 * x**2)
+    with pytest.raises(AssertionError, match="^the gradient disagrees: "):
+        assert_gradient(lambda u: torch.sum(u**3), x, gradient=lambda u: 3.01 * u**2)
+
+
 WRONG = {
     "gradient": (cube, {"gradient": lambda u: 3.01 * u**2}),
     "vjp": (np.exp, {"vjp": lambda u, g: u * g}),
