@@ -106,7 +106,7 @@ def _gaps_in_result(audit: Any, group: Any, worst: DirectionEvidence) -> list[En
         return []
     point = group.evaluations.point
     direction = worst.line.direction
-    step = worst.step if worst.step > 0 else STEP
+    step = worst.difference_step if worst.step > 0 else STEP
     ends = [audit.program.value(point.unpack(point.vector + side * direction)) for side in (step, -step)]
     change = (ends[0] - ends[1]) / (2 * step)
     product = None

@@ -154,6 +154,17 @@ class DirectionEvidence:
         """Error bar as a share of the derivative."""
         return self.bar / self.scale
 
+    @property
+    def difference_step(self) -> float:
+        """The step whose central difference is closest to the best estimate; NaN if there is no estimate.
+
+        The estimate may be an extrapolation from coarser steps.
+        """
+        if not self.step > 0:
+            return nan
+        errors = np.abs(self.gaps - self.gap) + self.noise / self.steps
+        return float(self.steps[np.argmin(errors)])
+
     def result(self) -> DirectionResult:
         """Return the public result."""
         return DirectionResult(

@@ -40,7 +40,9 @@ REMAINDER_SHARE = 0.01  # the search stops when the other entries together have 
 SLAB_PARTS = 4  # a region is divided into this number of parts, each of which must have a gap
 NOISE_RATIO = 3.0  # a gap that was measured along a direction exceeds the noise by this factor
 FACTOR_DIRECTIONS = 3  # a common factor of all entries is measured along this number of directions
-FACTOR_SHARE = 0.02  # it may differ between them by this share of its distance from 1
+FACTOR_SHARE = 0.02  # it may differ between them by this share of its distances from 0 and 1
+ZERO_SHARE = 1e-12  # a derivative below this share of another one counts as 0: terms that cancel leave rounding errors
+SMALL_NOISE_SHARE = 1e-3  # a noise below this share of a gap does not matter
 EVERY_ENTRY = "every entry of "  # begins a sentence about a leaf
 DEFAULT_STEP = 2.0**-11  # used if the sweep found no plateau
 CLEAR_OF_NOISE = 4.0  # a gap has to be this many times the noise of its measurement
@@ -77,7 +79,9 @@ class EntryGap(NamedTuple):
 
     @property
     def sort_key(self) -> float:
-        """Sort key: the largest gap comes first, and unknown gaps (NaN) come last."""
+        """Sort key: leaves and regions first, then the largest gap; blocks with unknown gaps (NaN) come last."""
+        if isnan(self.gap) and self.region is not None:
+            return -inf
         if isnan(self.gap):
             return inf
         return -abs(self.gap)
@@ -195,23 +199,32 @@ class _Search:
         entries = np.flatnonzero(weights[leaf])
         if entries.size < 2:
             return nan
-        shares = []
+        factors: list[float] = []
         for number in range(FACTOR_DIRECTIONS):
             gap = self.gap_along(weights)
             slope = self.slope_along(weights)
-            if slope == 0 and abs(gap) > self.noise:
-                shares.append(0.0)
-            elif abs(gap) > FACTOR_SHARE * abs(slope) + self.noise or slope:
-                shares.append(slope / (slope + gap) if slope + gap else inf)
-            else:
-                return nan
-            if not _is_same_error(shares[0], shares[-1]):
+            factors.append(self._ratio(slope, slope + gap))
+            if not all(_is_same_error(factors[0], factor) for factor in factors):  # NaN is not equal to itself
                 return nan
             if number + 1 < FACTOR_DIRECTIONS:
                 signs = self.rng.choice([-1.0, 1.0], entries.size) * self.rng.uniform(0.2, 1.8, entries.size)
                 weights = [weight.copy() for weight in weights]
                 weights[leaf].reshape(-1)[entries] = signs
-        return float(np.median(shares))
+        return float(np.median(factors))
+
+    def _ratio(self, slope: float, difference: float) -> float:
+        """Return the derivative under test divided by that by differences.
+
+        It is 0 or infinite if one of them is 0 up to rounding or noise. It is NaN if noise hides both of them or the
+        gap between them.
+        """
+        if abs(difference - slope) <= min(self.noise, FACTOR_SHARE * abs(slope)):
+            return nan
+        if abs(difference) <= max(self.noise, ZERO_SHARE * abs(slope)):
+            return inf if abs(slope) > NOISE_RATIO * self.noise else nan
+        if abs(slope) <= ZERO_SHARE * abs(difference):
+            return 0.0
+        return slope / difference
 
     def leaves_gap(self, low: int, high: int) -> float:
         """Return the gap of the leaves low, ..., high - 1."""
@@ -339,7 +352,7 @@ def _is_same_error(first: float, second: float) -> bool:
     """Return whether two ratios of a derivative to the right one show the same error."""
     if first == second:
         return True
-    return abs(first - second) <= FACTOR_SHARE * abs(first - 1) and abs(first - second) <= abs(first)
+    return abs(first - second) <= FACTOR_SHARE * min(abs(first), abs(first - 1))
 
 
 def gaps_along_entries(
@@ -377,15 +390,12 @@ def gaps_along_entries(
     if units is None:
         units = point.units
     worst = max(wrong, key=lambda direction: 0.0 if isnan(direction.share) else direction.share)
-    if worst.step > 0:
-        step = worst.step
-    else:
-        step = DEFAULT_STEP
-    if worst.jitter > 0:
-        jitter = worst.jitter
-    else:
-        jitter = 0.0
-    noise = CLEAR_OF_NOISE * max(2.0, jitter) * evaluations.eps * abs(evaluations.base) / step
+    jitter = worst.jitter if worst.jitter > 0 else 0.0
+    rounding = CLEAR_OF_NOISE * max(2.0, jitter) * evaluations.eps * abs(evaluations.base)
+    step = worst.difference_step if worst.step > 0 else DEFAULT_STEP
+    if step > DEFAULT_STEP and rounding / DEFAULT_STEP <= SMALL_NOISE_SHARE * worst.size:
+        step = DEFAULT_STEP  # other directions may have larger third derivatives than this one
+    noise = rounding / step
 
     def displacement(weights: Sequence[NDArray[Any]]) -> NDArray[Any]:
         parts = []

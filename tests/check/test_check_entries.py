@@ -157,3 +157,32 @@ def test_an_audit_that_agrees_takes_no_more_evaluations():
     with recording() as calls:
         found = dp.check.gradient(loss, FIELD, quick=True)
     assert found.gaps == () and calls["laplacian", "forward"] <= found.evaluations + 8
+
+
+def test_derivatives_that_are_zero_to_rounding_have_no_factor():
+    """Rounding errors of about 1e-16 are named as 0, and their ratios are not named at all."""
+    mix = np.linalg.qr(np.cos(np.arange(144.0)).reshape(12, 12) + 3 * np.eye(12))[0]
+    x = {"a": np.linspace(1.0, 2.0, 12), "b": np.linspace(1.0, 2.0, 12)}
+
+    def cancelled(b):
+        return mix @ (mix.T @ b) - b
+
+    f = lambda u: u["a"] ** 3 + u["b"] ** 2
+    missing = dp.check.vjp(f, lambda u, g: {"a": 3 * u["a"] ** 2 * g, "b": cancelled(2 * u["b"] * g)}, x)
+    assert missing.gaps == ("every entry of x['b']: vjp is 0",)
+    f = lambda u: u["a"] ** 3 + cancelled(u["b"])
+    needless = dp.check.vjp(f, lambda u, g: {"a": 3 * u["a"] ** 2 * g, "b": 2 * u["b"] * g}, x)
+    assert needless.gaps == ("every entry of x['b']: vjp should be 0",)
+
+
+def test_a_derivative_that_is_zero_within_the_noise_should_be_zero():
+    """The difference is an error of 1e-3, whose ratio to the derivative under test has no meaning."""
+
+    def slope_along(weights):
+        return float(np.sum(weights[0]))
+
+    def gap_along(weights):
+        return 1e-3 * np.sin(1e3 * np.sum(weights[0])) - slope_along(weights)
+
+    (entry,) = largest_gaps(gap_along, [(8,)], noise=2e-3, slope_along=slope_along)
+    assert entry.factor == np.inf and entry.region == (slice(None),)
