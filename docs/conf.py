@@ -38,7 +38,7 @@ html_math_renderer = "mathml"  # formulas.py: no script, no fonts to fetch
 default_role = "code"
 smartquotes_action = "D"  # dashes alone: quotes in tables of options are code
 # The bridges have pages without their libraries. One that is installed is imported: other libraries look at it.
-autodoc_mock_imports = [name for name in ("jax", "torch", "xarray") if find_spec(name) is None]
+autodoc_mock_imports = [name for name in ("jax", "pint", "torch", "xarray") if find_spec(name) is None]
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"
 napoleon_use_rtype = False

@@ -19,7 +19,7 @@ L = dp.laplacian(GRID)
 
 def test_a_name_that_is_not_there():
     message = "module 'sparsedp.interop' has no attribute 'to_numpy'; "
-    message += "it has from_jax, from_torch, from_xarray, to_jax, to_torch, to_xarray"
+    message += "it has from_jax, from_torch, from_xarray, to_jax, to_torch, to_xarray, with_units"
     with pytest.raises(AttributeError, match="^module .* has no attribute .*; it has .*$") as found:
         dp.interop.to_numpy
     assert str(found.value) == message
