@@ -29,6 +29,7 @@ from sparsedp.operators.operator import Operator
 __all__ = ["DerivativeCheck", "gradient_as_vjp", "hessian", "jacobian", "jvp", "transposed_products", "vjp"]
 
 DERIVATIVES = ("vjp", "jvp")
+DUALITY = "<g, jvp(t)> = <vjp(g), t>"  # name of the identity that compares them
 EXAMPLES = {"vjp": "lambda x, g: ...", "jvp": "lambda x, t: ..."}
 
 
@@ -614,8 +615,8 @@ def _result(audit: DerivativeAudit, title: str, seconds: float) -> DerivativeChe
         digits = min(int(line.digits) for line in lines if line.word in CONFIRMING_WORDS)
     notes = [note for word, note in audit.findings if word == "note"]
     culprit = audit.culprit
-    if audit.verdict == "disagrees" and culprit is None and audit.program.less_precise:
-        culprit = audit.program.less_precise
+    if audit.verdict == "disagrees" and culprit is None:
+        culprit = audit.program.less_precise or _other_derivative(audit, lines)
     if culprit:
         notes.append(f"culprit: {culprit}")
     notes += _gap_notes(audit.gaps, audit.result_gaps)
@@ -638,6 +639,15 @@ def _result(audit: DerivativeAudit, title: str, seconds: float) -> DerivativeChe
         notes=tuple(notes),
         lines=tuple(line.result() for line in lines),
     )
+
+
+def _other_derivative(audit: DerivativeAudit, lines: Sequence[Any]) -> str | None:
+    """Return a phrase if the derivative under test is right, and only the one that it is compared with is wrong."""
+    other = {"vjp": "jvp", "jvp": "vjp"}[audit.kind]
+    failed = [row.name for row in audit.rows if row.ok is False]
+    if failed == [DUALITY] and all(line.word in CONFIRMING_WORDS for line in lines):
+        return f"{other}, as {audit.title} agrees with differences"
+    return None
 
 
 class DerivativeCheck(Audit):
