@@ -19,9 +19,10 @@ from sparsedp.check.gradient_check import Audit
 from sparsedp.check.hessian_audit import GradientHessianAudit, LossHessianAudit
 from sparsedp.check.matrices import Products, adjoint_product, flattened, unflattened
 from sparsedp.check.point import audit_generator
-from sparsedp.check.programs import CONVENTIONS, Program, library_of
+from sparsedp.check.programs import CONVENTIONS, Program, WrongResult, library_of, real_part
 from sparsedp.check.step_sizes import checked_steps
 from sparsedp.check.table import Table
+from sparsedp.errors import ShapeError
 from sparsedp.grid.grid import Grid
 from sparsedp.grid.space import Space
 from sparsedp.operators.operator import Operator
@@ -263,6 +264,11 @@ def jacobian(
         vector = flattened(program.point.variables(t))
         rows = sum(map(np.size, program.result.values))
         slopes = products.product(program.library.tensors(tree), vector, rows)
+        if not (program.point.complex or program.result.complex):
+            try:
+                slopes = real_part("the product of the Jacobian with t", slopes)
+            except ShapeError as error:
+                raise WrongResult(str(error)) from error
         return program.result.build(unflattened(slopes, program.result.values))
 
     program = Program(subject.function, subject.x, pull, push, "transpose")

@@ -24,7 +24,7 @@ from sparsedp.check.summary import error_text
 from sparsedp.errors import DerivativeError, ShapeError, SparsedpError
 from sparsedp.interop.recording import recorded
 
-__all__ = ["CONVENTIONS", "Library", "Program", "WrongResult", "library_of", "plain_numpy_refused"]
+__all__ = ["CONVENTIONS", "Library", "Program", "WrongResult", "library_of", "plain_numpy_refused", "real_part"]
 
 CONVENTIONS = ("transpose", "adjoint")
 ARGUMENTS = {"gradient": "gradient(x)", "vjp": "vjp(x, g)", "jvp": "jvp(x, t)"}
@@ -262,7 +262,7 @@ class Program:
             if np.iscomplexobj(y):
                 part = part.astype(np.result_type(y, complex))
             else:
-                part = _real_part(leaf, part)
+                part = real_part(leaf, part)
             parts.append(part)
         return parts
 
@@ -332,7 +332,7 @@ class Program:
         for name, part, values in zip(names, parts, self.point.values, strict=True):
             part = np.asarray(part)
             if not np.iscomplexobj(values):
-                _real_part(name, part)
+                real_part(name, part)
             if part.dtype.kind in "fc" and np.finfo(part.dtype).eps > np.finfo(values.dtype).eps:
                 self.less_precise = f"vjp(x, g) returns {part.dtype}, but x has {values.dtype}"
 
@@ -411,7 +411,7 @@ def _is_of_a_rule(error: BaseException) -> bool:
     return isinstance(error, SparsedpError) and "traced value" not in str(error)
 
 
-def _real_part(name: str, part: NDArray[Any]) -> NDArray[Any]:
+def real_part(name: str, part: NDArray[Any]) -> NDArray[Any]:
     """Return the real part of numbers that have to be real. An FFT leaves imaginary parts of rounding errors.
 
     Raises

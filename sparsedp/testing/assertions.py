@@ -214,8 +214,8 @@ def _conclude(result: Result, seconds: float, allow_inconclusive: bool = False, 
     """
     __tracebackhide__ = True
     is_accepted = bool(result) or (allow_inconclusive and result.verdict == "inconclusive")
-    frame = sys._getframe(frames_inside())
     for observer in OBSERVERS[-1:]:
+        frame = sys._getframe(frames_inside())
         observer.note(result, seconds, is_accepted, frame.f_code.co_filename, frame.f_lineno)
     if is_accepted:
         return

@@ -219,6 +219,10 @@ REASONS = [
         "vjp(x, g): expected real numbers, got imaginary parts of up to ",
     ),
     (
+        lambda: dp.check.jacobian(np.sin, np.diag(np.cos(X)) * (1 + 1e-3j), X),
+        "the product of the Jacobian with t: expected real numbers, got imaginary parts of up to ",
+    ),
+    (
         lambda: VJP(cube, lambda u, g: cube_vjp(u, g)[:, None], X),
         "vjp(x, g): expected shape (5,), got (5, 1); return a tree like x",
     ),
@@ -240,12 +244,12 @@ def test_traced_numbers_in_an_array():
 
 
 def test_imaginary_parts_name_the_remedy():
-    from sparsedp.check.programs import _real_part
+    from sparsedp.check.programs import real_part
     from sparsedp.errors import ShapeError
 
     words = r"^g: expected real numbers, got imaginary parts of up to 2.0e\+00; return the real part$"
     with pytest.raises(ShapeError, match=words):
-        _real_part("g", np.array([1.0, 2j]))
+        real_part("g", np.array([1.0, 2j]))
 
 
 # ---- cotangents in forms that other libraries return ---------------------------------------------------------------
