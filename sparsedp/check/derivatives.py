@@ -330,7 +330,8 @@ def hessian(
         The point.
     gradient : callable, optional
         ``gradient(x)``, a tree like `x`. With a gradient, the Hessian is compared with first differences of it, to
-        about nine digits. Without one, it is compared with second differences of `f`, to about six digits.
+        about nine digits, and the gradient with differences of `f`. Without one, the Hessian is compared with second
+        differences of `f`, to about six digits.
     directions, steps, rng, grid, noise, beside
         As for `check.vjp`.
 
@@ -378,14 +379,16 @@ def hessian(
     options = _options("check.hessian", directions, steps, rng, grid, noise, beside and is_function)
     require_arrays("check.hessian", leaves(x))
     _require_point("check.hessian", x)
-    program = Program(f if gradient is None else gradient, x, None, product, None)
-    program.takes_arrays = not has_products
-    program.jvp_name = "H(x, v)"
+    loss = Program(f, x, None, product, None)
+    program = loss if gradient is None else Program(gradient, x, None, product, None)
+    for of_vectors in (loss, program):
+        of_vectors.takes_arrays = not has_products
+        of_vectors.jvp_name = "H(x, v)"
     if program.point.complex:
         raise TypeError("check.hessian takes real x, got complex numbers; split them into real and imaginary parts")
     if gradient is None:
-        return _audited(LossHessianAudit(program, options), "hessian")
-    return _audited(GradientHessianAudit(program, options, "jvp", False, "the Hessian"), "hessian")
+        return _audited(LossHessianAudit(loss, options), "hessian")
+    return _audited(GradientHessianAudit(program, options, loss), "hessian")
 
 
 def _takes_vector(H: Any) -> bool:

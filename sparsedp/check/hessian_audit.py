@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sparsedp._utils.pytree import norm
+from sparsedp._utils.pytree import mapped, norm
 from sparsedp.check.balanced_directions import balanced_direction
 from sparsedp.check.derivative_audit import DerivativeAudit, Group, Options, accept
 from sparsedp.check.derivative_places import Places
@@ -16,7 +17,7 @@ from sparsedp.check.directions import examine_line
 from sparsedp.check.entries import MOST_ENTRIES, largest_gaps, listed
 from sparsedp.check.evaluations import FLOAT_TINY, Evaluations, Level, Line
 from sparsedp.check.functionals import FunctionalEvaluations
-from sparsedp.check.point import Point
+from sparsedp.check.point import Point, audit_generator
 from sparsedp.check.programs import Program
 from sparsedp.check.rounding_modes import ROUNDING_FACTOR, rounding_error
 from sparsedp.check.summary import Row
@@ -28,10 +29,67 @@ STEPS = tuple(2.0**-exponent for exponent in range(1, 28, 2))  # second differen
 NEGLIGIBLE_BEND = 1e-6  # a second derivative counts as 0 if it and its error bar are below this share of the loss
 NOISE_FACTOR = 10.0  # a gap of an entry has to be this many times the rounding error of its measurement
 EVEN_EPS = 4.0  # rounding error of f(x + t d) + f(x - t d) - 2 f(x), in units of eps |f|
+HESSIAN_VERDICTS = {
+    "agrees": "the Hessian agrees",
+    "disagrees": "the Hessian disagrees, too",
+    "inconclusive": "the check of the Hessian is inconclusive",
+}
 
 
 class GradientHessianAudit(DerivativeAudit):
-    """The audit of a Hessian as the JVP of a gradient. The program is the gradient."""
+    """The audit of a Hessian as the JVP of a gradient. The program is the gradient.
+
+    The gradient is compared with differences of the loss first. If it is wrong, the Hessian is compared with second
+    differences of the loss instead, so that the reason says which of them is wrong.
+
+    Parameters
+    ----------
+    program : Program
+        The gradient, with the Hessian products as its JVP.
+    options : Options
+    loss : Program
+        The loss, with the Hessian products as its JVP.
+    """
+
+    def __init__(self, program: Program, options: Options, loss: Program) -> None:
+        super().__init__(program, options, "jvp", False, "the Hessian")
+        self.loss = loss
+
+    def run(self) -> None:
+        """Run the audit."""
+        gradient = self._audit_of_gradient()
+        if gradient is None or gradient.verdict != "disagrees":
+            super().run()
+            return
+        hessian = LossHessianAudit(self.loss, replace(self.options, rng=audit_generator(None)))
+        hessian.run()
+        self.verdict = "disagrees"
+        self.reason = (
+            f"gradient(x) is not the gradient of f, {gradient.reason}; "
+            f"compared with second differences of f, {HESSIAN_VERDICTS[hessian.verdict]}"
+        )
+        self.culprit = "the gradient and the Hessian" if hessian.verdict == "disagrees" else "the gradient"
+        self.base = gradient.base
+        self.groups = gradient.groups
+        self.rows = gradient.rows
+        self.gaps = gradient.gaps
+
+    def _audit_of_gradient(self) -> DerivativeAudit | None:
+        """Compare the gradient with differences of the loss. Return None if f is not a loss."""
+        with np.errstate(all="ignore"):
+            value = self.loss.start()
+        if value.size != 1 or self.loss.f is self.program.f:
+            return None
+
+        def pull(tree: Any, g: Any) -> Any:
+            factor = g.reshape(())
+            return mapped(lambda leaf: leaf * factor, self.program.f(tree))
+
+        program = Program(self.loss.f, self.loss.point.fresh(), pull)
+        audit = DerivativeAudit(program, replace(self.options, rng=audit_generator(None)), "vjp", title="gradient(x)")
+        audit.run()
+        self.program.runs["f"] += sum(program.runs.values())
+        return audit
 
     def examine(self) -> None:
         """Examine the products, and their symmetry."""

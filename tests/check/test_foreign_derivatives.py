@@ -443,6 +443,21 @@ def test_hessians():
     assert dp.check.hessian(lambda u: np.sum(np.abs(u) ** 3), lambda u, v: 6 * np.abs(u) * v, X - 1.5)
 
 
+@pytest.mark.parametrize(
+    ("slope", "bend", "culprit", "words"),
+    [
+        (3, 12, "the gradient", "the Hessian agrees"),
+        (3, 9, "the gradient and the Hessian", "the Hessian disagrees, too"),
+        (4, 9, None, ""),
+    ],
+)
+def test_a_wrong_gradient_is_not_blamed_on_the_hessian(slope, bend, culprit, words):
+    result = dp.check.hessian(lambda u: np.sum(u**4), lambda u, v: bend * u**2 * v, X, gradient=lambda u: slope * u**3)
+    assert result.verdict == "disagrees" and result.culprit == culprit and result.reason.endswith(words)
+    assert ("gradient(x) is not the gradient of f" in result.reason) == (slope == 3)
+    assert ("gradient(x) is too small" in result.gaps[0]) == (slope == 3)
+
+
 def test_a_hessian_that_is_not_symmetric():
     A = M.T @ np.roll(M, 1, 0)
     for options in ({}, {"gradient": lambda u: (A + A.T) @ u}):
