@@ -31,6 +31,8 @@ class Chain:
 
     def __init__(self, stages: Sequence[Any], kind: str) -> None:
         self.kind = kind
+        if not isinstance(stages, (list, tuple)):
+            raise TypeError(f"stages takes a list of stages, got {type(stages).__name__}; write stages=[(f, {kind})]")
         self.stages = [self._stage(number, stage) for number, stage in enumerate(stages, start=1)]
         if not self.stages:
             raise ValueError(f"stages must have at least one stage, got none; write stages=[(f, {kind})]")

@@ -142,6 +142,11 @@ MESSAGES = [
         "the whole tuple",
     ),
     (
+        lambda: VJP(None, x=X, stages=cube),
+        TypeError,
+        "stages takes a list of stages, got function; write stages=[(f, vjp)]",
+    ),
+    (
         lambda: dp.check.hessian(lambda u: abs(u), 1.0, 1j),
         TypeError,
         "check.hessian takes real x, got complex numbers; split them into real and imaginary parts",
