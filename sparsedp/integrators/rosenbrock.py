@@ -18,8 +18,8 @@ stage to the gradient is
     y_i . d f(u + sum_j a_ij U_j, t + c_i h) + d h d_i y_i . f_t + y_i . (dJ) U_i + ...,
 
 so that the derivative of J is applied to a pair of vectors, by a second derivative of f. The adjoints of all stages
-take one factorisation, which is that of the forward step as long as it is stored. One recording of a step serves the
-solution and both perturbed solutions of embedded.py.
+take one factorisation: that of the forward step, or a new one if too many steps lie between. One recording of each
+rate serves the solution and both perturbed solutions of embedded.py.
 
 References
 ----------
@@ -46,6 +46,7 @@ from sparsedp.integrators.embedded import EVALUATION_ERRORS, Embedded, norm
 from sparsedp.integrators.problem import SidedParams, combine, without_side
 from sparsedp.integrators.runge_kutta import as_matrix
 from sparsedp.solvers.adjoint import solve_rule
+from sparsedp.solvers.cache import Cache
 from sparsedp.solvers.jacobian import Jacobians
 from sparsedp.solvers.newton import Equation
 from sparsedp.solvers.records import SolveLog
@@ -58,6 +59,7 @@ if TYPE_CHECKING:
     from sparsedp.integrators.events import Event
     from sparsedp.integrators.problem import Problem
     from sparsedp.solvers.choose_method import SolveSettings
+    from sparsedp.solvers.jacobian import Linearisation
 
 __all__ = ["Rosenbrock"]
 
@@ -138,6 +140,9 @@ DENSE = np.array(
     ]
 )
 EMBEDDED = 4  # order of the embedded formula
+# Factorisations of the last steps are kept for the backward pass, up to this number of bytes by an estimate.
+KEPT_BYTES = 2**29
+BYTES = 320  # of the factors, for each entry of W: 12 in each of 20 to 30 entries on square grids
 
 
 def _quadrature() -> tuple[tuple, tuple]:
@@ -169,10 +174,16 @@ class Rosenbrock(Embedded):
     ----------
     equation : Equation
         W x - f, whose Jacobian is W, with the parameters (h, params, t). Of one interval.
+    kept : Cache
+        Jacobians of the last steps, with their factors. Of one interval.
+    keeps_factors : bool
+        Whether a backward pass will need them.
     """
 
     quadrature = _quadrature()
     equation: Any
+    kept: Any
+    keeps_factors = False
 
     def __init__(
         self,
@@ -201,10 +212,18 @@ class Rosenbrock(Embedded):
             rate = problem(x, params, t)
             return combine(x, (1.0 / (GAMMA * h) - 1.0, x), (-1.0, rate))
 
+        run.kept = Cache(1)
         run.equation = Equation(residual, run.problem.unknowns, (1.0, run.params, 0.0), self.name)
         return run, arguments
 
     # ------------------------------------------------------------ steps
+
+    def steps_over(
+        self, arguments: tuple, keeps_all: bool, detector: Any = None
+    ) -> tuple[list[AcceptedStep], Event | None, list[float]]:
+        """Run the steps over an interval: see `Adaptive`."""
+        self.keeps_factors = keeps_all
+        return super().steps_over(arguments, keeps_all, detector)
 
     def _steps(
         self, v: Any, params: Any, t: Any, h: Any, inspector: RateInspector | None = None
@@ -270,8 +289,20 @@ class Rosenbrock(Embedded):
         """Return the solution of W^T y = g for the Jacobian at a state."""
         return self._solved(True, g, self.equation, v, variables)
 
+    def _linearisation(self, equation: Equation, v: Any, variables: Sequence) -> Linearisation:
+        """Return the Jacobian W at a state, from the kept ones or new."""
+        key = (v, *variables)
+        linearisation = self.kept.find(key)
+        if linearisation is None:
+            linearisation = self.jacobians.cached(equation, v, variables)
+            op = linearisation.solver.system.unscaled
+            if self.keeps_factors and op.form == "explicit":
+                self.kept.most = max(1, KEPT_BYTES // (BYTES * max(op.matrix.nnz, 1)))
+            self.kept.put(key, linearisation)
+        return linearisation
+
     def _solved(self, transposed: bool, b: Any, equation: Equation, v: Any, variables: Sequence) -> Any:
-        linearisation = self.jacobians.cached(equation, v, variables)
+        linearisation = self._linearisation(equation, v, variables)
         if linearisation.singular:
             raise ConvergenceError(
                 f"{self.name}: the matrix of a step is singular, as the Jacobian of the rate has the eigenvalue "
@@ -420,14 +451,18 @@ class _RecordedStep:
         if parent.takes_time:
             slope = push(lambda time: parent.problem(self.step.u, parent.params, time), start, [1.0])[1]
 
+        # Points hold the tree of the state: slices of a flat array would take a third of the time.
+        state = parent.problem.state
+        split = parent.problem.unknowns.space.split
+
         def rate(point: tuple) -> Any:
-            v, moving, t = point
-            return parent.problem(v, parent.with_moving(moving), t)
+            u, moving, t = point
+            return parent.problem.problem(u, parent.with_moving(moving), t)
 
         def gradients(ys: np.ndarray, point: tuple) -> list:
             """Return the gradients of <y, rate> with respect to the point, for each y."""
-            tape = taped(rate, point, [True] * (len(moving) + 2))
-            return [[0.0 if part is None else part for part in tape.pull([y])] for y in ys]
+            tape = taped(rate, point, [True] * len(leaves(point)))
+            return [[0.0 if part is None else part for part in tape.pull(split(y))] for y in ys]
 
         new = sums.state
         of_stages = np.multiply.outer(B, new)
@@ -437,12 +472,15 @@ class _RecordedStep:
         of_length = np.zeros(len(new))
         for i in reversed(range(len(B))):
             ys = np.array([parent.solve_transposed(g, self.step.u, variables) for g in of_stages[i]])
-            point = combined(self.step.u, A[i], stages), moving, start + NODES[i] * length
-            of_stage = joined(gradients(ys, point), point)
+            point = state(combined(self.step.u, A[i], stages)), moving, start + NODES[i] * length
             # The derivative of J applied to the stage, and of the time derivative: one direction for both.
-            direction = [stages[i], *map(np.zeros_like, moving), D[i] * length]
-            base = self.step.u, moving, start
-            of_direction = joined(push(partial(gradients, ys), base, direction)[1], base)
+            direction = [*split(stages[i]), *map(np.zeros_like, moving), D[i] * length]
+            base = state(self.step.u), moving, start
+            at_base, of_direction = (joined(rows, base) for rows in push(partial(gradients, ys), base, direction))
+            if i == 0:  # the first stage is evaluated at the start of the step
+                of_stage = at_base
+            else:
+                of_stage = joined(gradients(ys, point), point)
             of_point += of_stage + of_direction
             earlier = combined(np.zeros_like(slope), C[i], stages)
             of_length += NODES[i] * of_stage[:, -1]
