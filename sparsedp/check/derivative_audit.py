@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from math import inf, isfinite
+from math import inf, isfinite, log10
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from sparsedp._utils.counters import thread
 from sparsedp._utils.pytree import norm
-from sparsedp._utils.validation import place
 from sparsedp.autodiff.derivative import unwarned
 from sparsedp.check.balanced_directions import (
     balanced_direction,
@@ -32,7 +31,7 @@ from sparsedp.check.balanced_directions import (
 from sparsedp.check.derivative_places import Places, diagnosis_of, places_of
 from sparsedp.check.derivative_review import review, rounds_in_single_precision
 from sparsedp.check.direction_evidence import CONFIRMING_WORDS, DirectionEvidence, weigh
-from sparsedp.check.directions import SHIFT, SHIFT_SEED, examine_line
+from sparsedp.check.directions import SHIFT, SHIFT_SEED, examine_line, first_non_finite
 from sparsedp.check.evaluations import EVALUATION_ERRORS, Evaluations, Line
 from sparsedp.check.functionals import FunctionalEvaluations, Functionals, Pullback, balanced_weights, leaf_weights
 from sparsedp.check.loss_noise import measure_noise, noise_of_entries, noise_steps
@@ -58,6 +57,7 @@ REPEATED_SHARE = 1e-6  # a larger relative difference of two equal calls is an e
 DUALITY_SHARE = 1e-6  # a larger gap between VJP and JVP is an error
 UNDECIDED = ("rough", "few", "noise", "masked")
 HIDDEN_EPS = 1e3  # a derivative that changes f(x) by less than this multiple of its rounding error is not examined
+LOSS_NAME = "f(x)"  # in sentences
 ARGUMENTS = {"vjp": "g", "jvp": "t"}
 ACCEPTED_SHARE = 1e-4  # an undecided direction is accepted if gap and error bar are below this share of the derivative
 MOST_HIDDEN_PARTS = 3
@@ -77,7 +77,6 @@ def examined(line: Line, search_ripples: bool = False) -> DirectionEvidence:
         if finer.resolution < evidence.resolution or finer.word not in UNDECIDED:
             evidence = finer
     accept(evidence)
-    evidence.note = evidence.note.replace("6 are needed", f"{-np.log10(ACCEPTED_SHARE):.0f} are needed")
     return evidence
 
 
@@ -161,6 +160,9 @@ class DerivativeAudit:
         f(x) as a vector.
     pairs : list of (ndarray, ndarray)
         Two vectors with their derivatives, see `derivative`.
+    point : Point
+    like : Evaluations
+        The steps, tolerances, precision and names of all functionals.
     linear_gap : float
         Relative gap between the derivative of a linear combination of them and the combination of the derivatives.
     """
@@ -183,6 +185,9 @@ class DerivativeAudit:
         self.base: NDArray[Any] = np.empty(0)
         self.pairs: list[tuple[NDArray[Any], NDArray[Any]]] = []
         self.linear_gap = 0.0
+        self.point = program.point  # `run` may replace it, for functions of NumPy arrays that use another library
+        self.like = Evaluations(program.value, program.point, None)
+        self._products: Any = None
         self.has_wide_leaves = False
         self.covered = 1.0
 
@@ -202,6 +207,9 @@ class DerivativeAudit:
                 self.findings.append(("unsound", self._non_finite("f(x)", self.base)))
             else:
                 self.like = Evaluations(self.program.value, self.point, None, self._steps())
+                self.like.loss_name = LOSS_NAME
+                self.like.gradient_name = self.title
+                self.like.digits_needed = round(-log10(ACCEPTED_SHARE))
                 self.like.may_extend = not self.options.steps
                 self.like.eps = max(self.like.eps, self.program.result.eps)
                 self.like.find_tolerances(self.program.value, solves, controlled)
@@ -224,13 +232,10 @@ class DerivativeAudit:
 
     def _non_finite(self, name: str, vector: NDArray[Any]) -> str:
         """Return a sentence about the first NaN or infinity of a vector in the structure of f(x)."""
-        for leaf, values in zip(self.program.result.names, self.program.result.arrays(vector)):
-            is_finite = np.isfinite(values)
-            if not np.all(is_finite):
-                where = ""
-                if values.ndim:
-                    where = f", the first at {place(int(np.argmin(is_finite)), values.shape)}"
-                return f"{leaf.replace('f(x)', name, 1)} holds NaN or infinity{where}"
+        result = self.program.result
+        for leaf, values in zip(result.names_under(name), result.arrays(vector)):
+            if not np.all(np.isfinite(values)):
+                return f"{leaf} holds NaN or infinity{first_non_finite(values)}"
         return f"{name} holds NaN or infinity"
 
     def examine(self) -> None:
@@ -321,11 +326,8 @@ class DerivativeAudit:
     def _note_non_finite_cotangent(self, slope: NDArray[Any]) -> None:
         """Add a finding about the first NaN or infinity of a cotangent of x."""
         for name, values in zip(self.point.names, self.point.arrays(slope)):
-            is_finite = np.isfinite(values)
-            if not np.all(is_finite):
-                where = ""
-                if values.ndim:
-                    where = f", the first at {place(int(np.argmin(is_finite)), values.shape)}"
+            if not np.all(np.isfinite(values)):
+                where = first_non_finite(values)
                 self.findings.append(("broken", f"vjp(x, g) holds NaN or infinity in {name}{where}"))
 
     def tangent(self, direction: NDArray[Any]) -> NDArray[Any]:
@@ -594,14 +596,15 @@ class DerivativeAudit:
         """Combine the verdicts of all functionals."""
         review(self)
         with_directions = [group for group in self.groups if group.directions]
-        verdicts = [overall_verdict(group.directions, self.findings) for group in with_directions]
-        if not verdicts:
-            verdicts = [overall_verdict([], self.findings)]
+        verdicts = [
+            overall_verdict(directions, self.findings, LOSS_NAME, self.title)
+            for directions in [group.directions for group in with_directions] or [[]]
+        ]
         for wanted in ("disagrees", "inconclusive", "agrees"):
             for verdict, reason in verdicts:
                 if verdict == wanted:
                     self.verdict = verdict
-                    self.reason = reason.replace("the loss", "f(x)").replace("the gradient", self.title)
+                    self.reason = reason
                     break
             if self.verdict:
                 break

@@ -13,7 +13,7 @@ import numpy as np
 from sparsedp._utils.pytree import norm
 from sparsedp.check.direction_evidence import CONFIRMING_WORDS, DirectionEvidence
 from sparsedp.check.directions import reclassify_kinks
-from sparsedp.check.evaluations import EVALUATION_ERRORS, UNCHANGED
+from sparsedp.check.evaluations import EVALUATION_ERRORS
 from sparsedp.check.rounding_modes import ROUNDING_FACTOR, rounding_error
 
 __all__ = ["review", "rounds_in_single_precision"]
@@ -89,7 +89,8 @@ def _find_other_scales(direction: DirectionEvidence) -> None:
         return
     rounding = CLEAR_OF_ROUNDING * line.evaluations.eps * abs(line.base)
     expected = abs(direction.difference)
-    stairs = [level for level in line.levels if level.note == UNCHANGED and level.step * expected > rounding]
+    unchanged = line.evaluations.unchanged
+    stairs = [level for level in line.levels if level.note == unchanged and level.step * expected > rounding]
     if len(stairs) >= STAIRS:
         direction.word = "noise"
         direction.note = f"f does not change at all for steps up to {stairs[0].step:.0e}: it is a staircase"

@@ -514,12 +514,14 @@ def _word_and_reason(evidence: DirectionEvidence) -> tuple[str, str]:
 
 def _without_any_change(evidence: DirectionEvidence) -> tuple[str, str]:
     """Return word and reason if no step changes the loss."""
+    evaluations = evidence.line.evaluations
+    still = f"{evaluations.unchanged} along this direction"
     if evidence.slope == 0:
-        return "constant", "the loss does not change along this direction"
+        return "constant", still
     predicted = abs(evidence.slope) * evidence.silent
     if predicted > 2 * THRESHOLDS.bars_disagree * evidence.smallest_change:
-        return "disagrees", "the loss does not change along this direction, the gradient says it does"
-    return "noise", "the derivative is smaller than the rounding error of the loss"
+        return "disagrees", f"{still}, {evaluations.gradient_name} says it does"
+    return "noise", f"the derivative is smaller than the rounding error of {evaluations.loss_name}"
 
 
 def _with_a_significant_gap(evidence: DirectionEvidence) -> tuple[str, str]:
@@ -534,16 +536,19 @@ def _with_a_significant_gap(evidence: DirectionEvidence) -> tuple[str, str]:
     is_difference = abs(evidence.difference) > THRESHOLDS.bars_disagree * evidence.bar
     if evidence.jitter < THRESHOLDS.rounding_noise or is_difference:
         return "disagrees", f"{off}, with error bars of {evidence.resolution:.1e}"
-    return "noise", "the loss is noisy or chaotic: differences see no derivative at all"
+    loss = evidence.line.evaluations.loss_name
+    return "noise", f"{loss} is noisy or chaotic: differences see no derivative at all"
 
 
 def _with_a_small_gap(evidence: DirectionEvidence) -> tuple[str, str]:
     """Return word and reason if the gap is within its error bar, or if both derivatives vanish."""
+    evaluations = evidence.line.evaluations
+    loss = evaluations.loss_name
     fewest = THRESHOLDS.fewest_orders
     is_noisy = evidence.jitter > THRESHOLDS.rounding_noise
     if evidence.is_close and is_noisy and evidence.bar > THRESHOLDS.noisy_agreement_share * evidence.scale:
-        relative_noise = evidence.jitter * evidence.line.evaluations.eps
-        return "masked", f"noise of {relative_noise:.0e} of the loss leaves {evidence.digits:.1f} digits, 6 are needed"
+        noise = f"noise of {evidence.jitter * evaluations.eps:.0e} of {loss}"
+        return "masked", f"{noise} leaves {evidence.digits:.1f} digits, {evaluations.digits_needed} are needed"
     orders = (evidence.first_levels, evidence.first_order), (evidence.second_levels, evidence.second_order)
     if any(levels >= fewest and np.isnan(order) for levels, order in orders):
         return "few", f"no two usable steps are a factor {THRESHOLDS.pair_ratio:g} apart: orders cannot be read"
@@ -552,7 +557,7 @@ def _with_a_small_gap(evidence: DirectionEvidence) -> tuple[str, str]:
         return "rough", reason
     is_order_one = abs(evidence.first_order - 1) <= THRESHOLDS.first_order_margin
     if evidence.first_levels >= fewest and not is_order_one:
-        return "rough", f"the loss changes with order {evidence.first_order:.2f} in the step, not 1"
+        return "rough", f"{loss} changes with order {evidence.first_order:.2f} in the step, not 1"
     if not evidence.is_close:
         return "vanishes", "the derivative is 0 to rounding, beside the curvature"
     if 0 < evidence.second_levels < fewest:
@@ -560,7 +565,7 @@ def _with_a_small_gap(evidence: DirectionEvidence) -> tuple[str, str]:
         return "few", f"the second Taylor remainder {seen}"
     if evidence.first_levels < fewest and not evidence.is_flat:
         seen = f"stands out of the noise on {evidence.first_levels} steps, {fewest} are needed"
-        return "few", f"the change of the loss {seen}"
+        return "few", f"the change of {loss} {seen}"
     if evidence.first_levels < fewest:
-        return "agrees", "flat: the loss bends before it climbs, order 1 cannot be read"
+        return "agrees", f"flat: {loss} bends before it climbs, order 1 cannot be read"
     return "agrees", ""

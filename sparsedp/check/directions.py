@@ -19,7 +19,15 @@ from sparsedp.check.point import Point, audit_generator
 from sparsedp.check.step_sizes import FINER_STEPS, RIPPLE_STEPS, STEPS_BETWEEN
 from sparsedp.check.thresholds import THRESHOLDS
 
-__all__ = ["RANDOM_DIRECTIONS", "SHIFT", "SHIFT_SEED", "examine_directions", "examine_line", "reclassify_kinks"]
+__all__ = [
+    "RANDOM_DIRECTIONS",
+    "SHIFT",
+    "SHIFT_SEED",
+    "examine_directions",
+    "examine_line",
+    "first_non_finite",
+    "reclassify_kinks",
+]
 
 RANDOM_DIRECTIONS = 3
 # A loss with kinks is examined again at a point at this distance from x (in units of x), in a random direction.
@@ -95,12 +103,12 @@ def _find_unsound_values(evaluations: Evaluations, slopes: NDArray[Any], again: 
         findings.append(("unsound", f"the loss changes by less than {smallest:g}: it underflows, scale it"))
     for name, values in zip(point.names, point.arrays(slopes)):
         if not np.all(np.isfinite(values)):
-            where = _first_non_finite(values)
+            where = first_non_finite(values)
             findings.append(("broken", f"the gradient of {name} holds NaN or infinity{where}"))
     return findings
 
 
-def _first_non_finite(values: NDArray[Any]) -> str:
+def first_non_finite(values: NDArray[Any]) -> str:
     """Return a phrase with the position of the first NaN or infinity in an array; "" for a scalar."""
     is_finite = np.isfinite(values)
     if not is_finite.ndim:
@@ -184,8 +192,9 @@ def _reclassify_hidden_ripple(evidence: DirectionEvidence) -> None:
             if bend > 2 * _bend_of_gradient(line, THRESHOLDS.ripple_smoothness * step):
                 evidence.word = "ripple"
                 evidence.note = (
-                    f"the gradient bends by {bend / evidence.scale:.1e} of itself within a step of {step:.0e}: "
-                    "a ripple below the noise of the loss may explain the gap"
+                    f"{line.evaluations.gradient_name} bends by {bend / evidence.scale:.1e} of itself "
+                    f"within a step of {step:.0e}: "
+                    f"a ripple below the noise of {line.evaluations.loss_name} may explain the gap"
                 )
                 return
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sparsedp._utils.counters import recording
 from sparsedp.check.direction_evidence import DirectionEvidence
-from sparsedp.check.evaluations import EVALUATION_ERRORS, UNCHANGED, Evaluations, Line
+from sparsedp.check.evaluations import EVALUATION_ERRORS, Evaluations, Line
 from sparsedp.check.point import Point
 from sparsedp.grid.grid import node_axes
 
@@ -418,7 +418,7 @@ def gaps_along_entries(
         if not np.any(direction):
             return 0.0
         level = Line("entries", direction, evaluations).level(step)
-        if level.note and level.note != UNCHANGED:
+        if level.note and level.note != evaluations.unchanged:
             raise _NotMeasured(level.note)
         if slope_along is None:
             return level.difference - level.slope

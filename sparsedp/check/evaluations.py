@@ -21,11 +21,10 @@ from sparsedp.check.step_sizes import COARSER_STEPS, default_steps
 from sparsedp.check.summary import error_text
 from sparsedp.errors import SparsedpError
 
-__all__ = ["EVALUATION_ERRORS", "FLOAT_TINY", "UNCHANGED", "Evaluations", "Level", "Line", "solvers_of"]
+__all__ = ["EVALUATION_ERRORS", "FLOAT_TINY", "Evaluations", "Level", "Line", "solvers_of"]
 
 # Exceptions that a loss may raise at a trial point, where it has no value. The solvers of SciPy raise RuntimeError.
 EVALUATION_ERRORS = (SparsedpError, ValueError, ArithmeticError, RuntimeError)
-UNCHANGED = "the loss does not change"
 FLOAT_TINY = float(np.finfo(float).tiny)
 LOST_SHARE = 0.1  # a step is unusable if the rounding of x changes the displacement by more than this share
 
@@ -70,6 +69,10 @@ class Evaluations:
         Steps that extend a sweep in which rounding errors hide the derivative.
     eps : float
         Machine epsilon of the dtype with the lowest precision that the loss has returned, at least that of float64.
+    loss_name, gradient_name : str
+        Names of the loss and of the gradient under test in sentences.
+    digits_needed : int
+        Number of digits in which a gradient must agree if the loss has noise, for sentences.
     """
 
     coarser_steps = COARSER_STEPS
@@ -97,6 +100,14 @@ class Evaluations:
         self.noise = 0.0
         self.deviation = 0.0
         self.eps = float(np.finfo(float).eps)
+        self.loss_name = "the loss"
+        self.gradient_name = "the gradient"
+        self.digits_needed = 6
+
+    @property
+    def unchanged(self) -> str:
+        """Note of a level at which the loss has the same value as at x."""
+        return f"{self.loss_name} does not change"
 
     def value(self, tree: Any) -> float:
         """Return the loss as a float."""
@@ -255,7 +266,7 @@ class Line:
             value = self.evaluations.value(self.point.tree(arrays))
         except EVALUATION_ERRORS as error:
             return np.nan, change, error_text(error)
-        return value, change, "" if np.isfinite(value) else "the loss overflows"
+        return value, change, "" if np.isfinite(value) else f"{self.evaluations.loss_name} overflows"
 
     def sweep(self, steps: Iterable[float]) -> None:
         """Evaluate the loss at x + t d and x - t d for each t in `steps` that was not evaluated before."""
@@ -269,7 +280,7 @@ class Line:
         minus, behind, note_behind = self.end(-step)
         note = note_ahead or note_behind
         if plus == minus == self.base:
-            note = UNCHANGED
+            note = self.evaluations.unchanged
         return Level(step, plus, minus, ahead, behind, note)
 
     def rounding(self, steps: NDArray[Any], losses: NDArray[Any]) -> NDArray[Any]:
@@ -293,4 +304,4 @@ class Line:
         """Steps at which the loss has the same value as at x. Empty if the loss changes at another step."""
         if self.usable:
             return []
-        return [level.step for level in self.levels if level.note == UNCHANGED]
+        return [level.step for level in self.levels if level.note == self.evaluations.unchanged]

@@ -130,7 +130,7 @@ class Functionals:
         gradient : callable or None
             The gradient under test as a function of a tree.
         like : Evaluations
-            Steps, tolerances and precision are copied from these evaluations.
+            Steps, tolerances, precision and names are copied from these evaluations.
         """
         evaluations = FunctionalEvaluations(Functional(self, number), self.point, gradient, like.steps)
         evaluations.may_extend = like.may_extend
@@ -141,6 +141,9 @@ class Functionals:
         evaluations.step_tolerance = like.step_tolerance
         evaluations.noise = like.noise
         evaluations.eps = like.eps
+        evaluations.loss_name = like.loss_name
+        evaluations.gradient_name = like.gradient_name
+        evaluations.digits_needed = like.digits_needed
         return evaluations
 
 

@@ -179,6 +179,9 @@ class LossHessianAudit(DerivativeAudit):
         evaluations.base = float(base[0])
         evaluations.slopes = np.zeros(point.size)
         evaluations.eps = self.like.eps
+        evaluations.loss_name = self.like.loss_name
+        evaluations.gradient_name = self.like.gradient_name
+        evaluations.digits_needed = self.like.digits_needed
         evaluations.may_extend = False
         group = Group(evaluations, np.ones(1))
         self.groups.append(group)

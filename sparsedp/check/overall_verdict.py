@@ -20,7 +20,12 @@ VERDICTS = (
 )
 
 
-def overall_verdict(directions: Sequence[DirectionEvidence], findings: Sequence[tuple[str, str]]) -> tuple[str, str]:
+def overall_verdict(
+    directions: Sequence[DirectionEvidence],
+    findings: Sequence[tuple[str, str]],
+    loss: str = "the loss",
+    gradient: str = "the gradient",
+) -> tuple[str, str]:
     """Return the verdict on a gradient and its reason.
 
     Parameters
@@ -28,6 +33,8 @@ def overall_verdict(directions: Sequence[DirectionEvidence], findings: Sequence[
     directions : sequence of DirectionEvidence
     findings : sequence of (str, str)
         (word, reason) of each finding that does not belong to a direction.
+    loss, gradient : str
+        Names of the loss and of the gradient under test in sentences.
 
     Returns
     -------
@@ -47,10 +54,10 @@ def overall_verdict(directions: Sequence[DirectionEvidence], findings: Sequence[
             return verdict, reason
     proved = {direction.word for direction in directions} & set(CONFIRMING_WORDS)
     if not proved:
-        return "inconclusive", "the loss is constant to rounding"
+        return "inconclusive", f"{loss} is constant to rounding"
     if "agrees" in proved:
         return "agrees", ""
-    return "agrees", "the gradient is 0 to rounding, beside the curvature"
+    return "agrees", f"{gradient} is 0 to rounding, beside the curvature"
 
 
 def _is_negligible(direction: DirectionEvidence, largest: float) -> bool:

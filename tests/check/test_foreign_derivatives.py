@@ -182,6 +182,17 @@ def test_results_can_be_stored():
     assert "disagrees" in wrong.markdown() and "disagrees" in wrong.html() and wrong.csv().count("\n") > 20
 
 
+def test_names_of_leaves_stand_unchanged_in_reasons():
+    """Sentences are written with the words of each check, not changed afterwards."""
+    x = {"the gradient": X, "the loss": X}
+    pull = lambda u, g: {"the gradient": g, "the loss": np.where(np.arange(12) == 3, np.nan, g)}
+    wrong = VJP(lambda u: u["the gradient"] + u["the loss"], pull, x)
+    assert wrong.reason == "vjp(x, g) holds NaN or infinity in x['the loss'], the first at 3"
+    push = lambda u, t: {"f(x)": np.where(np.arange(12) == 3, np.nan, t)}
+    wrong = JVP(lambda u: {"f(x)": u}, push, X)
+    assert wrong.reason == "jvp(x, t)['f(x)'] holds NaN or infinity, the first at 3"
+
+
 def test_a_state_of_the_last_run():
     result = VJP(StatefulInSecret(), x=X)
     assert result.verdict == "disagrees" and "it keeps a state of other runs" in result.reason
