@@ -39,6 +39,14 @@ __all__ = [
     "engine_of",
 ]
 
+
+def schur_engine(system: System) -> Engine:
+    """Build the solver for systems with multipliers: see saddle_point.py, which is imported on first use."""
+    from sparsedp.solvers import saddle_point
+
+    return saddle_point.schur_engine(system)
+
+
 # For each method the function that builds its solver (an Engine). The function takes a System, and the options of the
 # method as keyword-only arguments.
 METHODS: dict[str, Any] = {
@@ -47,6 +55,7 @@ METHODS: dict[str, Any] = {
     "structured": structured_engine,
     "multigrid": multigrid_engine,
     "krylov": krylov_engine,
+    "schur": schur_engine,
 }
 # Functions that check the option values of a method. They are called when substitution solves for all unknowns: the
 # method itself is then not set up, so nothing else would check its options.
@@ -82,6 +91,10 @@ DIRECT_UP_TO = {
 # multigrid: at 16^3 the set-up takes 5 times as long and a solve a third of the time; at 24^3 the set-up takes 26 times
 # and a solve 1.3 times as long.
 DIRECT_BELOW_STRUCTURED = {"many": {1: 10_000_000, 2: 16_384, 3: 4_096}, "few": {1: 10_000_000, 2: 4_096, 3: 1_000}}
+
+# From this number of unknowns on, "schur" is chosen for flows in 3-D. LU factors of a driven cavity of more than 20^3
+# cells do not fit into memory.
+SCHUR_FROM = 13_824
 
 # The same limits for matrices with complex entries, which multigrid cannot solve. Measured for the value and gradient
 # of a wave problem: at 2048^2 LU takes 96 s and 8.3 GB, and GMRES does not converge. At 32^3 LU takes 5 s and 0.6 GB,
@@ -251,6 +264,10 @@ def choose_method(system: System, solves: str) -> Choice:
         return Choice("separable", reason, engine)
     if not structure.has_entries:
         return Choice("krylov", "only products with the operator are known")
+    if _is_large_flow(system):
+        system.splitting = None  # the cycles of the fields take all unknowns
+        size = _size_in_words(system, "", 3)
+        return Choice("schur", f"{size}, of which some are multipliers, such as a pressure: LU costs more")
     splitting = _splitting(system)
     if splitting is None:
         return _choose_by_entries(system, solves, dimension, "")
@@ -258,6 +275,18 @@ def choose_method(system: System, solves: str) -> Choice:
         size = _size_in_words(system, "", dimension)
         return Choice("direct", f"{size}: the system is triangular, substitution solves it")
     return _choose_by_entries(system.coupled, solves, dimension, f", {splitting.size} others by substitution")
+
+
+def _is_large_flow(system: System) -> bool:
+    """Return whether a system has several fields in 3-D, of which one is a multiplier, and is too large for LU."""
+    parts = system.op.domain.parts
+    if len(parts) < 2 or max(map(len, parts)) != 3 or system.complex:
+        return False
+    if system.unknowns <= SCHUR_FROM:
+        return False
+    from sparsedp.solvers.saddle_point import find_multipliers
+
+    return bool(find_multipliers(system).any())
 
 
 def _transforms(system: System, dimension: int) -> Engine | None:

@@ -62,8 +62,8 @@ def inverse(
     op : Operator
         A square operator: fields on its domain and on its codomain have the same layout.
     method : str
-        "auto", "separable", "direct", "structured", "multigrid" or "krylov". With "auto" a fixed rule chooses the
-        method, and ``print(inv)`` shows the reason.
+        "auto", "separable", "direct", "structured", "multigrid", "krylov" or "schur". With "auto" a fixed rule chooses
+        the method, and ``print(inv)`` shows the reason.
     rtol : float
         Relative tolerance, 0 < rtol < 1: a solve succeeds if |b - op(x)| <= rtol |b|, or if the residual is at the
         level of rounding errors. The residual is computed from x. Adjoint solves use the same tolerance.
@@ -73,8 +73,8 @@ def inverse(
         What to do if the operator is singular and the right-hand side is not in its range: raise IncompatibleError, or
         project the right-hand side onto the range.
     **options
-        Options of the method. "separable" has none. "auto" accepts the options of all methods; the chosen method must
-        accept them too.
+        Options of the method. "separable" and "schur" have none. "auto" accepts the options of all methods; the chosen
+        method must accept them too.
 
         ==========  ==============  ==========  =================================================================
         method      option          default     meaning
@@ -199,7 +199,7 @@ def system_and_choice(op: Operator, settings: SolveSettings, solves: str) -> tup
     """Return the System of an operator, and the Choice of its method; the parameters are those of `build`."""
     method = settings.method
     system = System(op, settings.rtol, settings.maxiter)
-    if method in ("krylov", "separable"):
+    if method in ("krylov", "schur", "separable"):
         system.splitting = None  # these methods solve for all unknowns and do not use the matrix entries
     if method == "auto":
         choice = choose_method(system, solves)

@@ -202,6 +202,7 @@ class Jacobians:
         self._points = Cache()
         self._operators = Cache()
         self._matrices = Cache()
+        self._last_method = self.settings.method
         self._lock = RLock()  # held by the thread that searches a pattern
 
     def __str__(self) -> str:
@@ -230,12 +231,25 @@ class Jacobians:
         near : Engine, optional
             Of another Jacobian, to precondition the solves with this one, which is then not cached.
         """
+        if self._is_large_flow:
+            self._release()
         op, is_exact = self._operator(equation, x, leaves)
         point = Point(equation, *copied((x, leaves)))
         linearisation = Linearisation(self._solver(op, near), point, is_exact)
         if near:
             return linearisation
         return self._points.put(_key(equation, x, leaves), linearisation)
+
+    def _release(self):
+        """Drop all set-ups, because two of them do not fit into memory."""
+        self._points = Cache()
+        self._operators = Cache()
+        self._matrices = Cache()
+
+    @property
+    def _is_large_flow(self):
+        """Whether the last set-up was by method "schur", which is for flows in 3-D; equal entries are not looked up."""
+        return self._last_method == "schur"
 
     def cached(self, equation: Any, x: Any, leaves: Sequence[Any]) -> Linearisation:
         """Return the Jacobian at a point for a derivative, from the cache or new, compared with the residual."""
@@ -256,7 +270,7 @@ class Jacobians:
 
     def _solver(self, op, near):
         """Return the Solver of a Jacobian, from the cache of entries or new."""
-        if op.form != "explicit" or near:
+        if op.form != "explicit" or near or self._is_large_flow:
             return self._build(op, near)
         key: tuple[Any, ...]
         if op is self._operators.last:
@@ -273,7 +287,9 @@ class Jacobians:
         return self._matrices.put(key, solver)
 
     def _build(self, op, near):
-        return build(op, self.settings, self.solver_name, solves="few", near=near, all_rows=False).solver
+        solver = build(op, self.settings, self.solver_name, solves="few", near=near, all_rows=False).solver
+        self._last_method = solver.engine.method
+        return solver
 
     def check_after_slow_step(self, linearisation: Linearisation) -> bool:
         """Do the same as `complete_pattern`, unless the user supplied the Jacobian: it may be a simpler one."""
@@ -346,22 +362,29 @@ class Jacobians:
     def _assembled(self, pattern, product, unknowns):
         """Return J as an Operator from its products, and whether it is certainly exact."""
         coloured = pattern.coloured
-        op = self._explicit_operator(coloured.matrix(product), unknowns, pattern.cells, self.solver_name)
+        op = self._explicit_operator(coloured.matrix(product), unknowns, pattern, self.solver_name)
         is_full = coloured.pattern.nnz == unknowns.size**2
         return op, coloured.by_rows and is_full
 
-    def _explicit_operator(self, matrix, unknowns, cells, name):
+    def _explicit_operator(self, matrix, unknowns, pattern, name):
         """Return the matrix as an Operator, the last one if it is equal, on the cells of a grid if it is symmetric."""
+        cells = pattern.cells
         if cells is not None and unknowns.shapes[0] != cells.shape:
             cells = None  # a field of another shape with as many unknowns
         key = (cells, matrix.indptr, matrix.indices, matrix.data)
-        op = self._operators.find(key)
+        op = None if self._is_large_flow else self._operators.find(key)
         if op is not None:
             return op
         space = Space(unknowns.size)
+        shapes = pattern.coloured.shapes
+        if shapes is not None and len(shapes) > 1:
+            space = Space(None, "unknowns", None, shapes)
         if cells is not None and _is_symmetric(matrix, cells):
             space = cells
-        return self._operators.put(key, from_matrix(matrix, space, space, name))
+        op = from_matrix(matrix, space, space, name)
+        if self._is_large_flow:
+            return op
+        return self._operators.put(key, op)
 
     def _as_operator(self, jacobian, unknowns, name):
         """Return a Jacobian that the user supplied as an Operator on the unknowns."""

@@ -472,6 +472,7 @@ class Newton:
             self.near = solver.engine
 
     def _linearise(self):
+        self.J = None  # its memory is free while the next one is set up
         try:
             self.J = self.jacobians.evaluate(self.equation, self.x, self.leaves, self.near)
             self.is_stale = False

@@ -344,6 +344,7 @@ class ColouredPattern:
             fullest_row = np.diff(pattern.indptr).max(initial=0)
             by_rows = fullest_column <= 2 * fullest_row
         self.by_rows = bool(by_rows)
+        self.shapes = shapes
         self.seeds = colour_columns(pattern.T.tocsr() if by_rows else pattern, shapes)
         self.count = _count_of(self.seeds)
         self._set_pattern(pattern, self.seeds)
@@ -352,6 +353,7 @@ class ColouredPattern:
         """Store the pattern, and where each of its entries stands in the table of products (colour, row)."""
         self.pattern = pattern
         row = rows_of(pattern)
+        colours = colours.astype(np.int32)
         if self.by_rows:
             self._places = colours[row], pattern.indices
         else:

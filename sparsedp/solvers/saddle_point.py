@@ -1,0 +1,328 @@
+"""Method "schur": GMRES for flows and other systems with constraints, preconditioned by blocks.
+
+The unknowns are fields, one after the other. The last ones in a flow, the pressure, are multipliers: their equations,
+the constraint div v = 0, do not contain them. With the multipliers last the matrix is
+
+    [ A  G ]                              [ H  G ]
+    [ D  C ],    and one step solves with [ 0  S ],
+
+where H has the diagonal blocks of A, one for each field, whose inverses are approximated by one cycle of algebraic
+multigrid each, and S is the diagonal of the Schur complement C - D A^-1 G with the diagonal of A in place of A. For
+A = nu L on the faces of a grid, S is -1 / nu, which has the spectrum of the Schur complement on every grid. Convection
+adds iterations in proportion to the Reynolds number; the number of cells does not.
+
+**Constants.** A pressure that only its value in one cell fixes gives A one tiny eigenvalue, on which GMRES loses tens
+of iterations. Its right vector e is 1 on the multipliers of a connected region. Its left vector w has the ratios that
+make w D = 0, the volumes of cells. After each step, the multiple of e is added that makes the residual orthogonal to w.
+
+For A^T, the transpose of the same step is used.
+
+References
+----------
+H. C. Elman, D. J. Silvester, A. J. Wathen, Finite Elements and Fast Iterative Solvers, Oxford University Press, 2014,
+chapters 4 and 9.
+M. Benzi, G. H. Golub, J. Liesen, Numerical solution of saddle point problems, Acta Numerica 14 (2005) 1-137.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.csgraph import breadth_first_order, connected_components
+
+from sparsedp.errors import ConvergenceError
+from sparsedp.solvers.algebraic_multigrid import DENSE_UP_TO, Hierarchy, ruge_stueben
+from sparsedp.solvers.krylov import Krylov
+from sparsedp.solvers.records import failure
+from sparsedp.solvers.scaling import exponent_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from sparsedp.solvers.system import System
+
+__all__ = ["SchurComplement", "find_multipliers", "schur_engine"]
+
+MAXITER = 600
+RESTART = 60
+MOST_NUMBERS = 2**25  # in the basis of GMRES, 0.25 GB
+STRENGTH = 0.25
+LEVELS = 25
+MOST_REGIONS = 20  # regions with constants of their own that are treated; GMRES finds those of further ones
+ROUNDING = 1e-12  # a sum below this share of its terms is 0
+SHARE_OF_ZEROS = 0.5  # a field of which more diagonal entries are 0 is a multiplier
+
+
+def schur_engine(system: System) -> SchurComplement:
+    """Build GMRES for a system with multipliers, such as the pressure of a flow.
+
+    Parameters
+    ----------
+    system : System
+        Its matrix entries must be known.
+
+    Returns
+    -------
+    SchurComplement
+
+    Raises
+    ------
+    ValueError
+        If the entries are not known, or no field has a diagonal of zeros.
+    ConvergenceError
+        With status "setup_failed", if a field cannot be coarsened or a multiplier occurs in no equation.
+    """
+    if not system.op.structure.has_entries:
+        raise ValueError(f"schur needs the entries, {system.unscaled} has only products; write method='krylov'")
+    is_multiplier = find_multipliers(system)
+    if not is_multiplier.any():
+        raise ValueError(
+            f"schur needs multipliers, such as a pressure, whose diagonal entries are 0; {system.unscaled} has none; "
+            "write method='direct' or 'multigrid'"
+        )
+    return SchurComplement(system, is_multiplier)
+
+
+def find_multipliers(system: System) -> NDArray[np.bool_]:
+    """Return for each unknown whether it belongs to a field whose diagonal entries are 0.
+
+    Some of its entries may differ from 0, such as the one that fixes the constant of a pressure.
+    """
+    is_unknown = _unknowns(system)
+    is_zero = (system.matrix.diagonal() == 0) & is_unknown
+    is_multiplier = is_zero.copy()
+    for part in _fields(system):
+        if part.stop - part.start < system.size:
+            is_multiplier[part] = np.sum(is_zero[part]) > SHARE_OF_ZEROS * np.sum(is_unknown[part])
+    return is_multiplier & is_unknown
+
+
+def _unknowns(system: System) -> NDArray[np.bool_]:
+    """Return for each entry of a field whether it is an unknown."""
+    if system.active is None:
+        return np.ones(system.size, dtype=bool)
+    return system.active
+
+
+def _fields(system: System) -> Iterator[slice]:
+    """Yield the places of the fields among the unknowns."""
+    offsets = system.op.domain.offsets
+    for start, stop in zip(offsets[:-1], offsets[1:], strict=True):
+        if stop > start:
+            yield slice(start, stop)
+
+
+class Block(NamedTuple):
+    """A cycle that approximates the inverse of the diagonal block of some unknowns.
+
+    Attributes
+    ----------
+    places : int array
+    scale : array
+        Factors of the rows, which give a positive diagonal of the size 1.
+    hierarchy : Hierarchy
+    """
+
+    places: NDArray[Any]
+    scale: NDArray[Any]
+    hierarchy: Hierarchy
+
+    def solve(self, r: NDArray[Any], transposed: bool) -> NDArray[Any]:
+        """Return the result of one cycle for the block, or for its transpose."""
+        if transposed:
+            return self.scale * self.hierarchy.T.cycle(r)
+        return self.hierarchy.cycle(self.scale * r)
+
+
+class Constants:
+    """The constants of the multipliers that hardly any equation determines, one for each connected region.
+
+    Parameters
+    ----------
+    multipliers : int array
+        Those of these regions, as places among the unknowns.
+    region : int array
+        The region of each.
+    weights : array
+        The entry of each in the left vector of its region.
+    scale : array
+        w A e for each region.
+    """
+
+    def __init__(
+        self, multipliers: NDArray[Any], region: NDArray[Any], weights: NDArray[Any], scale: NDArray[Any]
+    ) -> None:
+        self.multipliers = multipliers
+        self.region = region
+        self.weights = weights
+        self.scale = scale
+
+    @classmethod
+    def of(
+        cls, divergence: sp.csr_array, gradient: sp.csr_array, matrix: sp.csr_array, multipliers: NDArray[Any]
+    ) -> Constants | None:
+        """Return the constants of a matrix; None if there are none."""
+        columns = sp.csc_array(divergence)
+        columns.eliminate_zeros()
+        first = columns.indptr[:-1][np.diff(columns.indptr) == 2]  # faces between two cells
+        one, two = columns.indices[first], columns.indices[first + 1]
+        size = multipliers.size
+        links = sp.coo_array((np.ones(first.size), (one, two)), shape=(size, size)).tocsr()
+        count, region = connected_components(links, directed=False)
+        has_gradient = np.abs(gradient @ np.ones(size)) > ROUNDING * (abs(gradient) @ np.ones(size))
+        touched = sp.csr_array(gradient[has_gradient]).indices
+        is_free = np.ones(count, dtype=bool)
+        is_free[region[touched]] = False
+        logarithms = np.log(np.abs(columns.data[first + 1])) - np.log(np.abs(columns.data[first]))
+        weights = np.exp(_sums_along_trees(links, one, two, logarithms, region, count))
+        pinned = matrix.diagonal()[multipliers]
+        scale = np.bincount(region, weights * pinned, count)
+        is_free &= scale != 0
+        if not is_free.any():
+            return None
+        kept = is_free[region]
+        scale[~is_free] = 1.0
+        return cls(multipliers[kept], region[kept], weights[kept], scale)
+
+    def amount(self, r: NDArray[Any], transposed: bool) -> NDArray[Any]:
+        """Return for each region the multiple of its vector that a residual asks for."""
+        residual = r[self.multipliers]
+        if not transposed:
+            residual = residual * self.weights
+        return np.bincount(self.region, residual, self.scale.size) / self.scale
+
+    def vector(self, amount: NDArray[Any], transposed: bool, size: int) -> NDArray[Any]:
+        """Return these multiples of the right vectors, or of the left ones for the transposed matrix."""
+        values = amount[self.region]
+        if transposed:
+            values = values * self.weights
+        result = np.zeros(size)
+        result[self.multipliers] = values
+        return result
+
+
+def _sums_along_trees(links, one, two, differences, region, count):
+    """Return numbers f, 0 at the first node of each region, with f(one) - f(two) = differences on a spanning tree."""
+    size = region.size
+    places = np.concatenate([one, two]), np.concatenate([two, one])
+    step = sp.coo_array((np.concatenate([differences, -differences]), places), shape=(size, size)).tocsr()
+    number = sp.coo_array((np.ones(places[0].size), places), shape=(size, size)).tocsr()
+    roots = np.unique(region, return_index=True)[1]
+    parent = np.arange(size)
+    for root in roots[:MOST_REGIONS]:
+        _, predecessors = breadth_first_order(links, root, directed=False)
+        reached = predecessors >= 0
+        parent[reached] = predecessors[reached]
+    total = np.zeros(size)
+    moving = np.flatnonzero(parent != np.arange(size))
+    if moving.size:  # two cells of a periodic axis have two faces: their mean
+        total[moving] = step[moving, parent[moving]] / number[moving, parent[moving]]
+    while np.any(parent != parent[parent]):  # each pass doubles the length of the paths that are summed
+        total = total + total[parent]
+        parent = parent[parent]
+    return total
+
+
+class SchurComplement(Krylov):
+    """GMRES with the block preconditioner of a system with multipliers.
+
+    Parameters
+    ----------
+    system : System
+    is_multiplier : bool array, shape (n,)
+    """
+
+    method = "schur"
+    hierarchical = True
+    advice = "; write method='direct', or approach a large Reynolds number by dp.continuation"
+
+    def __init__(self, system: System, is_multiplier: NDArray[np.bool_]) -> None:
+        super().__init__(system, maxiter=MAXITER)
+        self.symmetric = False
+        self.restart = int(np.clip(MOST_NUMBERS // max(system.size, 1), 20, RESTART))
+        matrix = sp.csr_array(system.matrix)
+        self.multipliers = np.flatnonzero(is_multiplier)
+        is_other = _unknowns(system) & ~is_multiplier
+        self.others = np.flatnonzero(is_other)
+        self.blocks = []
+        names = []
+        for part in _fields(system):
+            places = np.arange(part.start, part.stop)[is_other[part]]
+            if places.size:
+                self.blocks.append(_block(system, matrix, places))
+                names.append(self.blocks[-1].hierarchy.words)
+        rows = sp.csr_array(matrix[self.others])
+        self.gradient = sp.csr_array(rows[:, self.multipliers])
+        divergence = sp.csr_array(matrix[self.multipliers][:, self.others])
+        diagonal = matrix.diagonal()
+        own = diagonal[self.others]
+        inverse = np.divide(1.0, own, out=np.zeros_like(own), where=own != 0)
+        products = divergence.multiply(self.gradient.T.multiply(inverse))
+        schur = diagonal[self.multipliers] - products @ np.ones(self.others.size)
+        if not np.all(schur):
+            number = int(self.multipliers[np.argmin(np.abs(schur))])
+            raise ConvergenceError(
+                f"schur cannot be set up: unknown {number} of {system.unscaled} is a multiplier without a constraint; "
+                "give it an equation or write method='direct'",
+                info=failure("setup_failed"),
+            )
+        self.schur = schur
+        self.constants = Constants.of(divergence, self.gradient, matrix, self.multipliers)
+        self.hierarchy = (
+            f"GMRES, restarted after {self.restart} iterations; {self.multipliers.size} multipliers; "
+            + "; ".join(names)
+        )
+
+    def precondition(self, r: NDArray[Any], transposed: bool) -> NDArray[Any]:
+        """Return the result of one step for A, or for A^T."""
+        constants = self.constants
+        if constants is None:
+            return self._block_solve(r, transposed)
+        if transposed:
+            amount = constants.amount(r, transposed)
+            moved = constants.vector(amount, transposed, r.size)
+            return self._block_solve(r - self.system.product(moved, transposed), transposed) + moved
+        z = self._block_solve(r, transposed)
+        amount = constants.amount(r - self.system.product(z), transposed)
+        return z + constants.vector(amount, transposed, r.size)
+
+    def _block_solve(self, r, transposed):
+        """Return the solution of the block triangular system, or of its transpose."""
+        z = np.zeros_like(r)
+        multiplier = r[self.multipliers]
+        if not transposed:
+            multiplier = multiplier / self.schur
+            z[self.multipliers] = multiplier
+            r = r.copy()
+            r[self.others] -= self.gradient @ multiplier
+        for block in self.blocks:
+            z[block.places] = block.solve(r[block.places], transposed)
+        if transposed:
+            z[self.multipliers] = (multiplier - self.gradient.T @ z[self.others]) / self.schur
+        return z
+
+
+def _block(system, matrix, places):
+    """Return the Block of some unknowns."""
+    start, stop = places[0], places[-1] + 1
+    if stop - start == places.size:
+        own = sp.csr_array(matrix[start:stop, start:stop])
+    else:
+        own = sp.csr_array(matrix[places][:, places])
+    diagonal = own.diagonal()
+    signs = np.where(diagonal < 0, -1.0, 1.0)
+    unit = 2.0 ** -exponent_of(np.max(np.abs(diagonal), initial=0.0) or 1.0)
+    scale = unit * signs
+    levels = ruge_stueben(sp.csr_array(own.multiply(scale[:, None])), STRENGTH, LEVELS)
+    coarsest = levels[-1].A.shape[0]
+    if coarsest > DENSE_UP_TO:
+        raise ConvergenceError(
+            f"schur on {system.unscaled} ends at a level of {coarsest} unknowns, and it may have {DENSE_UP_TO}; "
+            "write method='direct'",
+            info=failure("setup_failed"),
+        )
+    return Block(places, scale, Hierarchy(levels, 1, ("forward",), ("backward",)))
