@@ -1,5 +1,6 @@
-"""Diffusive terms of a flow step, explicit or by the trapezoidal rule, and the amplification of waves by a step.
+"""Diffusive terms of a flow step with a constant coefficient, and the amplification of waves by a step.
 
+The terms are explicit, or implicit by the trapezoidal rule; `variable_diffusion` has those whose coefficient varies.
 The second-order Adams-Bashforth method is stable for an explicit term nu L u if dt nu |lambda| <= 1 for all eigenvalues
 lambda of L. For a wave with the Courant number c and the damping d = dt nu k^2 in a step, the amplification factor of
 the step is the largest absolute value |z| of the roots of
@@ -14,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sparsedp._utils.validation import check_number, number_beside, rounded_down
-from sparsedp.autodiff.program_trace import check_values
+from sparsedp._utils.validation import number_beside, rounded_down
 from sparsedp.errors import UnstableStepError
 from sparsedp.operators.masks_and_lift import identity
 from sparsedp.solvers.inverse import inverse
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from sparsedp.flow.settings import FlowSettings
     from sparsedp.operators.operator import Operator
 
-__all__ = ["Diffusion", "wave_growth"]
+__all__ = ["Diffusion", "check_stable", "spectral_bound", "wave_growth"]
 
 ROUNDING = 1e-12  # tolerance: a step exactly at the stability limit may exceed it by a rounding error
 
@@ -36,8 +36,8 @@ class Diffusion:
     ----------
     name : str
         Name of nu in error messages.
-    coefficient : float or callable
-        nu, or ``nu(params)``.
+    coefficient : float
+        nu.
     build_operator : callable
         ``build_operator()`` returns L.
     settings : FlowSettings
@@ -49,16 +49,17 @@ class Diffusion:
     solve : Operator or None
         The inverse of I - dt nu L / 2 if the term is implicit, else None.
     damping : float
-        dt nu |L|, with the largest absolute row sum as |L|; 0 if nu is a function.
+        dt nu |L|, with the largest absolute row sum as |L|.
     """
 
+    varies = False
     op: Any
     solve: Any
 
     def __init__(
         self,
         name: str,
-        coefficient: Any,
+        coefficient: float,
         build_operator: Callable[[], Operator],
         settings: FlowSettings,
     ) -> None:
@@ -73,33 +74,24 @@ class Diffusion:
         self.damping = 0.0
         if self.op is None:
             return
-        row_sums = self.op.structure.magnitude()(np.ones(self.op.domain.size))
-        self._spectral_bound = float(np.max(row_sums, initial=0.0))  # no eigenvalue exceeds the largest row sum
-        if not callable(coefficient):
-            self.damping = settings.dt * coefficient * self._spectral_bound
+        self.damping = settings.dt * coefficient * spectral_bound(self.op)
         if settings.implicit:
             self.solve = inverse(identity(self.op.domain) - (0.5 * settings.dt * coefficient) * self.op)
-        elif not callable(coefficient):
-            self._check_stable(coefficient)
+        else:
+            check_stable(name, coefficient, settings.dt, coefficient * spectral_bound(self.op), settings)
 
-    def add_explicit(self, rate: Any, u: Any, params: Any, wall_part: Callable[[], Any]) -> Any:
+    def add_explicit(self, rate: Any, u: Any, wall_part: Callable[[], Any]) -> Any:
         """Return the rate plus this term if the term is explicit; return the rate itself if it is implicit.
 
         Parameters
         ----------
         rate, u : array
-        params : tree
-            Argument of a coefficient that is a function.
         wall_part : callable
             ``wall_part()`` returns the contribution of walls to L u, or None if it is 0.
         """
         if self.op is None or self.solve is not None:
             return rate
-        coefficient = self.coefficient
-        if callable(coefficient):
-            coefficient = coefficient(params)
-            check_values(self._check_coefficient, coefficient)
-        return rate + coefficient * self._laplacian(u, wall_part())
+        return rate + self.coefficient * self._laplacian(u, wall_part())
 
     def step_implicit(self, explicit: Any, u: Any, wall_part: Any) -> Any:
         """Return the field at the end of the step, by the trapezoidal rule.
@@ -121,25 +113,26 @@ class Diffusion:
             return self.op(u)
         return self.op(u) + wall_part
 
-    def _check_coefficient(self, coefficient: Any) -> None:
-        """Raise an error if the coefficient that a function returned is negative, or makes the term unstable."""
-        self._check_stable(check_number("the viscosity of flow_step", coefficient, ">= 0"))
 
-    def _check_stable(self, coefficient: float) -> None:
-        """Raise UnstableStepError if the explicit term is unstable."""
-        dt = self.settings.dt
-        rate = coefficient * self._spectral_bound
-        if not self.settings.strict or not dt * rate > 1 + ROUNDING:
-            return
-        largest = rounded_down(1 / rate)
-        if self.settings.may_be_implicit:
-            advice = "take smaller steps or write implicit=True"
-        else:
-            advice = "take smaller steps, or write unstable='allow'"
-        raise UnstableStepError(
-            f"flow_step is unstable for {self.name} = {coefficient:.6g} with "
-            f"dt = {number_beside(dt, float(largest), digits=12)}: the largest stable dt is {largest}; {advice}"
-        )
+def spectral_bound(op: Operator) -> float:
+    """Return an upper bound of the absolute eigenvalues of an operator: its largest absolute row sum."""
+    row_sums = op.structure.magnitude()(np.ones(op.domain.size))
+    return float(np.max(row_sums, initial=0.0))
+
+
+def check_stable(name: str, coefficient: float, dt: float, rate: float, settings: FlowSettings) -> None:
+    """Raise UnstableStepError if an explicit term with eigenvalues up to `rate` is unstable, unless that is allowed."""
+    if not settings.strict or not dt * rate > 1 + ROUNDING:
+        return
+    largest = rounded_down(1 / rate)
+    if settings.friction is None:
+        advice = "take smaller steps or write implicit=True"
+    else:
+        advice = "take smaller steps, or write unstable='allow'"
+    raise UnstableStepError(
+        f"flow_step is unstable for {name} = {coefficient:.6g} with "
+        f"dt = {number_beside(dt, float(largest), digits=12)}: the largest stable dt is {largest}; {advice}"
+    )
 
 
 def wave_growth(courant: float, damping: float, implicit: bool) -> float:

@@ -58,6 +58,9 @@ from sparsedp.flow.pressure_projection import projection
 from sparsedp.flow.projection_setup import mask_of_faces
 from sparsedp.flow.scalars import Scalar
 from sparsedp.flow.settings import FlowSettings
+from sparsedp.flow.variable_density import WeightedProjection, density_on_faces
+from sparsedp.flow.variable_diffusion import Coefficient, VariableDiffusion, is_constant, takes_params_alone
+from sparsedp.flow.viscous_stress import ViscousStress
 from sparsedp.grid.boundary_conditions import inflow as inflow_side
 from sparsedp.grid.boundary_conditions import no_slip, occurring
 from sparsedp.grid.grid import check_grid
@@ -95,6 +98,7 @@ def flow_step(
     unstable: str = "raise",
     friction: Any = None,
     inflow: Any = None,
+    density: Any = None,
 ) -> FlowStep:
     """Return the time step ``step(state, params)`` of incompressible flow, of order 2 in space and time.
 
@@ -223,6 +227,7 @@ def flow_step(
         unstable=unstable,
         friction=friction,
         inflow=inflow,
+        density=density,
     )
     settings = FlowSettings(**copied(arguments))  # copies: the caller may change the originals
     _check(settings)
@@ -232,11 +237,14 @@ def flow_step(
 def _check(settings: FlowSettings) -> None:
     """Raise an error if arguments of `flow_step` are out of range or contradict each other."""
     check_grid("flow_step", settings.grid)
-    _check_constant("dt", settings.dt, "> 0")
-    if not callable(settings.viscosity):
-        _check_constant("viscosity", settings.viscosity, ">= 0")
-    elif settings.implicit:
-        raise ValueError("implicit viscosity of flow_step is a number, got a function; write implicit=False")
+    if callable(settings.dt):
+        check_function("flow_step", settings.dt, "dt=lambda params: ...", 1)
+    else:
+        _check_constant("dt", settings.dt, "> 0")
+    _check_coefficient("viscosity", settings.viscosity, ">= 0")
+    if settings.density is not None:
+        settings.grid.backend.check("density in flow_step")
+        _check_coefficient("density", settings.density, "> 0")
     if settings.scalars is not None:
         check_type("flow_step", settings.scalars, dict, "a dict of scalars", 'scalars={"heat": {...}}')
     if settings.force is not None:
@@ -244,6 +252,13 @@ def _check(settings: FlowSettings) -> None:
             check_function("flow_step", settings.force, "force=lambda v, s, params: ...", 3)
         else:
             check_function("flow_step", settings.force, "force=lambda v, params: ...", 2)
+    if callable(settings.density) and not takes_params_alone(settings.density):
+        check_function("flow_step", settings.density, "density=lambda s, params: ...", 2)
+    if callable(settings.viscosity) and not takes_params_alone(settings.viscosity):
+        if settings.scalars:
+            check_function("flow_step", settings.viscosity, "viscosity=lambda shear_rate, s, params: ...", 3)
+        else:
+            check_function("flow_step", settings.viscosity, "viscosity=lambda shear_rate, params: ...", 2)
     if callable(settings.walls):
         check_function("flow_step, as walls,", settings.walls, "walls=lambda params: values", 1)
     elif settings.walls is not None:
@@ -259,21 +274,42 @@ def _check(settings: FlowSettings) -> None:
             raise ValueError(
                 f"scalar {name!r} of flow_step needs a dict of {', '.join(SCALAR_ENTRIES)}, got {entries!r}"
             )
-        _check_constant(f"diffusivity of {name!r}", entries.get("diffusivity", 0.0), ">= 0")
+        diffusivity = entries.get("diffusivity", 0.0)
+        _check_coefficient(f"diffusivity of {name!r}", diffusivity, ">= 0")
+        if callable(diffusivity) and not takes_params_alone(diffusivity):
+            check_function("flow_step", diffusivity, "diffusivity=lambda s, params: ...", 2)
+            if settings.implicit:
+                raise ValueError(
+                    f"implicit diffusion of flow_step takes a diffusivity of {name!r} that is a function of params "
+                    "alone, got one of the scalars; write implicit=False"
+                )
         if entries.get("source") is not None:
             check_function("flow_step", entries["source"], "source=lambda s, params: ...", 2)
         if callable(entries.get("values")):
             check_function("flow_step, as values,", entries["values"], "values=lambda params: ...", 1)
 
 
+def _check_coefficient(name: str, value: Any, range_: str) -> None:
+    """Raise unless a coefficient is a function, an array, or a number in the given range that is not traced."""
+    if not callable(value) and np.ndim(sample(value)) == 0:
+        _check_constant(name, value, range_)
+    elif isbox(value):
+        raise _traced(name)
+
+
 def _check_constant(name: str, number: Any, range_: str) -> None:
     """Raise unless an argument is a finite number in the given range that is not traced."""
     if isbox(number):
-        raise DerivativeError(
-            f"flow_step needs a constant {name}, got a traced one; a derivative in the viscosity takes "
-            "viscosity=lambda params: ..."
-        )
+        raise _traced(name)
     check_number(f"{name} of flow_step", number, range_)
+
+
+def _traced(name: str) -> DerivativeError:
+    argument = name.split()[0]
+    return DerivativeError(
+        f"flow_step needs a constant {name}, got a traced one; a derivative in the {argument} takes "
+        f"{argument}=lambda params: ..."
+    )
 
 
 def _rebuild(arguments: dict[str, Any]) -> FlowStep:
@@ -290,14 +326,14 @@ class FlowStep(Reconstructible):
     Attributes
     ----------
     grid : Grid
-    dt : float
+    dt : float or callable
     project : Projection
     pressure : Operator
         From a face field to the pressure potential of `project`.
     divergence, pressure_gradient : Operator
     convect : callable or None
         The function that `convection` returns; None without convection.
-    viscous : Diffusion
+    viscous : Diffusion or VariableDiffusion
     walls : WallsAtRest
         Tangential velocities of walls.
     scalars : dict of Scalar
@@ -309,7 +345,9 @@ class FlowStep(Reconstructible):
         grid = settings.grid
         self.settings = settings
         self.grid = grid
-        self.dt = float(settings.dt)
+        self.dt: Any = settings.dt
+        if not callable(settings.dt):
+            self.dt = float(settings.dt)
         self.project = projection(grid, settings.solid, settings.boundary)
         self.pressure = self.project.pressure
         self.divergence = divergence(grid)
@@ -319,7 +357,18 @@ class FlowStep(Reconstructible):
         if settings.convective:
             self.convect = convection(grid, settings.boundary, settings.solid)
         build_laplacian = partial(face_laplacian, grid, settings.boundary, settings.solid, settings.solid_boundary)
-        self.viscous = Diffusion("viscosity", settings.viscosity, build_laplacian, settings)
+        self.viscous: Any
+        if is_constant(settings.viscosity, settings) and settings.density is None:
+            self.viscous = Diffusion("viscosity", settings.viscosity, build_laplacian, settings)
+        else:
+            build_stress = partial(ViscousStress, settings, setup.sides)
+            self.viscous = VariableDiffusion("viscosity", settings.viscosity, settings, build_stress, build_laplacian)
+        self._density: Any = None
+        if settings.density is not None:
+            self._density = Coefficient("density", settings.density, settings, "> 0")
+            self._to_faces = density_on_faces(grid)
+            self._weighted_projection = WeightedProjection(setup)
+        self._extrapolates = self.viscous.varies and settings.implicit and self.viscous.coefficient.needs_fields
         self.walls = moving_walls(settings, setup.sides)
         self.scalars = {
             name: Scalar(name, settings, self.divergence, **entries)
@@ -365,7 +414,6 @@ class FlowStep(Reconstructible):
         """
         if s is None:
             s = {}
-        v = self.project(self._set_inflow(v, params))
         if not isinstance(s, dict) or s.keys() != self.scalars.keys():
             if isinstance(s, dict):
                 names = list(s)
@@ -374,18 +422,28 @@ class FlowStep(Reconstructible):
             raise ShapeError(
                 f"flow_step needs the scalars {sorted(self.scalars)}, got {names}; write step.start(v, params, s)"
             )
+        v = self._set_inflow(v, params)
+        if self._density is None:
+            v = self.project(v)
+        else:
+            v, _ = self._weighted_projection.split(v, self._face_density(s, params, dtype_of(v)))
         walls = self.walls.velocities(params, dtype_of(v))
+        dt = self._step_length(params)
         state = {
             "v": v,
             "p": np.zeros(np.shape(v)[:-1] + self.grid.shape, dtype_of(v)),
-            "a": self.acceleration(v, params, s, self._friction(params), walls),
+            "a": self.acceleration(v, params, s, self._friction(params), walls, dt),
         }
         if self.walls.changes:
             state["walls"] = walls
+        if callable(self.dt):
+            state["dt"] = dt
+        if self._extrapolates:
+            state["before"] = v
         if s:
             state["s"] = s
             values = self._wall_values(s, params)
-            state["r"] = self._rates(v, s, params, values)
+            state["r"] = self._rates(v, s, params, values, dt)
             if values:
                 state["values"] = values
         return state
@@ -406,38 +464,138 @@ class FlowStep(Reconstructible):
         dict
         """
         self._check_state(state)
-        dt = self.dt
+        dt = self._step_length(params)
         v = state["v"]
         p = state["p"]
         s = state.get("s", {})
         if self.convect is not None and self.settings.strict:
-            check_values(self._check_convection, v)
+            check_values(self._check_convection, v, dt)
         friction = self._friction(params)
         walls = state.get("walls", self.walls.constant)
         walls_after = self.walls.velocities(params, dtype_of(v))
-        a = self.acceleration(v, params, s, friction, walls)
-        predicted = v + dt * (1.5 * a - 0.5 * state["a"] - self.pressure_gradient(p))
+        a = self.acceleration(v, params, s, friction, walls, dt)
+        density = None
+        scalars: dict[str, Any] = {}
+        mean_scalars = s
+        if s and (self._density is not None or self._extrapolates):  # both need the scalars at half the step
+            scalars = self._advance_scalars(state, params, dt)
+            mean_scalars = {name: 0.5 * (u + scalars["s"][name]) for name, u in s.items()}
+        slope_of_p = self.pressure_gradient(p)
+        if self._density is not None:
+            density = self._face_density(mean_scalars, params, dtype_of(v))
+            slope_of_p = slope_of_p / density
+        predicted = v + dt * (self._half_step_ahead(a, state["a"], state, dt) - slope_of_p)
         if friction is not None:
             predicted = (predicted - dt * friction * v) / (1.0 + dt * friction)
         predicted = self._set_inflow(predicted, params)
-        if self.viscous.solve is not None:
+        if self.viscous.varies:
+            if self.viscous.implicit:
+                before = state.get("before", v)
+                middle = self._half_step_ahead(v, before, state, dt)
+                predicted = self._step_viscosity(
+                    predicted, v, middle, mean_scalars, params, walls, walls_after, density, dt
+                )
+        elif self.viscous.solve is not None:
             wall_part = self.walls.laplacian_part_sum(walls, walls_after)
             predicted = self.viscous.step_implicit(predicted, v, wall_part)
-        q = self.pressure(predicted)
-        new = {"v": self._open_faces(predicted) + self.pressure_gradient(q), "p": p - q / dt, "a": a}
+        if density is None:
+            q = self.pressure(predicted)
+            next_v = self._open_faces(predicted) + self.pressure_gradient(q)
+        else:
+            next_v, q = self._weighted_projection.split(predicted, density)
+        new = {"v": next_v, "p": p - q / dt, "a": a}
         if self.walls.changes:
             new["walls"] = walls_after
+        if callable(self.dt):
+            new["dt"] = dt
+        if self._extrapolates:
+            new["before"] = v
         if s:
-            before = state.get("values", {})
-            after = self._wall_values(s, params)
-            rates = self._rates(v, s, params, before)
-            new["r"] = rates
-            new["s"] = {
-                name: scalar.step(s[name], rates[name], state["r"][name], before.get(name), after.get(name))
-                for name, scalar in self.scalars.items()
-            }
-            if after:
-                new["values"] = after
+            new.update(scalars or self._advance_scalars(state, params, dt))
+        return new
+
+    def _step_length(self, params: Any) -> Any:
+        """Return the length of the step."""
+        if not callable(self.dt):
+            return self.dt
+        dt = self.dt(params)
+        check_values(_check_step_length, dt)
+        return dt
+
+    def _half_step_ahead(self, now: Any, before: Any, state: dict[str, Any], dt: Any) -> Any:
+        """Return a value half a step ahead, extrapolated from those at the beginning of this and the previous step."""
+        if not callable(self.dt):
+            return 1.5 * now - 0.5 * before
+        half_ratio = 0.5 * dt / state["dt"]
+        return (1.0 + half_ratio) * now - half_ratio * before
+
+    def _step_viscosity(
+        self,
+        predicted: Any,
+        v: Any,
+        middle: Any,
+        s: dict[str, Any],
+        params: Any,
+        walls: Any,
+        walls_after: Any,
+        density: Any,
+        dt: Any,
+    ) -> Any:
+        """Return the velocity after an implicit viscosity that varies.
+
+        `middle`, `s` and `density` are the velocity, the scalars and the density on faces at half the step.
+        """
+        self._check_wall_velocities()
+        sum_of_walls = None
+        mean_of_walls = None
+        if self.walls.changes:
+            sum_of_walls = walls + walls_after
+            mean_of_walls = 0.5 * sum_of_walls
+        viscosity = self._viscosity(middle, s, params, mean_of_walls)
+        return self.viscous.step_implicit(predicted, v, viscosity, sum_of_walls, density, dt)
+
+    def _viscosity(self, v: Any, s: dict[str, Any], params: Any, walls: Any) -> Any:
+        """Return a viscosity that varies, a number or one value for each cell."""
+
+        def fields():
+            self._check_wall_velocities()
+            shear_rate = self.viscous.form.shear_rate(v, walls)
+            if self.scalars:
+                return shear_rate, s
+            return (shear_rate,)
+
+        return self.viscous.coefficient(fields, params, dtype_of(v))
+
+    def _check_wall_velocities(self) -> None:
+        """Raise an error if only the result of `face_lift` is known of the velocities of walls."""
+        if self.settings.walls is not None and not self.walls.changes:
+            raise ValueError(
+                "flow_step takes walls= as a function where the viscosity varies; write walls=lambda params: values, "
+                "with values on face_lift(grid, boundary).domain"
+            )
+
+    def _face_density(self, s: dict[str, Any], params: Any, dtype: np.dtype) -> Any:
+        """Return the density on faces, or a number."""
+        density = self._density(lambda: (s,), params, dtype)
+        if np.shape(sample(density)) == ():
+            return density
+        return self._to_faces(density)
+
+    def _advance_scalars(self, state: dict[str, Any], params: Any, dt: Any) -> dict[str, Any]:
+        """Return the entries of the next state that belong to scalars."""
+        s = state["s"]
+        before = state.get("values", {})
+        after = self._wall_values(s, params)
+        rates = self._rates(state["v"], s, params, before, dt)
+        new: dict[str, Any] = {"r": rates, "s": {}}
+        for name, scalar in self.scalars.items():
+            change = dt * self._half_step_ahead(rates[name], state["r"][name], state, dt)
+            diffusivity = None
+            if self.settings.implicit:
+                diffusivity = scalar.diffusivity(s, params)
+            new["s"][name] = scalar.step(s[name], change, before.get(name), after.get(name), diffusivity, dt)
+        if after:
+            new["values"] = after
         return new
 
     def _check_state(self, state: Any) -> None:
@@ -446,6 +604,10 @@ class FlowStep(Reconstructible):
             names += ["s", "r"]
         if self.walls.changes:
             names += ["walls"]
+        if callable(self.dt):
+            names += ["dt"]
+        if self._extrapolates:
+            names += ["before"]
         if any(scalar.changes for scalar in self.scalars.values()):
             names += ["values"]
         if not isinstance(state, dict) or state.keys() != set(names):
@@ -455,7 +617,13 @@ class FlowStep(Reconstructible):
             )
 
     def acceleration(
-        self, v: Any, params: Any, s: dict[str, Any] | None = None, friction: Any = None, walls: Any = None
+        self,
+        v: Any,
+        params: Any,
+        s: dict[str, Any] | None = None,
+        friction: Any = None,
+        walls: Any = None,
+        dt: Any = None,
     ) -> Any:
         """Return a(v), the sum of the explicit terms, plus friction * v; see the module docstring."""
         if self.convect is None:
@@ -466,7 +634,18 @@ class FlowStep(Reconstructible):
             a = a + self._free_faces(self._force(v, params, s))
         if friction is not None:
             a = a + friction * v
-        return self.viscous.add_explicit(a, v, params, partial(self.walls.laplacian_part, walls))
+        wall_part = partial(self.walls.laplacian_part, walls)
+        if not self.viscous.varies:
+            return self.viscous.add_explicit(a, v, wall_part)
+        if self.viscous.implicit:
+            return a
+        viscosity = self._viscosity(v, s or {}, params, walls)
+        density = None
+        if self._density is not None:
+            density = self._face_density(s or {}, params, dtype_of(v))
+        if np.shape(sample(viscosity)) != ():
+            self._check_wall_velocities()
+        return self.viscous.add_explicit(a, v, viscosity, wall_part, walls, density, dt)
 
     def _force(self, v: Any, params: Any, s: dict[str, Any] | None) -> Any:
         """Return the force as an array on faces; a force that is one number applies to all faces."""
@@ -503,14 +682,14 @@ class FlowStep(Reconstructible):
         scalars = self.scalars.items()
         return {name: scalar.wall_values(params, dtype_of(s[name])) for name, scalar in scalars if scalar.changes}
 
-    def _rates(self, v: Any, s: dict[str, Any], params: Any, values: dict[str, Any]) -> dict[str, Any]:
-        return {name: scalar.rate(v, s, params, values.get(name)) for name, scalar in self.scalars.items()}
+    def _rates(self, v: Any, s: dict[str, Any], params: Any, values: dict[str, Any], dt: Any) -> dict[str, Any]:
+        return {name: scalar.rate(v, s, params, values.get(name), dt) for name, scalar in self.scalars.items()}
 
-    def _check_convection(self, v: Any) -> None:
+    def _check_convection(self, v: Any, dt: Any) -> None:
         """Raise UnstableStepError if convection would amplify a wave by more than MAX_GROWTH."""
         total_flow = self._total_flow.apply(np.abs(v).astype(float))  # in each cell, 2 * sum of |v| / h
         fastest = 0.5 * float(np.max(total_flow, initial=0.0))
-        courant = self.dt * fastest
+        courant = dt * fastest
         if not SAFE_COURANT < courant < np.inf:
             return
         terms = [self.viscous, *(scalar.diffusion for scalar in self.scalars.values())]
@@ -518,7 +697,7 @@ class FlowStep(Reconstructible):
         if growth > MAX_GROWTH:
             safe = rounded_down(SAFE_COURANT / fastest)
             raise UnstableStepError(
-                f"flow_step is unstable for this velocity with dt = {number_beside(self.dt, float(safe), digits=12)}: "
+                f"flow_step is unstable for this velocity with dt = {number_beside(dt, float(safe), digits=12)}: "
                 f"waves grow by {growth - 1:.0%} a step, at a Courant number of {courant:.3g}; dt = {safe} is safe, "
                 "or write unstable='allow'"
             )
@@ -526,13 +705,18 @@ class FlowStep(Reconstructible):
     def __repr__(self) -> str:
         terms = {
             "convection": self.convect,
-            "viscosity": self.viscous.op,
+            "viscosity": self.viscous if self.viscous.varies else self.viscous.op,
             "force": self.settings.force,
             "friction": self.settings.friction,
+            "density": self.settings.density,
             "scalars": self.scalars or None,
         }
         names = ["pressure", *(name for name, term in terms.items() if term is not None)]
         return f"<flow step on {self.grid}: {', '.join(names)}>"
+
+
+def _check_step_length(dt):
+    check_number("dt of flow_step", dt, "> 0")
 
 
 def _check_friction(friction):

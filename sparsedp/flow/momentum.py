@@ -69,11 +69,15 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MomentumFluxes",
+    "WallSide",
+    "at_wall",
     "check_walls",
+    "conditions_along",
     "convection",
     "face_laplacian",
     "face_lift",
     "free_faces",
+    "gradient_around",
     "inflow_points",
     "stresses",
     "wall_sides",
@@ -308,16 +312,16 @@ class MomentumFluxes:
                 back = _centres_to_nodes(grid, c)
                 count = centres.shape[0]
             else:
-                carried[number, c] = mean_terms(grid, a, _conditions_along(grid, sides, a, c))
-                carrier[number, a] = mean_terms(grid, c, _conditions_along(grid, sides, c, a))
+                carried[number, c] = mean_terms(grid, a, conditions_along(grid, sides, a, c))
+                carrier[number, a] = mean_terms(grid, c, conditions_along(grid, sides, c, a))
                 back = differences(grid, a)
                 count = grid.node_count(a)
             gain[c, number] = along(a, grid.dim, back)
             sites.append(tuple(count if b == a else n for b, n in enumerate(grid.face_shape(c))))
         for part, (a, side, c) in enumerate(wall_sides(grid, sides)):
-            at_wall = _at_wall(grid, sides, WallSide(a, side, c), _wall_to_faces(grid, a, side))
-            wall_carried[numbers[c, a], part] = at_wall
-            wall_carrier[numbers[a, c], part] = at_wall
+            terms = at_wall(grid, sides, WallSide(a, side, c), _wall_to_faces(grid, a, side))
+            wall_carried[numbers[c, a], part] = terms
+            wall_carrier[numbers[a, c], part] = terms
         fluxes = Space(None, "fluxes", grid, sites)
         self._fluxes = fluxes
         self._wall_carried_blocks = wall_carried
@@ -402,7 +406,7 @@ def wall_stresses(grid: Grid, sides: tuple) -> Kronecker:
     blocks: dict = {}
     for part, (axis, side, component) in enumerate(wall_sides(grid, sides)):
         factor = differences(grid, axis) @ wall_slopes(grid, axis, side, dirichlet)
-        blocks[component, part] = _at_wall(grid, sides, WallSide(axis, side, component), factor)
+        blocks[component, part] = at_wall(grid, sides, WallSide(axis, side, component), factor)
     return Kronecker(grid.faces.parts, wall_velocities(grid, sides).parts, blocks)
 
 
@@ -414,7 +418,7 @@ def free_faces(grid: Grid, sides: tuple, solid: ArrayLike | None) -> NDArray[np.
 # ---- 1-D factors -----------------------------------------------------------------------------------------------------
 
 
-def _conditions_along(grid: Grid, sides: tuple, axis: int, component: int) -> tuple | None:
+def conditions_along(grid: Grid, sides: tuple, axis: int, component: int) -> tuple | None:
     """Return the conditions of a tangential component at both walls of an axis; None if the axis is periodic."""
     pair = sides[axis]
     if pair is None:
@@ -434,7 +438,7 @@ def _at_points(grid: Grid, wall: Any, axis: int, component: int) -> Any:
     return mixed_wall([(dirichlet, is_fixed), (neumann, ~is_fixed)])
 
 
-def _at_wall(grid: Grid, sides: tuple, entry: WallSide, factor: Factor) -> tuple[Term, ...]:
+def at_wall(grid: Grid, sides: tuple, entry: WallSide, factor: Factor) -> tuple[Term, ...]:
     """Return the terms of a factor along the axis across a wall, at the points that have the velocity of the wall."""
     wall = _at_points(grid, sides[entry.axis][entry.side], entry.axis, entry.component)
     if isinstance(wall, MixedWall):
@@ -448,21 +452,27 @@ def _second_differences(grid: Grid, component: int, axis: int, sides: tuple) -> 
         wall_values = sides[component] and (dirichlet, dirichlet)
         return along(axis, grid.dim, slopes(grid, component, wall_values) @ differences(grid, component))
     (difference,) = along(axis, grid.dim, differences(grid, axis))
-    across = slope_terms(grid, axis, _conditions_along(grid, sides, axis, component))
+    across = slope_terms(grid, axis, conditions_along(grid, sides, axis, component))
     return tuple(difference @ slope for slope in across)
 
 
-def _laplacian_around(grid: Grid, c: int, sides: tuple, closed: NDArray, condition: Any) -> sp.csr_array:
-    """Return the Laplacian of component c with faces `closed` by obstacles.
+def gradient_around(grid: Grid, c: int, sides: tuple, closed: NDArray, condition: Any) -> Operator:
+    """Return the gradient of component c with faces `closed` by obstacles, across the other axes.
 
     The faces of the component are taken as the cells of an auxiliary grid, on which the obstacles are solid cells.
     """
     spacing = [np.ones(n) if a == c else grid.widths[a] for a, n in enumerate(grid.face_shape(c))]
     lattice = Grid(grid.face_shape(c), spacing=spacing, periodic=grid.periodic)
-    conditions = {n: _conditions_along(grid, sides, a, c) for a, n in enumerate(grid.axes) if sides[a] and a != c}
+    conditions = {n: conditions_along(grid, sides, a, c) for a, n in enumerate(grid.axes) if sides[a] and a != c}
+    return gradient(lattice, conditions, closed, condition)
+
+
+def _laplacian_around(grid: Grid, c: int, sides: tuple, closed: NDArray, condition: Any) -> sp.csr_array:
+    """Return the Laplacian of component c with faces `closed` by obstacles; see `gradient_around`."""
+    slope = gradient_around(grid, c, sides, closed, condition)
+    lattice = slope.domain.grid
     across = Mask(lattice.join(*(a != c for a in range(grid.dim))))
-    slope = gradient(lattice, conditions, closed, condition).structure
-    laplacian_across = compose(divergence(lattice).structure, compose(across, slope))
+    laplacian_across = compose(divergence(lattice).structure, compose(across, slope.structure))
     # Along the component's own axis no condition is needed, because the closed faces hold the obstacle's velocity.
     blocks = {(0, 0): _second_differences(grid, c, c, sides)}
     laplacian_along = Kronecker(lattice.cells.parts, lattice.cells.parts, blocks)

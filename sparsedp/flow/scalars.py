@@ -5,7 +5,8 @@
 for implicit diffusion. If diffusion is explicit, r also contains k (L s + D B), and the third term is omitted. D is the
 divergence, A the average from cells to faces, and k the diffusivity. B and W are the contributions of the wall values
 to the slopes and to the values on faces. If the wall values are a function of params, r contains those at the beginning
-of the step, and B is the mean of those at its beginning and at its end.
+of the step, and B is the mean of those at its beginning and at its end. If the diffusivity varies, the diffusive term
+is D(k (G s + B)); see `variable_diffusion`.
 """
 
 from __future__ import annotations
@@ -23,8 +24,10 @@ from sparsedp.autodiff.tape import cast, dtype_of
 from sparsedp.autodiff.tape_constants import frozen
 from sparsedp.errors import ShapeError
 from sparsedp.flow.diffusion import Diffusion
+from sparsedp.flow.variable_diffusion import DiffusionForm, VariableDiffusion, is_constant
 from sparsedp.grid.boundary_conditions import neumann
-from sparsedp.operators.difference import laplacian
+from sparsedp.operators.difference import divergence, gradient, laplacian
+from sparsedp.operators.harmonic import harmonic_average
 from sparsedp.operators.masks_and_lift import check_solid, lift, mask
 from sparsedp.operators.transfer import average
 
@@ -61,7 +64,7 @@ class Scalar:
         name: str,
         settings: FlowSettings,
         divergence: Operator,
-        diffusivity: float = 0.0,
+        diffusivity: Any = 0.0,
         boundary: Any = neumann,
         values: NDArray | Callable | None = None,
         source: Callable | None = None,
@@ -69,7 +72,6 @@ class Scalar:
         grid = settings.grid
         solid = settings.solid
         self.name = name
-        self.dt = settings.dt
         self.source = source
         self._divergence = divergence
         self._average = average(grid, boundary)
@@ -83,7 +85,13 @@ class Scalar:
         if values is not None and not self.changes:
             self._constant_parts = self._contributions(values)
         build_laplacian = partial(laplacian, grid, boundary, solid)
-        self.diffusion = Diffusion(f"diffusivity of {name!r}", float(diffusivity), build_laplacian, settings)
+        coefficient_name = f"diffusivity of {name!r}"
+        self.diffusion: Any
+        if is_constant(diffusivity, settings):
+            self.diffusion = Diffusion(coefficient_name, float(diffusivity), build_laplacian, settings)
+        else:
+            build_form = partial(DiffusiveFlux, settings, boundary, self._fluid)
+            self.diffusion = VariableDiffusion(coefficient_name, diffusivity, settings, build_form, build_laplacian)
 
     def wall_values(self, params: Any, dtype: np.dtype) -> Any:
         """Return the wall values for params, in the dtype of the field, if they are a function of params."""
@@ -117,10 +125,17 @@ class Scalar:
             parts = self._contributions(values)
         return tuple(None if part is None else cast(part, dtype) for part in parts)
 
-    def rate(self, v: Any, scalars: dict[str, Any], params: Any, values: Any = None) -> Any:
+    def diffusivity(self, scalars: dict[str, Any], params: Any) -> Any:
+        """Return the diffusivity for these scalars if it varies, else None."""
+        if not self.diffusion.varies:
+            return None
+        return self.diffusion.coefficient(lambda: (scalars,), params, dtype_of(scalars[self.name]))
+
+    def rate(self, v: Any, scalars: dict[str, Any], params: Any, values: Any = None, dt: Any = None) -> Any:
         """Return the explicit part r of the rate of change; see the module docstring.
 
-        `values` are the wall values at the beginning of the step; None if they are constant.
+        `values` are the wall values at the beginning of the step, None if they are constant. `dt` is the length of the
+        step, which a diffusivity that varies needs for its stability limit.
         """
         u = scalars[self.name]
         wall_part, on_walls = self._parts(values, dtype_of(u))
@@ -136,13 +151,45 @@ class Scalar:
                     f"{np.shape(sample(source))}; write one number for each cell"
                 )
             rate = rate + source
-        rate = self.diffusion.add_explicit(rate, u, params, lambda: wall_part)
+        if self.diffusion.varies:
+            k = self.diffusivity(scalars, params)
+            walls = self._at_walls(values)
+            rate = self.diffusion.add_explicit(rate, u, k, lambda: wall_part, walls, None, dt)
+        else:
+            rate = self.diffusion.add_explicit(rate, u, lambda: wall_part)
         check_values(partial(check_finite, f"the rate of {self.name!r}"), rate)
         return rate
 
-    def step(self, u: Any, rate: Any, previous_rate: Any, before: Any = None, after: Any = None) -> Any:
-        """Return the field after a step, given the wall values at its beginning and end; None if they are constant."""
-        explicit = u + self.dt * (1.5 * rate - 0.5 * previous_rate)
+    def _at_walls(self, values: Any) -> Any:
+        """Return the wall values, given those of a function; None stands for 0."""
+        if values is None and not self.changes:
+            return self._values
+        return values
+
+    def step(self, u: Any, change: Any, before: Any = None, after: Any = None, k: Any = None, dt: Any = None) -> Any:
+        """Return the field after a step.
+
+        Parameters
+        ----------
+        u : array
+        change : array
+            The change by the explicit terms.
+        before, after : array or None
+            The wall values at the beginning and the end of the step; None if they are constant.
+        k : number or array or None
+            The diffusivity, and the length of the step `dt`, if the diffusivity varies.
+        """
+        explicit = u + change
+        if self.diffusion.varies:
+            if not self.diffusion.implicit:
+                return explicit
+            if before is not None:
+                walls = before + after
+            elif self._values is None:
+                walls = None
+            else:
+                walls = 2.0 * self._values
+            return self.diffusion.step_implicit(explicit, u, k, walls, None, dt)
         if self.diffusion.solve is None:
             return explicit
         if before is not None:
@@ -152,3 +199,30 @@ class Scalar:
             if wall_part is not None:
                 wall_part = 2.0 * wall_part
         return self.diffusion.step_implicit(explicit, u, wall_part)
+
+
+class DiffusiveFlux(DiffusionForm):
+    """The factors of div(k grad s) for a scalar; see `variable_diffusion`.
+
+    Parameters
+    ----------
+    settings : FlowSettings
+    boundary : condition or dict
+        As `flow_step` takes it in `scalars`.
+    fluid : Operator or None
+        The mask of the cells that are not solid; None if there are no solid cells.
+    """
+
+    def __init__(self, settings: FlowSettings, boundary: Any, fluid: Any) -> None:
+        grid = settings.grid
+        grid.backend.check("a diffusivity that varies in flow_step")
+        self.slopes = gradient(grid, boundary, settings.solid)
+        self.wall_slopes = lift(grid, boundary)
+        self.divergence = divergence(grid)
+        if fluid is not None:
+            self.divergence = fluid @ self.divergence
+        self._average = harmonic_average(grid)
+
+    def at_sites(self, k: Any) -> Any:
+        """Return the harmonic average of a diffusivity on faces."""
+        return self._average(k)

@@ -16,7 +16,7 @@ class FlowSettings:
     """The arguments of `flow_step`, which documents them."""
 
     grid: Grid
-    dt: float
+    dt: Any
     viscosity: Any
     force: Any
     boundary: Any
@@ -29,13 +29,9 @@ class FlowSettings:
     unstable: str
     friction: Any
     inflow: Any
+    density: Any
 
     @property
     def strict(self) -> bool:
         """Whether an error is raised if dt is too large for stability."""
         return self.unstable == "raise"
-
-    @property
-    def may_be_implicit(self) -> bool:
-        """Whether `implicit=True` is allowed: the viscosity is a number, and there is no friction."""
-        return self.friction is None and not callable(self.viscosity)

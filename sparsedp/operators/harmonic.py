@@ -24,7 +24,7 @@ from sparsedp.autodiff.program_trace import check_values, sample
 from sparsedp.grid.grid import Grid, check_grid
 from sparsedp.operators.stencils import adjacent_cell, to_faces
 
-__all__ = ["harmonic_average"]
+__all__ = ["harmonic_average", "harmonic_pair", "lower_share"]
 
 
 def harmonic_average(grid: Grid) -> Callable:
@@ -65,7 +65,7 @@ def harmonic_average(grid: Grid) -> Callable:
     axes = range(grid.dim)
     below = to_faces("cell below", grid, [adjacent_cell(grid, axis, False) for axis in axes])
     above = to_faces("cell above", grid, [adjacent_cell(grid, axis, True) for axis in axes])
-    pair = _pair_rule(grid.join(*(_lower_share(grid, axis) for axis in range(grid.dim))))
+    pair = harmonic_pair(grid.join(*(lower_share(grid, axis) for axis in range(grid.dim))))
 
     def average(k):
         check_native("harmonic_average", k)
@@ -86,7 +86,7 @@ def _check_coefficient(k):
         raise ValueError(f"harmonic_average needs a coefficient >= 0, got {np.min(values):g}")
 
 
-def _lower_share(grid, axis):
+def lower_share(grid, axis):
     """Return w_l (see the module docstring) on the faces perpendicular to an axis, broadcastable to their shape."""
     low = adjacent_cell(grid, axis, False).matrix @ grid.widths[axis]
     high = adjacent_cell(grid, axis, True).matrix @ grid.widths[axis]
@@ -95,7 +95,7 @@ def _lower_share(grid, axis):
     return (low / (low + high)).reshape(shape)
 
 
-def _pair_rule(share):
+def harmonic_pair(share):
     """Return the differentiable function k_f(k_l, k_r) of the module docstring, given w_l as `share`."""
 
     def ratios(low, high):

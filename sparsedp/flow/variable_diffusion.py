@@ -1,0 +1,280 @@
+"""Diffusive terms whose coefficient varies: in space, or as a function of params, of scalars or of the shear rate.
+
+    div(k (E u + W walls)) / rho,
+
+with the slopes E, the divergence div, and the contribution W of the values on walls. For a velocity see
+`viscous_stress`; for a scalar E is the gradient, and k on faces is the harmonic average of the cells. If the
+coefficient is one number, the term is k (L u + B) / rho, with the Laplacian L, as in `diffusion`.
+
+Implicit terms are advanced by the trapezoidal rule with k and rho at half the step:
+
+    (2 rho / dt - div k E) u_next = 2 rho / dt u_explicit + div(k (E u + W (walls + walls_next))).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from types import FunctionType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sparsedp._utils.pytree import mapped
+from sparsedp._utils.validation import check_finite, check_kind, check_number, check_on, place
+from sparsedp.autodiff.program_trace import check_values, sample
+from sparsedp.autodiff.tape import cast, dtype_of
+from sparsedp.autodiff.tape_constants import frozen
+from sparsedp.flow.diffusion import check_stable, spectral_bound
+from sparsedp.solvers.parametric import EllipticSolver, elliptic_solver
+
+if TYPE_CHECKING:
+    from sparsedp.flow.settings import FlowSettings
+    from sparsedp.operators.operator import Operator
+
+__all__ = ["Coefficient", "DiffusionForm", "VariableDiffusion", "is_constant", "takes_params_alone"]
+
+
+class DiffusionForm:
+    """The factors of div(k (E u + W walls)).
+
+    Attributes
+    ----------
+    slopes, wall_slopes : Operator
+        E and W.
+    divergence : Operator
+    """
+
+    slopes: Operator
+    wall_slopes: Operator
+    divergence: Operator
+
+    def at_sites(self, k: Any) -> Any:
+        """Return the coefficient where the slopes are, from one value for each cell."""
+        raise TypeError("a DiffusionForm defines at_sites")
+
+    def flux_divergence(self, k: Any, u: Any, walls: Any = None) -> Any:
+        """Return div(k (E u + W walls)) for k on the sites; None as walls stands for 0."""
+        slopes = self.slopes(u)
+        if walls is not None:
+            slopes = slopes + self.wall_slopes(cast(walls, dtype_of(u)))
+        return self.divergence(k * slopes)
+
+    @cached_property
+    def solver(self) -> EllipticSolver:
+        """The solver of (shift - div k E) u = b."""
+        return elliptic_solver(self.divergence, self.slopes)
+
+    def largest_row_sum(self, k: Any, density: Any) -> float:
+        """Return an upper bound of the eigenvalues of div k E / density, for plain arrays."""
+        slopes = self._magnitudes[1](np.ones(self.slopes.domain.size))
+        row_sums = self._magnitudes[0](np.asarray(k, float).reshape(-1) * slopes)
+        return float(np.max(row_sums / np.asarray(density, float).reshape(-1), initial=0.0))
+
+    @cached_property
+    def _magnitudes(self) -> tuple[Any, Any]:
+        return self.divergence.structure.magnitude(), self.slopes.structure.magnitude()
+
+
+class Coefficient:
+    """A coefficient of a flow: a number, one value for each cell, or a function that returns them.
+
+    Parameters
+    ----------
+    name : str
+        Name in error messages, such as "viscosity".
+    given : number, array or callable
+        A function with one argument is called with the params, a function with more with the fields and the params.
+    settings : FlowSettings
+    needs : str
+        The range of valid numbers: ">= 0" or "> 0".
+
+    Attributes
+    ----------
+    needs_fields : bool
+        Whether it is a function of fields.
+    """
+
+    def __init__(self, name: str, given: Any, settings: FlowSettings, needs: str) -> None:
+        self.name = name
+        self._given = given
+        self._cells = settings.grid.cells
+        self._needs = needs
+        self.needs_fields = callable(given) and not takes_params_alone(given)
+        if not callable(given):
+            self._check(given)
+
+    def __call__(self, fields: Callable[[], tuple], params: Any, dtype: np.dtype) -> Any:
+        """Return the coefficient, a number or one value for each cell.
+
+        Parameters
+        ----------
+        fields : callable
+            ``fields()`` returns the first arguments of a function of fields.
+        params : tree
+        dtype : dtype
+            Dtype of the flow, which the result has if it is an array.
+        """
+        value = self._given
+        if callable(value):
+            if self.needs_fields:
+                value = value(*mapped(frozen, fields()), params)
+            else:
+                value = value(params)
+            self._check(value)
+        if np.shape(sample(value)) == ():
+            return value
+        return cast(value, dtype)
+
+    def _check(self, value: Any) -> None:
+        if np.shape(sample(value)) != ():
+            check_on(f"flow_step, as {self.name},", sample(value), self._cells, "; write one number for each cell")
+            check_kind(f"the {self.name} of flow_step", dtype_of(value), "real numbers", "; write its .real")
+        check_values(self._check_range, value)
+
+    def _check_range(self, value: Any) -> None:
+        """Raise an error for values that are not finite, or out of range."""
+        name = f"the {self.name} of flow_step"
+        if np.ndim(value) == 0:
+            check_number(name, value, self._needs)
+            return
+        check_finite(name, value)
+        bad = value < 0 if self._needs == ">= 0" else value <= 0
+        if np.any(bad):
+            cell = place(int(np.argmax(bad)), np.shape(value))
+            raise ValueError(f"{name} must be {self._needs}, got {value[cell]:.6g} in cell {cell}")
+
+
+def is_constant(coefficient: Any, settings: FlowSettings) -> bool:
+    """Return whether a coefficient is one number, and the step length too, so that no operator ever changes."""
+    return not callable(coefficient) and np.ndim(coefficient) == 0 and not callable(settings.dt)
+
+
+def takes_params_alone(function: Callable) -> bool:
+    """Return whether a function has one positional argument without a default value."""
+    if type(function) is not FunctionType:
+        return True
+    return function.__code__.co_argcount - len(function.__defaults__ or ()) <= 1
+
+
+class VariableDiffusion:
+    """A term div(k (E u + W walls)) / rho of a flow step.
+
+    Parameters
+    ----------
+    name : str
+        Name of k in error messages.
+    coefficient : number, array or callable
+    settings : FlowSettings
+    build_form : callable
+        ``build_form()`` returns the DiffusionForm.
+    build_laplacian : callable
+        ``build_laplacian()`` returns L.
+
+    Attributes
+    ----------
+    coefficient : Coefficient
+    damping : float
+        0: the damping is unknown before the step.
+    """
+
+    varies = True
+    damping = 0.0
+
+    def __init__(
+        self,
+        name: str,
+        coefficient: Any,
+        settings: FlowSettings,
+        build_form: Callable[[], Any],
+        build_laplacian: Callable[[], Operator],
+    ) -> None:
+        self.name = name
+        self.coefficient = Coefficient(name, coefficient, settings, ">= 0")
+        self.settings = settings
+        self.implicit = settings.implicit
+        self._build_form = build_form
+        self._build_laplacian = build_laplacian
+
+    @cached_property
+    def form(self) -> Any:
+        """The DiffusionForm, which is built at the first use."""
+        return self._build_form()
+
+    @cached_property
+    def op(self) -> Operator:
+        """The Laplacian L, which is built at the first use."""
+        return self._build_laplacian()
+
+    @cached_property
+    def _spectral_bound(self) -> float:
+        return spectral_bound(self.op)
+
+    def add_explicit(
+        self, rate: Any, u: Any, k: Any, wall_part: Callable[[], Any], walls: Any, density: Any, dt: Any
+    ) -> Any:
+        """Return the rate plus this term if the term is explicit; return the rate itself if it is implicit.
+
+        Parameters
+        ----------
+        rate, u : array
+        k : number or array on cells
+        wall_part : callable
+            ``wall_part()`` returns the contribution of walls to L u, or None if it is 0.
+        walls : array or None
+            The values on walls; None stands for 0.
+        density : array like u, or None
+            None stands for 1.
+        dt : number
+        """
+        if self.implicit:
+            return rate
+        if np.shape(sample(k)) == ():
+            check_values(self._check_number, k, dt, 1.0 if density is None else density)
+            part = wall_part()
+            laplacian_of_u = self.op(u)
+            if part is not None:
+                laplacian_of_u = laplacian_of_u + part
+            term = k * laplacian_of_u
+        else:
+            at_sites = self.form.at_sites(k)
+            check_values(self._check_field, k, at_sites, dt, 1.0 if density is None else density)
+            term = self.form.flux_divergence(at_sites, u, walls)
+        if density is not None:
+            term = term / density
+        return rate + term
+
+    def step_implicit(self, explicit: Any, u: Any, k: Any, walls: Any, density: Any, dt: Any) -> Any:
+        """Return the field at the end of the step.
+
+        Parameters
+        ----------
+        explicit : array
+            The field after the step with all terms except this one.
+        u : array
+            The field at the beginning of the step.
+        k : number or array on cells
+        walls : array or None
+            The sum of the values on walls at the beginning and at the end of the step; None stands for 0.
+        density : array like u, or None
+        dt : number
+        """
+        if np.shape(sample(k)) == ():
+            k = k * np.ones(self.settings.grid.shape, dtype_of(u))
+        k = self.form.at_sites(k)
+        shift = 2.0 / dt
+        if density is not None:
+            shift = shift * density
+        change = self.form.flux_divergence(k, u, walls)
+        return self.form.solver(k, cast(shift * explicit + change, dtype_of(u)), shift)
+
+    def _check_number(self, k: Any, dt: Any, density: Any) -> None:
+        """Raise UnstableStepError if the explicit term is unstable for one number as coefficient."""
+        rate = float(k) * self._spectral_bound / float(np.min(density, initial=np.inf))
+        check_stable(self.name, float(k), dt, rate, self.settings)
+
+    def _check_field(self, k: Any, at_sites: Any, dt: Any, density: Any) -> None:
+        """Raise UnstableStepError if the explicit term is unstable for a coefficient that varies in space."""
+        if self.settings.strict:
+            rate = self.form.largest_row_sum(at_sites, density)
+            check_stable(f"the largest {self.name}", float(np.max(k, initial=0.0)), dt, rate, self.settings)
