@@ -22,6 +22,12 @@ a_previous supplies the term with v_previous:
 Scalars are advanced with the velocity at the beginning of the step; see `scalars`. Convection is explicit; see
 `diffusion` for the amplification of waves.
 
+A viscosity that varies in space replaces nu (L v + B) by div(mu (grad v + grad v^T)); see `viscous_stress` and
+`variable_diffusion`. With a density rho, this term and G p are divided by rho, and G q by rho in the projection; see
+`variable_density`. Explicit terms take mu and rho at the beginning of the step, all others take them at half the step.
+If dt is a function, the previous acceleration has the weight -r / 2 and the new one 1 + r / 2, with the ratio r of this
+step length to the previous one.
+
 References
 ----------
 J. van Kan, SIAM J. Sci. Stat. Comput. 7 (1986) (second-order pressure correction).
@@ -105,11 +111,14 @@ def flow_step(
     Parameters
     ----------
     grid : Grid
-    dt : float
-        Time step > 0 [time].
-    viscosity : float or callable
-        >= 0 [length^2 / time]. A function ``viscosity(params)`` is differentiable in params and requires explicit
-        viscosity.
+    dt : float or callable
+        Time step > 0 [time]. A function ``dt(params)`` returns the length of each step; differentiable.
+    viscosity : number, array or callable
+        >= 0 [length^2 / time], one number or one for each cell, with which the viscous term is
+        div(viscosity (grad v + grad v^T)). A function ``viscosity(params)`` returns such a number or array. A function
+        ``viscosity(shear_rate, params)``, with scalars ``viscosity(shear_rate, s, params)``, also gets the shear rate
+        sqrt(2 D : D) [1 / time] in the cells, where D = (grad v + grad v^T) / 2. Functions are differentiable. With a
+        density, this is the dynamic viscosity [density length^2 / time].
     force : callable, optional
         ``force(v, params)`` returns an array on faces [velocity / time], or a number.
     boundary, solid, solid_boundary
@@ -126,9 +135,10 @@ def flow_step(
         Default: 0.
     scalars : dict, optional
         Cell fields that the flow carries, such as ``{"heat": {"diffusivity": 0.1, "boundary": {"x": dp.dirichlet},
-        "values": values, "source": lambda s, params: ...}}``. All four entries are optional. "diffusivity": a number
-        >= 0 [length^2 / time]. "boundary": a condition or a dict (default neumann). "values": wall values as `lift`
-        takes them, here for x-lower, x-upper, y-lower and y-upper
+        "values": values, "source": lambda s, params: ...}}``. All four entries are optional. "diffusivity": >= 0
+        [length^2 / time], one number or one for each cell, or a function ``diffusivity(params)`` or, for explicit
+        diffusion, ``diffusivity(s, params)`` that returns them; differentiable. "boundary": a condition or a dict
+        (default neumann). "values": wall values as `lift` takes them, here for x-lower, x-upper, y-lower and y-upper
         ``dp.lift(grid, {"x": dp.dirichlet}).domain.join(1.0, 0.0, 0.0, 0.0)``, or a function ``values(params)`` that
         returns those at the end of a step; differentiable. "source": a function that returns the rate [scalar / time]
         from the dict of all scalars. With scalars, the force is called as ``force(v, s, params)``.
@@ -143,33 +153,42 @@ def flow_step(
         ``inflow(params)`` returns an array on faces [velocity]; differentiable. Its values on inflow boundaries are the
         normal velocity there at the end of a step; all other values are ignored. Default: the normal velocity keeps the
         values of the first state.
+    density : number, array or callable, optional
+        > 0 [density], one number or one for each cell, or a function ``density(params)``, with scalars also
+        ``density(s, params)``, that returns them; differentiable. The viscous term and the gradient of the pressure
+        are divided by it; the force remains an acceleration. The flow does not move a density that is an array: give
+        a function of a scalar, or move it with `transport` and pass it in the params. Default: 1.
 
     Returns
     -------
     FlowStep
         ``step.start(v, params=None)`` returns the first state, a dict of the velocity "v" [velocity], the pressure "p"
         [velocity^2] and the previous acceleration "a". ``step(state, params)`` returns the next state, for `rollout`.
-        The params are passed to force, friction, viscosity, walls and inflow. With scalars,
+        The params are passed to all arguments that are functions. With scalars,
         ``step.start(v, params, s)`` takes a dict of cell fields. The state then also holds these as "s" and their
         previous rates as "r". If `walls` is a function, the state also holds the wall velocities as "walls"; if wall
-        values of scalars are functions, it holds these as "values".
+        values of scalars are functions, it holds these as "values"; if `dt` is a function, the step length as "dt"; if
+        an implicit viscosity depends on the shear rate, the previous velocity as "before". With a density, the pressure
+        has the unit [density velocity^2].
 
     Raises
     ------
     ValueError
-        If dt or the viscosity is out of range, a scalar has an entry other than those four, a friction is given with
-        implicit viscosity, `inflow` is given without an inflow boundary, an array as `walls` without a side that has a
-        tangential velocity, or it does not determine the tangential velocity at an inflow boundary. On use, if a
-        friction is < 0 or complex.
+        If dt, the viscosity, a diffusivity or the density is out of range, a scalar has an entry other than those
+        four, a friction is given with implicit viscosity, `inflow` is given without an inflow boundary, an array as
+        `walls` without a side that has a tangential velocity, or it does not determine the tangential velocity at an
+        inflow boundary, or if an implicit diffusivity is a function of the scalars. On use, if a friction is < 0 or complex, or `walls` is an array
+        beside a viscosity that varies.
     ShapeError
-        If `walls` is an array of another shape than the faces. On use, if the state does not have the entries that
-        ``step.start`` returns, or a force, friction, source, inflow or wall velocity has the wrong shape.
+        If `walls` is an array of another shape than the faces, or a viscosity, diffusivity or density is an array of
+        another shape than the cells. On use, if the state does not have the entries that ``step.start`` returns, or a
+        force, friction, source, inflow or wall velocity has the wrong shape.
     TypeError
         If scalars is not a dict, or a force or source does not take the right number of arguments.
     DerivativeError
-        If dt or a viscosity given as a number is traced.
+        If dt, a viscosity, a diffusivity or a density that is not given as a function is traced.
     NonFiniteError
-        If dt or the viscosity is NaN or infinite. On use, if the velocity or a friction is.
+        If dt, the viscosity, a diffusivity or the density is NaN or infinite. On use, if the velocity or a friction is.
     UnstableStepError
         If dt is too large for explicit viscosity or diffusivity. On use, if it is too large for convection.
 
@@ -180,13 +199,17 @@ def flow_step(
 
     Notes
     -----
-    Explicit viscosity is stable for dt nu / h^2 <= 1/8 in 2-D (Adams-Bashforth); a larger dt raises an error.
+    Explicit viscosity is stable for dt nu / h^2 <= 1/8 in 2-D (Adams-Bashforth), and for <= 1/16 where it varies in
+    space; a larger dt raises an error.
+    At an outflow the normal viscous stress is 0, as if the velocity there did not change along the axis.
+    A viscosity, diffusivity or density that varies in space is not available on ranks.
     Convection is explicit. A step raises an error if it would amplify waves by more than 2 %. Let the Courant number c
     be dt times the largest sum over the axes of |v| / h in a cell: without viscosity the limit is c = 0.53, and
     viscosity increases it.
     The force that a friction exerts in a step is the sum of volumes * friction * (v* - (v - v_previous) / 2), where
     v* = v_next + dt G (p_next - p), as in benchmarks/cylinder.py. The bracket equals v_next only at a steady state.
-    Cost: one pressure solve per step, and one more solve for implicit viscosity; as many in the backward pass.
+    Cost: one pressure solve per step, and one more solve for implicit viscosity; as many in the backward pass. A solve
+    with a coefficient that changes from step to step includes a new set-up.
 
     References
     ----------
@@ -254,6 +277,10 @@ def _check(settings: FlowSettings) -> None:
             check_function("flow_step", settings.force, "force=lambda v, params: ...", 2)
     if callable(settings.density) and not takes_params_alone(settings.density):
         check_function("flow_step", settings.density, "density=lambda s, params: ...", 2)
+        if not settings.scalars:
+            raise ValueError(
+                "density of flow_step is a function of scalars, and there are none; write density=lambda params: ..."
+            )
     if callable(settings.viscosity) and not takes_params_alone(settings.viscosity):
         if settings.scalars:
             check_function("flow_step", settings.viscosity, "viscosity=lambda shear_rate, s, params: ...", 3)
@@ -457,7 +484,7 @@ class FlowStep(Reconstructible):
         state : dict
             A state from ``step.start`` or from the call.
         params : tree, optional
-            Passed to force, friction, viscosity, walls, inflow and sources.
+            Passed to all arguments of `flow_step` that are functions.
 
         Returns
         -------

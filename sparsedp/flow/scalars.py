@@ -221,8 +221,4 @@ class DiffusiveFlux(DiffusionForm):
         self.divergence = divergence(grid)
         if fluid is not None:
             self.divergence = fluid @ self.divergence
-        self._average = harmonic_average(grid)
-
-    def at_sites(self, k: Any) -> Any:
-        """Return the harmonic average of a diffusivity on faces."""
-        return self._average(k)
+        self.at_sites = harmonic_average(grid)

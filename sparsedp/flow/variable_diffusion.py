@@ -43,15 +43,14 @@ class DiffusionForm:
     slopes, wall_slopes : Operator
         E and W.
     divergence : Operator
+    at_sites : callable
+        ``at_sites(k)`` returns the coefficient where the slopes are, from one value for each cell.
     """
 
     slopes: Operator
     wall_slopes: Operator
     divergence: Operator
-
-    def at_sites(self, k: Any) -> Any:
-        """Return the coefficient where the slopes are, from one value for each cell."""
-        raise TypeError("a DiffusionForm defines at_sites")
+    at_sites: Callable[[Any], Any]
 
     def flux_divergence(self, k: Any, u: Any, walls: Any = None) -> Any:
         """Return div(k (E u + W walls)) for k on the sites; None as walls stands for 0."""
@@ -237,7 +236,7 @@ class VariableDiffusion:
                 laplacian_of_u = laplacian_of_u + part
             term = k * laplacian_of_u
         else:
-            at_sites = self.form.at_sites(k)
+            at_sites = cast(self.form.at_sites(k), dtype_of(u))
             check_values(self._check_field, k, at_sites, dt, 1.0 if density is None else density)
             term = self.form.flux_divergence(at_sites, u, walls)
         if density is not None:

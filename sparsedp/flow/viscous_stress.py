@@ -88,8 +88,9 @@ class ViscousStress(DiffusionForm):
         self._across_component = harmonic_pair(self._shares(0))
         self._across_axis = harmonic_pair(self._shares(1))
         self._strain, self._to_cells = self._invariant()
+        self.at_sites = self._harmonic_average
 
-    def at_sites(self, mu: Any) -> Any:
+    def _harmonic_average(self, mu: Any) -> Any:
         """Return the viscosity on the sites of the stress, from one value for each cell."""
         lower, upper = (
             self._across_component(self._cells[False, side](mu), self._cells[True, side](mu)) for side in (False, True)

@@ -1,0 +1,124 @@
+"""Messages for a viscosity, diffusivity, density and step length of flow_step that vary."""
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+
+import sparsedp as dp
+
+
+def media(**given):
+    """Run one step in a box of 4 x 4 cells."""
+    grid = dp.Grid((4, 4), size=4.0)
+    s = {"c": np.ones((4, 4))} if "scalars" in given else None
+    step = dp.flow_step(grid, **{"dt": 0.1, **given})
+    return step(step.start(np.zeros(40), 1.0, s), 1.0)
+
+
+NEGATIVE = -np.eye(4)
+REFUSED = [
+    ({"viscosity": NEGATIVE}, ValueError, "the viscosity of flow_step must be >= 0, got -1 in cell (0, 0)"),
+    ({"viscosity": lambda p: NEGATIVE}, ValueError, "the viscosity of flow_step must be >= 0, got -1 in cell (0, 0)"),
+    ({"density": np.eye(4)}, ValueError, "the density of flow_step must be > 0, got 0 in cell (0, 1)"),
+    ({"density": 0.0}, ValueError, "density of flow_step must be > 0, got 0"),
+    ({"density": lambda p: 0 * p}, ValueError, "the density of flow_step must be > 0, got 0"),
+    (
+        {"viscosity": np.ones(3)},
+        dp.errors.ShapeError,
+        "flow_step, as viscosity, takes a field on cells(4, 4), got an array of shape (3,); write one number for each cell",
+    ),
+    (
+        {"density": lambda p: np.ones(3)},
+        dp.errors.ShapeError,
+        "flow_step, as density, takes a field on cells(4, 4), got an array of shape (3,); write one number for each cell",
+    ),
+    (
+        {"scalars": {"c": {"diffusivity": np.ones(3)}}},
+        dp.errors.ShapeError,
+        "flow_step, as diffusivity of 'c', takes a field on cells(4, 4), got an array of shape (3,); write one number for each cell",
+    ),
+    (
+        {"viscosity": np.full((4, 4), 1j)},
+        TypeError,
+        "the viscosity of flow_step must hold real numbers, got dtype complex128; write its .real",
+    ),
+    (
+        {"density": np.full((4, 4), np.nan)},
+        dp.errors.NonFiniteError,
+        "the density of flow_step must be finite, got 16 that are NaN or infinite, the first at (0, 0)",
+    ),
+    ({"dt": lambda p: -p}, ValueError, "dt of flow_step must be > 0, got -1"),
+    (
+        {"viscosity": 0.1 * np.ones((4, 4)), "walls": np.zeros(40)},
+        ValueError,
+        "flow_step takes walls= as a function where the viscosity varies; write walls=lambda params: values, "
+        "with values on face_lift(grid, boundary).domain",
+    ),
+    (
+        {"implicit": True, "scalars": {"c": {"diffusivity": lambda s, p: s["c"]}}},
+        ValueError,
+        "implicit diffusion of flow_step takes a diffusivity of 'c' that is a function of params alone, got one of the "
+        "scalars; write implicit=False",
+    ),
+    (
+        {"viscosity": lambda rate, p: rate, "scalars": {"c": {}}},
+        TypeError,
+        "flow_step calls a function with 3 arguments, got one that takes 2; write viscosity=lambda shear_rate, s, "
+        "params: ...",
+    ),
+    (
+        {"viscosity": lambda rate, s, p: rate},
+        TypeError,
+        "flow_step calls a function with 2 arguments, got one that takes 3; write viscosity=lambda shear_rate, "
+        "params: ...",
+    ),
+    (
+        {"density": lambda v, s, p: 1.0},
+        TypeError,
+        "flow_step calls a function with 2 arguments, got one that takes 3; write density=lambda s, params: ...",
+    ),
+    (
+        {"density": lambda s, p: 1.0},
+        ValueError,
+        "density of flow_step is a function of scalars, and there are none; write density=lambda params: ...",
+    ),
+    (
+        {"dt": lambda s, p: 1.0},
+        TypeError,
+        "flow_step calls a function with 1 arguments, got one that takes 2; write dt=lambda params: ...",
+    ),
+    (
+        {"viscosity": np.full((4, 4), 2.0)},
+        dp.errors.UnstableStepError,
+        "flow_step is unstable for the largest viscosity = 2 with dt = 0.1: the largest stable dt is 0.03125; take "
+        "smaller steps or write implicit=True",
+    ),
+    (
+        {"viscosity": 2.0, "density": 0.5},
+        dp.errors.UnstableStepError,
+        "flow_step is unstable for viscosity = 2 with dt = 0.1: the largest stable dt is 0.03125; take smaller steps "
+        "or write implicit=True",
+    ),
+]
+
+
+@pytest.mark.parametrize("given, error, message", REFUSED)
+def test_refused_media(given, error, message):
+    with pytest.raises(error) as caught:
+        media(**given)
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    ("argument", "build"),
+    [
+        ("viscosity", lambda grid, x: dp.flow_step(grid, 0.1, x)),
+        ("density", lambda grid, x: dp.flow_step(grid, 0.1, density=x)),
+        ("diffusivity", lambda grid, x: dp.flow_step(grid, 0.1, scalars={"c": {"diffusivity": x}})),
+        ("dt", lambda grid, x: dp.flow_step(grid, x[0, 0])),
+    ],
+)
+def test_traced_media_are_functions(argument, build):
+    words = rf"flow_step needs a constant {argument}.*, got a traced one; a derivative in the {argument} takes "
+    with pytest.raises(dp.errors.DerivativeError, match=f"{words}{argument}=lambda params: ..."):
+        dp.grad(lambda x: anp.sum(build(dp.Grid((4, 4)), x).start(np.zeros(40))["v"]))(np.ones((4, 4)))

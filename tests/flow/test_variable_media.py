@@ -1,0 +1,281 @@
+"""flow_step with a viscosity, diffusivity, density and step length that vary."""
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+
+import sparsedp as dp
+
+
+def channel(n):
+    """A channel between y = 0 and y = 1 that is periodic along x."""
+    return dp.Grid((1, n), spacing=[np.ones(1), np.full(n, 1 / n)], periodic=(True, False))
+
+
+def steady_speeds(grid, viscosity, params, steps, dt, s=None, scalars=None):
+    """Return the speeds of a channel after many implicit steps under a constant force."""
+    if s is None:
+        force = lambda v, params: grid.join(1.0, 0.0)
+    else:
+        force = lambda v, s, params: grid.join(1.0, 0.0)
+    step = dp.flow_step(grid, dt, viscosity, force, implicit=True, convective=False, scalars=scalars)
+    end = dp.rollout(step, step.start(np.zeros(grid.faces.size), params, s), params, steps)
+    return grid.split(end["v"])[0][0]
+
+
+@pytest.mark.parametrize(
+    ("sides", "solid"),
+    [
+        (dp.no_slip, False),
+        ({"x": (dp.inflow, dp.outflow), "y": (dp.free_slip, dp.outflow)}, False),
+        ({"x": (dp.inflow, dp.outflow), "y": dp.no_slip}, True),
+    ],
+)
+def test_a_constant_field_is_a_number(rng, sides, solid):
+    """For a velocity without divergence the stress equals the Laplacian, at walls, outflows and obstacles too."""
+    grid = dp.Grid((7, 6), spacing=[rng.uniform(0.8, 1.2, 7), rng.uniform(0.8, 1.2, 6)])
+    obstacle = np.zeros(grid.shape, bool)
+    obstacle[2:4, 2:4] = solid
+    walls = rng.standard_normal(dp.face_lift(grid, sides).domain.size)
+    options = {"boundary": sides, "solid": obstacle, "walls": lambda params: walls}
+    v = rng.standard_normal(grid.faces.size)
+    number = dp.flow_step(grid, 1e-3, 0.1, **options).start(v)["a"]
+    field = dp.flow_step(grid, 1e-3, np.full(grid.shape, 0.1), **options).start(v)["a"]
+    np.testing.assert_allclose(field, number, rtol=1e-12, atol=1e-12)
+
+
+def test_three_axes(rng):
+    grid = dp.Grid((4, 3, 2), periodic=(False, True, False))
+    v = rng.standard_normal(grid.faces.size)
+    number = dp.flow_step(grid, 1e-3, 0.1).start(v)["a"]
+    field = dp.flow_step(grid, 1e-3, np.full(grid.shape, 0.1)).start(v)["a"]
+    np.testing.assert_allclose(field, number, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.whole
+def test_power_law_fluid():
+    """Shear-thinning with exponent 1/2: the mean speed is n / (2 n + 1) (1/2)^(1 + 1/n), of order 2."""
+
+    def error(cells):
+        speeds = steady_speeds(channel(cells), lambda rate, n: (1e-6 + rate**2) ** ((n - 1) / 2), 0.5, 60, 0.03)
+        return np.mean(speeds) / 0.03125 - 1
+
+    assert abs(error(16)) < 6e-3
+    assert error(8) / error(16) > 2.8  # tends to 4: the viscosity in the middle is singular
+
+
+@pytest.mark.whole
+def test_viscosity_of_temperature():
+    """A channel with a hot wall and exp(-b T): (exp(b y) (y0 - y))' integrates to the exact profile."""
+    b = 2.0
+
+    def error(cells):
+        grid = channel(cells)
+        hot = {"y": dp.dirichlet}
+        values = dp.lift(grid, hot).domain.join(0.0, 1.0)
+        heat = {"diffusivity": 1.0, "boundary": hot, "values": values}
+        y = grid.centres()[1]
+        viscosity = lambda rate, s, b: anp.exp(-b * s["heat"])
+        speeds = steady_speeds(grid, viscosity, b, 40, 0.1, {"heat": y}, scalars={"heat": heat})
+        y = y[0]
+        middle = (np.exp(b) * (b - 1) + 1) / b / (np.exp(b) - 1)  # where the shear rate is 0
+        antiderivative = lambda y: np.exp(b * y) * (middle / b - y / b + 1 / b**2)
+        return np.max(np.abs(speeds - antiderivative(y) + antiderivative(0.0)))
+
+    assert error(16) < 3e-3
+    assert error(8) / error(16) > 3.5
+
+
+def test_two_layers():
+    """Couette flow of two layers with viscosities 1 and 1e6: the exact profile, linear in each layer, is steady."""
+    grid = channel(8)
+    y = grid.centres()[1][0]
+    viscosity = np.where(grid.centres()[1] < 0.5, 1.0, 1e6)
+    stress = 1 / (0.5 + 0.5e-6)
+    exact = np.where(y < 0.5, stress * y, 1 - stress * (1 - y) * 1e-6)
+    walls = dp.face_lift(grid).domain.join(0.0, 1.0)
+    step = dp.flow_step(grid, 0.1, viscosity, implicit=True, walls=lambda params: walls)
+    end = dp.rollout(step, step.start(grid.join(exact, 0.0)), None, 10)
+    np.testing.assert_allclose(grid.split(end["v"])[0][0], exact, rtol=1e-9)
+
+
+@pytest.mark.parametrize("ratio", [1000.0, 1e6])
+def test_two_layers_at_rest(ratio):
+    """Heavy below light fluid stays at rest up to rounding, and the pressure balances the weight."""
+    grid = dp.Grid((5, 6), size=1.0)
+    y = grid.centres()[1]
+    density = np.where(y > 0.5, 1.0, ratio)
+    step = dp.flow_step(grid, 0.01, 1e-3, lambda v, params: grid.join(0.0, -9.8), density=density)
+    end = dp.rollout(step, step.start(np.zeros(grid.faces.size)), None, 20)
+    assert np.max(np.abs(end["v"])) < 1e-15 * ratio
+    weight = 9.8 * (ratio * (0.5 - 1 / 12) + 0.5 - 1 / 12)
+    np.testing.assert_allclose(np.ptp(end["p"]), weight, rtol=1e-12)
+
+
+def test_density_one_is_no_density(rng):
+    grid = dp.Grid((6, 5))
+    v = rng.standard_normal(grid.faces.size)
+    plain = dp.flow_step(grid, 0.01, 0.1)
+    given = dp.flow_step(grid, 0.01, 0.1, density=np.ones(grid.shape))
+    heavy = dp.flow_step(grid, 0.01, 0.3, density=3.0)
+    ends = [dp.rollout(step, step.start(v), None, 3) for step in (plain, given, heavy)]
+    np.testing.assert_allclose(ends[1]["v"], ends[0]["v"], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(ends[2]["v"], ends[0]["v"], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(ends[2]["p"], 3.0 * ends[0]["p"], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.whole
+def test_rayleigh_taylor():
+    """Growth of a wave on the interface of two fluids without viscosity, by linear theory."""
+    grid = dp.Grid((16, 32), size=(1.0, 2.0), periodic=(True, False))
+    x, y = grid.face_centres(1)
+    heavy = np.where(grid.centres()[1] > 1, 1.0, 0.0)
+    step = dp.flow_step(
+        grid,
+        0.03,
+        force=lambda v, s, ratio: grid.join(0.0, -1.0),
+        density=lambda s, ratio: 1 + (ratio - 1) * s["heavy"],
+        scalars={"heavy": {}},
+    )
+    start = grid.join(0.0, 1e-6 * np.cos(2 * np.pi * x) * np.exp(-2 * np.pi * np.abs(y - 1)))
+    middle, end = dp.rollout(step, step.start(start, 3.0, {"heavy": heavy}), 3.0, 100, keep=[70, 100])["v"]
+    growth = np.log(np.sum(end**2) / np.sum(middle**2)) / (2 * 30 * 0.03)
+    assert growth == pytest.approx(np.sqrt(np.pi), rel=0.1)  # 9.5 % with 16 cells a wavelength, 2.5 % with 64
+
+
+def test_oscillating_wall():
+    """Stokes' second problem in a channel: the wall velocity is a function of time, given by the inputs."""
+    viscosity, frequency = 0.02, 2 * np.pi
+    decay = np.sqrt(1j * frequency / viscosity)
+
+    def error(n):
+        grid = channel(n)
+        y = grid.centres()[1]
+        exact = lambda t: np.real(np.exp(1j * frequency * t) * np.sinh(decay * (1 - y)) / np.sinh(decay))
+        times = np.arange(1, 2 * n + 1) / (2 * n)
+        walls = dp.face_lift(grid).domain
+        flow = dp.flow_step(
+            grid, 0.5 / n, viscosity, implicit=True, convective=False, walls=lambda speed: walls.join(speed, 0.0)
+        )
+        step = lambda state, params, speed: flow(state, speed)
+        start = flow.start(grid.join(exact(0.0), 0.0), 1.0)
+        end = dp.rollout(step, start, None, 2 * n, inputs=np.cos(frequency * times))
+        return np.max(np.abs(grid.split(end["v"])[0] - exact(1.0)))
+
+    assert error(16) / error(32) > 3.9
+
+
+def test_step_length_of_params():
+    """A constant function gives the numbers of a constant; steps of different length keep order 2."""
+    grid = dp.Grid((6, 6), size=1.0, periodic=True)
+    x, y = (2 * np.pi * c for c in grid.face_centres(0))
+    z, w = (2 * np.pi * c for c in grid.face_centres(1))
+    start = grid.join(np.sin(x) * np.cos(y), -np.cos(z) * np.sin(w))
+    constant = dp.flow_step(grid, 0.01, 0.05)
+    varying = dp.flow_step(grid, lambda dt: dt, 0.05)
+    ends = [dp.rollout(step, step.start(start, 0.01), 0.01, 3) for step in (constant, varying)]
+    np.testing.assert_allclose(ends[1]["v"], ends[0]["v"], rtol=1e-14, atol=1e-15)
+
+    def end(n):
+        lengths = 1 + 0.5 * np.sin(2 * np.pi * np.arange(n) / n)
+        lengths *= 0.2 / np.sum(lengths)
+        step = lambda state, params, dt: varying(state, dt)
+        return dp.rollout(step, varying.start(start, lengths[0]), None, n, inputs=lengths)["v"]
+
+    coarse, middle, fine = end(10), end(20), end(40)
+    assert np.max(np.abs(coarse - middle)) / np.max(np.abs(middle - fine)) > 3
+
+
+def test_diffusivity_in_layers():
+    """Conduction through two layers in series is exact, explicit and implicit."""
+    grid = dp.Grid(8, size=1.0)
+    ends = {"x": dp.dirichlet}
+    values = dp.lift(grid, ends).domain.join(0.0, 1.0)
+    diffusivity = np.where(grid.centres()[0] < 0.5, 1.0, 4.0)
+    y = grid.centres()[0]
+    exact = np.where(y < 0.5, 1.6 * y, 1 - 0.4 * (1 - y))
+    for implicit in (False, True):
+        heat = {"diffusivity": lambda k: k, "boundary": ends, "values": values}
+        step = dp.flow_step(grid, 5e-4, scalars={"heat": heat}, implicit=implicit, convective=False)
+        start = step.start(np.zeros(9), diffusivity, {"heat": exact})
+        end = step(step(start, diffusivity), diffusivity)
+        np.testing.assert_allclose(end["s"]["heat"], exact, rtol=1e-12)
+
+
+def test_smagorinsky_at_rest():
+    """The shear rate is 0 at rest, and so is its derivative."""
+    grid = dp.Grid((4, 4))
+    step = dp.flow_step(grid, 0.1, lambda rate, c: c * rate)
+    gradient = dp.grad(lambda v: anp.sum(step(step.start(v, 0.1), 0.1)["v"] ** 2))(np.zeros(grid.faces.size))
+    assert np.all(gradient == 0)
+
+
+def test_single_precision():
+    grid = dp.Grid((4, 4))
+    laws = {"viscosity": lambda rate, s, p: p * (1 + rate) * s["c"], "density": lambda s, p: 1 + s["c"]}
+    for implicit in (False, True):
+        step = dp.flow_step(grid, 0.1, scalars={"c": {"diffusivity": lambda p: p}}, implicit=implicit, **laws)
+        p = np.full(grid.shape, 0.1)
+        state = step.start(np.ones(grid.faces.size, np.float32), p, {"c": np.ones(grid.shape, np.float32)})
+        end = step(state, p)
+        assert end["v"].dtype == end["p"].dtype == end["s"]["c"].dtype == np.float32
+
+
+LAWS = {
+    "field": {"viscosity": lambda p: p["mu"]},
+    "all": {
+        "viscosity": lambda rate, s, p: p["mu"] * (0.01 + rate**2) ** ((p["n"] - 1) / 2) * anp.exp(-s["c"]),
+        "density": lambda s, p: 1 + p["rho"] * s["c"],
+        "scalars": {"c": {"diffusivity": lambda p: p["k"], "boundary": {"x": dp.dirichlet}}},
+        "dt": lambda p: p["dt"],
+    },
+}
+
+
+def loss_of(law, implicit, rng):
+    """Return a loss of three steps, and its params."""
+    grid = dp.Grid((4, 3), spacing=[rng.uniform(0.8, 1.2, 4), rng.uniform(0.8, 1.2, 3)])
+    v = rng.standard_normal(grid.faces.size)
+    weights = rng.standard_normal(grid.faces.size)
+    given = {"dt": 0.02, **LAWS[law]}
+    params = {"mu": 0.1 + 0.1 * rng.uniform(size=grid.shape), "n": 0.6, "dt": 0.02, "v": v}
+    params["rho"] = rng.uniform(size=grid.shape)
+    params["k"] = 0.1 + rng.uniform(size=grid.shape)
+
+    def loss(params):
+        step = dp.flow_step(grid, implicit=implicit, **given)
+        s = {"c": anp.ones(grid.shape)} if "scalars" in given else None
+        end = dp.rollout(step, step.start(params["v"], params, s), params, 2)
+        return anp.sum(weights * end["v"]) + anp.sum(end["v"] ** 2)
+
+    return loss, params
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize(("law", "implicit"), [("field", True), ("all", False)])
+def test_gradients(law, implicit, rng):
+    loss, params = loss_of(law, implicit, rng)
+    assert dp.check.gradient(loss, params, quick=True).verdict == "agrees"
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("implicit", [False, True])
+def test_derivatives_of_all_orders_and_modes(implicit, rng):
+    """vjp, jvp and hvp of all arguments agree with each other and with differences; jit with the plain step."""
+    loss, params = loss_of("all", implicit, rng)
+    direction = scaled(lambda leaf: 0.1 * leaf * np.cos(np.arange(np.size(leaf))).reshape(np.shape(leaf)), params)
+    value, gradient = dp.value_and_grad(loss)(params)
+    inner = lambda a, b: sum(np.sum(a[key] * b[key]) for key in a)
+    moved = lambda t: {key: params[key] + t * direction[key] for key in params}
+    slope = inner(gradient, direction)
+    assert dp.jvp(loss, params, direction)[1] == pytest.approx(slope, rel=1e-10)
+    differences = (loss(moved(1e-4)) - loss(moved(-1e-4))) / 2e-4
+    assert differences == pytest.approx(slope, rel=1e-6)
+    change = dp.hvp(loss, params, direction)
+    before, after = (inner(dp.grad(loss)(moved(t)), direction) for t in (-1e-4, 1e-4))
+    assert inner(change, direction) == pytest.approx((after - before) / 2e-4, rel=1e-5)
+    assert dp.jit(loss)(params) == value
+
+
+def scaled(function, tree):
+    return {key: function(leaf) for key, leaf in tree.items()}
