@@ -125,7 +125,7 @@ def check_stable(name: str, coefficient: float, dt: float, rate: float, settings
     if not settings.strict or not dt * rate > 1 + ROUNDING:
         return
     largest = rounded_down(1 / rate)
-    if settings.friction is None:
+    if settings.may_be_implicit:
         advice = "take smaller steps or write implicit=True"
     else:
         advice = "take smaller steps, or write unstable='allow'"

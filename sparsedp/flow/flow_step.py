@@ -63,9 +63,9 @@ from sparsedp.flow.moving_walls import moving_walls
 from sparsedp.flow.pressure_projection import projection
 from sparsedp.flow.projection_setup import mask_of_faces
 from sparsedp.flow.scalars import Scalar
-from sparsedp.flow.settings import FlowSettings
+from sparsedp.flow.settings import FlowSettings, takes_params_alone
 from sparsedp.flow.variable_density import WeightedProjection, density_on_faces
-from sparsedp.flow.variable_diffusion import Coefficient, VariableDiffusion, is_constant, takes_params_alone
+from sparsedp.flow.variable_diffusion import Coefficient, VariableDiffusion, is_constant
 from sparsedp.flow.viscous_stress import ViscousStress
 from sparsedp.grid.boundary_conditions import inflow as inflow_side
 from sparsedp.grid.boundary_conditions import no_slip, occurring
@@ -177,8 +177,8 @@ def flow_step(
         If dt, the viscosity, a diffusivity or the density is out of range, a scalar has an entry other than those
         four, a friction is given with implicit viscosity, `inflow` is given without an inflow boundary, an array as
         `walls` without a side that has a tangential velocity, or it does not determine the tangential velocity at an
-        inflow boundary, or if an implicit diffusivity is a function of the scalars. On use, if a friction is < 0 or complex, or `walls` is an array
-        beside a viscosity that varies.
+        inflow boundary, or if an implicit diffusivity is a function of the scalars. On use, if a friction is < 0 or
+        complex, or `walls` is an array beside a viscosity that varies.
     ShapeError
         If `walls` is an array of another shape than the faces, or a viscosity, diffusivity or density is an array of
         another shape than the cells. On use, if the state does not have the entries that ``step.start`` returns, or a
@@ -275,13 +275,13 @@ def _check(settings: FlowSettings) -> None:
             check_function("flow_step", settings.force, "force=lambda v, s, params: ...", 3)
         else:
             check_function("flow_step", settings.force, "force=lambda v, params: ...", 2)
-    if callable(settings.density) and not takes_params_alone(settings.density):
+    if not takes_params_alone(settings.density):
         check_function("flow_step", settings.density, "density=lambda s, params: ...", 2)
         if not settings.scalars:
             raise ValueError(
                 "density of flow_step is a function of scalars, and there are none; write density=lambda params: ..."
             )
-    if callable(settings.viscosity) and not takes_params_alone(settings.viscosity):
+    if not takes_params_alone(settings.viscosity):
         if settings.scalars:
             check_function("flow_step", settings.viscosity, "viscosity=lambda shear_rate, s, params: ...", 3)
         else:
@@ -303,7 +303,7 @@ def _check(settings: FlowSettings) -> None:
             )
         diffusivity = entries.get("diffusivity", 0.0)
         _check_coefficient(f"diffusivity of {name!r}", diffusivity, ">= 0")
-        if callable(diffusivity) and not takes_params_alone(diffusivity):
+        if not takes_params_alone(diffusivity):
             check_function("flow_step", diffusivity, "diffusivity=lambda s, params: ...", 2)
             if settings.implicit:
                 raise ValueError(

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import FunctionType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sparsedp.grid.grid import Grid
 
-__all__ = ["FlowSettings"]
+__all__ = ["FlowSettings", "takes_params_alone"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,3 +36,16 @@ class FlowSettings:
     def strict(self) -> bool:
         """Whether an error is raised if dt is too large for stability."""
         return self.unstable == "raise"
+
+    @property
+    def may_be_implicit(self) -> bool:
+        """Whether `implicit=True` is allowed: no friction is given, and no diffusivity is a function of scalars."""
+        diffusivities = [entries.get("diffusivity") for entries in (self.scalars or {}).values()]
+        return self.friction is None and all(map(takes_params_alone, diffusivities))
+
+
+def takes_params_alone(given: Any) -> bool:
+    """Return whether an argument is not a function, or a function with one argument that has no default value."""
+    if type(given) is not FunctionType:
+        return True
+    return given.__code__.co_argcount - len(given.__defaults__ or ()) <= 1

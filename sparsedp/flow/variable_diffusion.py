@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from types import FunctionType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,13 +25,14 @@ from sparsedp.autodiff.program_trace import check_values, sample
 from sparsedp.autodiff.tape import cast, dtype_of
 from sparsedp.autodiff.tape_constants import frozen
 from sparsedp.flow.diffusion import check_stable, spectral_bound
+from sparsedp.flow.settings import takes_params_alone
 from sparsedp.solvers.parametric import EllipticSolver, elliptic_solver
 
 if TYPE_CHECKING:
     from sparsedp.flow.settings import FlowSettings
     from sparsedp.operators.operator import Operator
 
-__all__ = ["Coefficient", "DiffusionForm", "VariableDiffusion", "is_constant", "takes_params_alone"]
+__all__ = ["Coefficient", "DiffusionForm", "VariableDiffusion", "is_constant"]
 
 
 class DiffusionForm:
@@ -99,7 +99,7 @@ class Coefficient:
         self._given = given
         self._cells = settings.grid.cells
         self._needs = needs
-        self.needs_fields = callable(given) and not takes_params_alone(given)
+        self.needs_fields = not takes_params_alone(given)
         if not callable(given):
             self._check(given)
 
@@ -147,13 +147,6 @@ class Coefficient:
 def is_constant(coefficient: Any, settings: FlowSettings) -> bool:
     """Return whether a coefficient is one number, and the step length too, so that no operator ever changes."""
     return not callable(coefficient) and np.ndim(coefficient) == 0 and not callable(settings.dt)
-
-
-def takes_params_alone(function: Callable) -> bool:
-    """Return whether a function has one positional argument without a default value."""
-    if type(function) is not FunctionType:
-        return True
-    return function.__code__.co_argcount - len(function.__defaults__ or ()) <= 1
 
 
 class VariableDiffusion:

@@ -12,9 +12,11 @@ the ratios k_l / den and k_r / den are 0 / 0; they are set to 1, which is their 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import autograd.numpy as anp
 import numpy as np
+from numpy.typing import NDArray
 
 from sparsedp._utils.base_classes import ReconstructibleFunction
 from sparsedp._utils.validation import check_finite, check_kind, check_native, check_on
@@ -86,7 +88,7 @@ def _check_coefficient(k):
         raise ValueError(f"harmonic_average needs a coefficient >= 0, got {np.min(values):g}")
 
 
-def lower_share(grid, axis):
+def lower_share(grid: Grid, axis: int) -> NDArray:
     """Return w_l (see the module docstring) on the faces perpendicular to an axis, broadcastable to their shape."""
     low = adjacent_cell(grid, axis, False).matrix @ grid.widths[axis]
     high = adjacent_cell(grid, axis, True).matrix @ grid.widths[axis]
@@ -95,7 +97,7 @@ def lower_share(grid, axis):
     return (low / (low + high)).reshape(shape)
 
 
-def harmonic_pair(share):
+def harmonic_pair(share: NDArray) -> Callable[[Any, Any], Any]:
     """Return the differentiable function k_f(k_l, k_r) of the module docstring, given w_l as `share`."""
 
     def ratios(low, high):

@@ -25,17 +25,20 @@ REFUSED = [
     (
         {"viscosity": np.ones(3)},
         dp.errors.ShapeError,
-        "flow_step, as viscosity, takes a field on cells(4, 4), got an array of shape (3,); write one number for each cell",
+        "flow_step, as viscosity, takes a field on cells(4, 4), got an array of shape (3,); write one "
+        "number for each cell",
     ),
     (
         {"density": lambda p: np.ones(3)},
         dp.errors.ShapeError,
-        "flow_step, as density, takes a field on cells(4, 4), got an array of shape (3,); write one number for each cell",
+        "flow_step, as density, takes a field on cells(4, 4), got an array of shape (3,); write one "
+        "number for each cell",
     ),
     (
         {"scalars": {"c": {"diffusivity": np.ones(3)}}},
         dp.errors.ShapeError,
-        "flow_step, as diffusivity of 'c', takes a field on cells(4, 4), got an array of shape (3,); write one number for each cell",
+        "flow_step, as diffusivity of 'c', takes a field on cells(4, 4), got an array of shape (3,); write one "
+        "number for each cell",
     ),
     (
         {"viscosity": np.full((4, 4), 1j)},

@@ -128,14 +128,14 @@ def test_friction_has_no_effect_on_walls_and_inflows():
 
 
 @pytest.mark.parametrize("friction", [False, True])
-@pytest.mark.parametrize("term", ["number", "function", "diffusivity"])
+@pytest.mark.parametrize("term", ["number", "function", "diffusivity", "diffusivity of scalars"])
 def test_advice_for_a_step_that_is_too_long(term, friction):
-    """Implicit viscosity is refused with a friction and with a viscosity that is a function."""
+    """Implicit viscosity is refused with a friction and with a diffusivity that is a function of scalars."""
     grid = dp.Grid((4, 4))
     given = {"friction": np.ones(grid.faces.size)} if friction else {}
     s = None
-    if term == "diffusivity":
-        given |= {"scalars": {"heat": {"diffusivity": 3.0}}}
+    if term.startswith("diffusivity"):
+        given |= {"scalars": {"heat": {"diffusivity": 3.0 if term == "diffusivity" else lambda s, params: 3.0}}}
         s = {"heat": np.zeros((4, 4))}
     else:
         given["viscosity"] = 3.0 if term == "number" else lambda params: 3.0
@@ -144,7 +144,7 @@ def test_advice_for_a_step_that_is_too_long(term, friction):
         dp.errors.UnstableStepError, match="unstable for (viscosity|diffusivity of 'heat') = 3 "
     ) as caught:
         run()
-    possible = not friction and term != "function"
+    possible = not friction and term != "diffusivity of scalars"
     assert ("implicit=True" in str(caught.value)) == possible
     if possible:
         run(implicit=True)
