@@ -80,7 +80,9 @@ FAULTS = {
         "push(varied, chosen, tangents)[1], equation, ans, *leaves)",
         "",
     ),
-    "a flow step that forgets the acceleration before": Bug("flow", '1.5 * a - 0.5 * state["a"]', "a", ""),
+    "a flow step that forgets the acceleration before": Bug(
+        "flow", 'self._half_step_ahead(a, state["a"], state, dt)', "a", ""
+    ),
 }
 
 
