@@ -1192,7 +1192,7 @@ BUGS = {
     # ---- check, report
     "a checker that takes a wrong gradient for a right one": Bug(
         "check",
-        '(("disagrees", "outside"), "disagrees")',
+        '(WRONG_WORDS, "disagrees")',
         '(("disagrees", "outside"), "agrees")',
         "tests/check/test_check_gradient.py",
     ),
@@ -1210,14 +1210,14 @@ BUGS = {
     ),
     "an inexact adjoint solve that counts as noise": Bug(
         "check/derivative_review.py",
-        "    if gap > allowed and (any(map(_is_exact, suspects)) or (not suspects and _is_resolved(audit, gap))):\n",
+        "    if is_visible and is_exact:\n",
         "    if False:\n",
         "tests/check/test_foreign_derivatives.py",
     ),
     "single precision of a VJP that nobody notices": Bug(
         "check/derivative_review.py",
-        "        if gap > LEAST_SINGLE and is_smooth and _roughness(audit) is None:\n",
-        "        if False:\n",
+        "    if audit.linear_gap > REVIEW.single_precision_gap and is_smooth and _roughness(audit) is None:\n",
+        "    if False:\n",
         "tests/check/test_foreign_derivatives.py",
     ),
     "a change in place that nobody notices": Bug(
@@ -1246,7 +1246,7 @@ BUGS = {
     ),
     "an inexact solve that is taken for an error": Bug(
         "check/derivative_review.py",
-        "        if direction.word in WRONG and direction.share <= INEXACT_SHARES * gap\n",
+        "        if direction.word in WRONG_WORDS and direction.share <= REVIEW.inexact_shares * gap\n",
         "        if False\n",
         "tests/check/test_foreign_derivatives.py",
     ),

@@ -30,7 +30,7 @@ from sparsedp.check.balanced_directions import (
 )
 from sparsedp.check.derivative_places import Places, diagnosis_of, places_of
 from sparsedp.check.derivative_review import review, rounds_in_single_precision
-from sparsedp.check.direction_evidence import CONFIRMING_WORDS, DirectionEvidence, weigh
+from sparsedp.check.direction_evidence import CONFIRMING_WORDS, UNDECIDED_WORDS, WRONG_WORDS, DirectionEvidence, weigh
 from sparsedp.check.directions import SHIFT, SHIFT_SEED, examine_line, first_non_finite
 from sparsedp.check.evaluations import EVALUATION_ERRORS, Evaluations, Line
 from sparsedp.check.functionals import FunctionalEvaluations, Functionals, Pullback, balanced_weights, leaf_weights
@@ -55,7 +55,6 @@ LINEAR_EPS = 1e4  # the same in units of machine epsilon; matters in single prec
 REPEATED_EPS = 1e3  # two runs of f may differ by this multiple of machine epsilon, if threads add in another order
 REPEATED_SHARE = 1e-6  # a larger relative difference of two equal calls is an error
 DUALITY_SHARE = 1e-6  # a larger gap between VJP and JVP is an error
-UNDECIDED = ("rough", "few", "noise", "masked")
 HIDDEN_EPS = 1e3  # a derivative that changes f(x) by less than this multiple of its rounding error is not examined
 LOSS_NAME = "f(x)"  # in sentences
 ARGUMENTS = {"vjp": "g", "jvp": "t"}
@@ -71,10 +70,10 @@ def examined(line: Line, search_ripples: bool = False) -> DirectionEvidence:
     A kink near x, or noise, leaves no Taylor order. A gap that is small on several neighbouring steps is accepted.
     """
     evidence = examine_line(line, search_ripples)
-    if evidence.word in UNDECIDED and evidence.step > 0 and line.evaluations.may_extend:
+    if evidence.word in UNDECIDED_WORDS and evidence.step > 0 and line.evaluations.may_extend:
         line.sweep(evidence.step * STEPS_BETWEEN)
         finer = weigh(line)
-        if finer.resolution < evidence.resolution or finer.word not in UNDECIDED:
+        if finer.resolution < evidence.resolution or finer.word not in UNDECIDED_WORDS:
             evidence = finer
     accept(evidence)
     return evidence
@@ -82,7 +81,7 @@ def examined(line: Line, search_ripples: bool = False) -> DirectionEvidence:
 
 def accept(evidence: DirectionEvidence) -> None:
     """Accept a direction without a Taylor order if its gap is small on several neighbouring steps."""
-    if evidence.word in UNDECIDED and evidence.is_close:
+    if evidence.word in UNDECIDED_WORDS and evidence.is_close:
         if evidence.size + evidence.bar <= ACCEPTED_SHARE * evidence.scale:
             evidence.note = f"accepted with {evidence.digits:.1f} digits, although {evidence.note}"
             evidence.word = "agrees"
@@ -610,7 +609,7 @@ class DerivativeAudit:
                 break
         for group in self.groups:
             for direction in group.directions:
-                if direction.word in ("disagrees", "outside"):
+                if direction.word in WRONG_WORDS:
                     share = direction.share if isfinite(direction.share) else inf
                     if self.worst is None or share > self.worst[1].share:
                         self.worst = group, direction

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sparsedp._utils.pytree import norm
 from sparsedp.check.balanced_directions import entry_units
-from sparsedp.check.direction_evidence import DirectionEvidence
+from sparsedp.check.direction_evidence import WRONG_WORDS, DirectionEvidence
 from sparsedp.check.entries import MOST_ENTRIES, EntryGap, gaps_along_entries, largest_gaps, listed
 from sparsedp.check.evaluations import EVALUATION_ERRORS
 
@@ -179,7 +179,7 @@ def _transpose(audit: Any, group: Any) -> str | None:
     shapes = [[values.shape for values in packing.values] for packing in (point, audit.program.result)]
     if shapes[0] != shapes[1] or point.vector.size != audit.base.size:
         return None
-    wrong = [direction.share for direction in group.directions if direction.word in ("disagrees", "outside")]
+    wrong = [direction.share for direction in group.directions if direction.word in WRONG_WORDS]
     if not wrong:
         return None
     scale = norm(point.units) / norm(group.weights)

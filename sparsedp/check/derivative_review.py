@@ -11,39 +11,17 @@ from typing import Any
 import numpy as np
 
 from sparsedp._utils.pytree import norm
-from sparsedp.check.direction_evidence import CONFIRMING_WORDS, DirectionEvidence
+from sparsedp.check.direction_evidence import CONFIRMING_WORDS, UNDECIDED_WORDS, WRONG_WORDS, DirectionEvidence
 from sparsedp.check.directions import reclassify_kinks
 from sparsedp.check.evaluations import EVALUATION_ERRORS
 from sparsedp.check.rounding_modes import ROUNDING_FACTOR, rounding_error
+from sparsedp.check.thresholds import REVIEW
 
 __all__ = ["review", "rounds_in_single_precision"]
 
-WRONG = ("disagrees", "outside")
-UNDECIDED = ("few", "noise", "rough", "masked", "constant")
 ABSOLUTE = "absolute"  # name of directions with steps relative to a whole leaf, if there are relative ones too
-NOT_LINEAR = 1e-2  # a larger gap of a linear combination is an error; a smaller one may be that of an inexact solve
-INEXACT_SHARES = 1e3  # a gap up to this multiple of the gap of linearity may be due to the same inexact solve
-LEAST_SINGLE = 1e-9  # a smaller gap of linearity is not due to single precision
-RESOLVED_SHARE = 0.01
-COARSE = 2.0**-6  # steps from here on are coarse
-EXACT_SHARE = 1e-3  # f is exact if the differences with coarse steps differ by at most this share of the gap
-LEAST_INEXACT = 1e-13  # gaps of linearity below this value are rounding errors
+ARGUMENTS = {"vjp": "g", "jvp": "t"}
 SINGLE_EPS = float(np.finfo(np.float32).eps)
-NUDGE = 1e-10  # relative change of a vector, far below the rounding of single precision
-ROUGH_SHARE = 0.3  # a larger second difference of the derivative is due to rounding
-LONG_SCALE = 2.0**6  # ratio of two steps over which the change of a differentiable function decreases clearly
-CHANGE_SHARE = 0.1
-SMOOTH_NOISE = 1e3  # noise of f in units of rounding, above which the roughness of a VJP shows nothing
-LARGER_NUDGE = 1e-6  # relative change of x, above the rounding of single precision
-SINGLE_SHARE = 2e-3  # a larger second difference of a VJP shows the rounding of single precision
-LEAST_CHANGE = 1e-4  # a smaller change of a VJP, relative to that of x, is due to rounding in double precision
-ROUNDING_STEP = 2.0**-27  # rounding of intermediate values may be visible in steps below this one
-FAR_STEPS = 2.0**9  # steps from this multiple on are far above the best one
-STEEP_SHARE = 0.05
-STAIRS = 2  # number of steps at which a staircase does not change although it should
-CLEAR_OF_ROUNDING = 100.0
-LEAST_AMPLIFIED_SHARE = 1 / 30
-SAME_GAP_SHARE = 0.1
 
 
 def review(audit: Any) -> None:
@@ -56,7 +34,7 @@ def review(audit: Any) -> None:
     """
     for group in audit.groups:
         for direction in group.directions:
-            if direction.word in WRONG:
+            if direction.word in WRONG_WORDS:
                 _find_other_scales(direction)
     if audit.base.size and np.all(np.isfinite(audit.base)) and audit.pairs:
         _review_linearity(audit)
@@ -64,7 +42,9 @@ def review(audit: Any) -> None:
     for group in audit.groups:
         if group.evaluations.gradient is not None:
             reclassify_kinks(group.evaluations, group.directions)
-    _drop(audit, "hidden entries", UNDECIDED)  # no difference can show a derivative that changes f so little
+    _drop(
+        audit, "hidden entries", (*UNDECIDED_WORDS, "constant")
+    )  # no difference can show a derivative that changes f so little
     if audit.has_wide_leaves:
         _drop_absolute_steps(audit)
 
@@ -73,25 +53,25 @@ def _find_other_scales(direction: DirectionEvidence) -> None:
     """Change the word to "noise" if the function varies on a finer scale than the steps, or is a staircase."""
     line = direction.line
     levels = [level for level in line.levels if not level.note and level.step <= direction.step]
-    if len(levels) > 1 and levels[0].step >= LONG_SCALE * levels[-1].step:
+    if len(levels) > 1 and levels[0].step >= REVIEW.long_scale * levels[-1].step:
         changes = [max(abs(level.plus - line.base), abs(level.minus - line.base)) for level in levels]
-        if changes[-1] >= CHANGE_SHARE * changes[0] > 0:
+        if changes[-1] >= REVIEW.unchanged_share * changes[0] > 0:
             direction.word = "noise"
             direction.note = "f varies on a scale below the smallest step: differences see no derivative"
             return
-    larger = [level for level in line.levels if not level.note and level.step >= FAR_STEPS * direction.step]
+    larger = [level for level in line.levels if not level.note and level.step >= REVIEW.far_steps * direction.step]
     steepest = max((abs(level.difference) for level in larger), default=inf)
-    if direction.step < ROUNDING_STEP and steepest <= STEEP_SHARE * abs(direction.difference):
+    if direction.step < REVIEW.rounding_step and steepest <= REVIEW.steep_share * abs(direction.difference):
         direction.word = "noise"
         direction.note = (
             f"steps below {direction.step:.0e} show a much steeper f than all others: rounding inside f may do it"
         )
         return
-    rounding = CLEAR_OF_ROUNDING * line.evaluations.eps * abs(line.base)
+    rounding = REVIEW.clear_of_rounding * line.evaluations.eps * abs(line.base)
     expected = abs(direction.difference)
     unchanged = line.evaluations.unchanged
     stairs = [level for level in line.levels if level.note == unchanged and level.step * expected > rounding]
-    if len(stairs) >= STAIRS:
+    if len(stairs) >= REVIEW.stairs:
         direction.word = "noise"
         direction.note = f"f does not change at all for steps up to {stairs[0].step:.0e}: it is a staircase"
 
@@ -102,64 +82,94 @@ def _review_linearity(audit: Any) -> None:
     If it is an inexact solve or rounding errors, then gaps of the same size along directions are no errors either.
     """
     gap = audit.linear_gap
-    if gap <= max(LEAST_INEXACT, 100 * max(audit.point.eps, audit.program.result.eps)):
+    eps = max(audit.point.eps, audit.program.result.eps)
+    if gap <= max(REVIEW.rounding_gap, REVIEW.rounding_gap_eps * eps):
         return
-    allowed = audit.allowed(1e-5)
     suspects = [
         direction
         for group in audit.groups
         for direction in group.directions
-        if direction.word in WRONG and direction.share <= INEXACT_SHARES * gap
+        if direction.word in WRONG_WORDS and direction.share <= REVIEW.inexact_shares * gap
     ]
-    name = audit.kind
-    argument = {"vjp": "g", "jvp": "t"}[name]
-    if gap <= allowed and not suspects:
-        is_smooth = audit.groups[0].evaluations.noise <= SMOOTH_NOISE
-        if gap > LEAST_SINGLE and is_smooth and _roughness(audit) is None:
-            reason = f"{name} rounds its numbers to single precision: it is linear in {argument} only to {gap:.0e}"
-            audit.findings.append(("broken", reason))
-        return
+    if gap <= audit.allowed(REVIEW.linear_share) and not suspects:
+        _review_small_gap(audit)
+    elif not _is_not_linear(audit):
+        _review_inexact_derivative(audit, suspects)
+
+
+def _review_small_gap(audit: Any) -> None:
+    """Add a finding if an allowed gap of linearity shows that a derivative rounds its numbers to single precision."""
+    is_smooth = audit.groups[0].evaluations.noise <= REVIEW.smooth_noise
+    if audit.linear_gap > REVIEW.single_precision_gap and is_smooth and _roughness(audit) is None:
+        _find_broken(audit, f"rounds its numbers to single precision: it {_linear_only(audit)}")
+
+
+def _is_not_linear(audit: Any) -> bool:
+    """Return whether a gap of linearity is explained without an inexact solve, and add a finding then."""
+    gap = audit.linear_gap
+    allowed = audit.allowed(REVIEW.linear_share)
+    argument = ARGUMENTS[audit.kind]
     vector, _ = audit.pairs[0]
-    zero = norm(audit.derivative(0 * vector))
-    if zero:
-        audit.findings.append(("broken", f"{name} is not linear: for a vector of zeros it does not return zeros"))
-        return
+    if norm(audit.derivative(0 * vector)):
+        return _find_broken(audit, "is not linear: for a vector of zeros it does not return zeros")
     roughness = _roughness(audit)
-    if roughness is None and gap > NOT_LINEAR:
-        audit.findings.append(
-            ("broken", f"{name} is a staircase of {argument}: some of its numbers are rounded, maybe to integers")
-        )
-        return
-    if roughness is None or roughness > ROUGH_SHARE:
+    if roughness is None and gap > REVIEW.nonlinear_gap:
+        return _find_broken(audit, f"is a staircase of {argument}: some of its numbers are rounded, maybe to integers")
+    if roughness is None or roughness > REVIEW.rough_share:
         if gap > allowed:
-            reason = f"{name} has rounding errors of {gap:.1e}: the problem is too ill-conditioned to tell"
+            reason = f"{audit.kind} has rounding errors of {gap:.1e}: the problem is too ill-conditioned to tell"
             audit.findings.append(("unsound", reason))
-        elif suspects:
-            audit.findings.append(("note", f"{name} has the rounding errors of single precision, {gap:.0e}"))
-        return
-    if gap > max(NOT_LINEAR, allowed):
-        audit.findings.append(("broken", f"{name} is not linear in {argument}: it is off by {gap:.1e}"))
-        return
-    if gap > allowed and (any(map(_is_exact, suspects)) or (not suspects and _is_resolved(audit, gap))):
-        reason = (
-            f"{name} is linear in {argument} only to {gap:.0e}, although f is exact: tighten the tolerance of its solve"
-        )
-        audit.findings.append(("broken", reason))
+        else:
+            audit.findings.append(("note", f"{audit.kind} has the rounding errors of single precision, {gap:.0e}"))
+        return True
+    if gap > max(REVIEW.nonlinear_gap, allowed):
+        return _find_broken(audit, f"is not linear in {argument}: it is off by {gap:.1e}")
+    return False
+
+
+def _review_inexact_derivative(audit: Any, suspects: Sequence[DirectionEvidence]) -> None:
+    """Decide whether a derivative with an inexact solve is wrong. It is, if f itself is exact.
+
+    Parameters
+    ----------
+    audit : DerivativeAudit
+    suspects : sequence of DirectionEvidence
+        Directions with gaps that may be due to the same inexact solve. They are noise if f is not exact either.
+    """
+    gap = audit.linear_gap
+    is_visible = gap > audit.allowed(REVIEW.linear_share)
+    if suspects:
+        is_exact = any(map(_is_exact, suspects))
+    else:
+        is_exact = _is_resolved(audit, gap)
+    if is_visible and is_exact:
+        _find_broken(audit, f"{_linear_only(audit)}, although f is exact: tighten the tolerance of its solve")
         return
     for direction in suspects:
         direction.word = "noise"
         direction.note = (
-            f"off by {direction.share:.1e}, and {name} is linear only to {gap:.0e}: "
+            f"off by {direction.share:.1e}, and {audit.kind} is linear only to {gap:.0e}: "
             "a solve in it may be inexact, tighten its tolerance"
         )
-    if gap > allowed and not suspects:
-        audit.findings.append(("note", f"{name} is linear only to {gap:.0e}: a solve in it may be inexact"))
+    if is_visible and not suspects:
+        audit.findings.append(("note", f"{audit.kind} is linear only to {gap:.0e}: a solve in it may be inexact"))
+
+
+def _linear_only(audit: Any) -> str:
+    """Return a phrase with the gap of linearity."""
+    return f"is linear in {ARGUMENTS[audit.kind]} only to {audit.linear_gap:.0e}"
+
+
+def _find_broken(audit: Any, words: str) -> bool:
+    """Add the finding that the derivative is wrong. Return True."""
+    audit.findings.append(("broken", f"{audit.kind} {words}"))
+    return True
 
 
 def _is_resolved(audit: Any, gap: float) -> bool:
     """Return whether all differences at x have much smaller error bars than a gap: then f has smaller errors, too."""
     lines = [direction for group in audit.groups for direction in group.directions]
-    return all(direction.resolution <= RESOLVED_SHARE * gap for direction in lines)
+    return all(direction.resolution <= REVIEW.resolved_share * gap for direction in lines)
 
 
 def _is_exact(direction: DirectionEvidence) -> bool:
@@ -167,8 +177,8 @@ def _is_exact(direction: DirectionEvidence) -> bool:
 
     An inexact solve is a nonlinear function of its right-hand side, with a relative error of its tolerance.
     """
-    coarse = [level for level in direction.line.levels if not level.note and level.step >= COARSE]
-    allowed = EXACT_SHARE * abs(direction.gap)
+    coarse = [level for level in direction.line.levels if not level.note and level.step >= REVIEW.coarse_step]
+    allowed = REVIEW.exact_share * abs(direction.gap)
     return len(coarse) > 1 and all(abs(level.difference - direction.difference) <= allowed for level in coarse)
 
 
@@ -181,7 +191,7 @@ def _roughness(audit: Any) -> float | None:
     if max(audit.point.eps, audit.program.result.eps) > SINGLE_EPS / 2:
         return 0.0  # every change is rounded
     vector, _ = audit.pairs[0]
-    change = NUDGE * vector * np.random.default_rng(0).uniform(-1.0, 1.0, vector.size)
+    change = REVIEW.nudge * vector * np.random.default_rng(0).uniform(-1.0, 1.0, vector.size)
     middle = audit.derivative(vector)
     ahead = audit.derivative(vector + change) - middle
     behind = audit.derivative(vector - change) - middle
@@ -195,10 +205,10 @@ def rounds_in_single_precision(audit: Any) -> bool:
     Then it rounds values that depend on x.
     """
     group = audit.groups[0]
-    if max(audit.point.eps, audit.program.result.eps) > SINGLE_EPS / 2 or group.evaluations.noise > SMOOTH_NOISE:
+    if max(audit.point.eps, audit.program.result.eps) > SINGLE_EPS / 2 or group.evaluations.noise > REVIEW.smooth_noise:
         return False
     point = audit.point
-    change = LARGER_NUDGE * point.units * np.random.default_rng(1).uniform(-1.0, 1.0, point.size)
+    change = REVIEW.larger_nudge * point.units * np.random.default_rng(1).uniform(-1.0, 1.0, point.size)
     slopes = [
         audit.program.pull(point.unpack(point.vector + side * change), group.weights) * point.units
         for side in (0.0, 1.0, -1.0)
@@ -206,9 +216,9 @@ def rounds_in_single_precision(audit: Any) -> bool:
     ahead = slopes[1] - slopes[0]
     behind = slopes[2] - slopes[0]
     size = max(norm(ahead), norm(behind))
-    if size <= LEAST_CHANGE * LARGER_NUDGE * norm(slopes[0]):
+    if size <= REVIEW.least_change * REVIEW.larger_nudge * norm(slopes[0]):
         return False
-    return norm(ahead + behind) > SINGLE_SHARE * size
+    return norm(ahead + behind) > REVIEW.single_precision_share * size
 
 
 def _review_rounding(audit: Any) -> None:
@@ -218,7 +228,9 @@ def _review_rounding(audit: Any) -> None:
     """
     if any(word in ("broken", "unsound") for word, _ in audit.findings):
         return
-    wrong = [(group, direction) for group in audit.groups for direction in group.directions if direction.word in WRONG]
+    wrong = [
+        (group, direction) for group in audit.groups for direction in group.directions if direction.word in WRONG_WORDS
+    ]
     for group, direction in sorted(wrong, key=lambda pair: -pair[1].share):
         reason = None
         with suppress(*EVALUATION_ERRORS):
@@ -241,7 +253,7 @@ def _rounding_reason(audit: Any, group: Any, direction: DirectionEvidence) -> st
         return None
     in_f = rounding_error(partial(audit.difference_along, group, direction, step))
     in_derivative = rounding_error(partial(audit.slope_along, group, direction))
-    if in_f < LEAST_AMPLIFIED_SHARE * in_derivative:  # only the derivative under test has errors: it is at fault
+    if in_f < REVIEW.amplified_share * in_derivative:  # only the derivative under test has errors: it is at fault
         in_derivative = 0.0
     error = in_f + in_derivative
     if direction.size <= ROUNDING_FACTOR * error:
@@ -262,7 +274,7 @@ def _coarsest_step(direction: DirectionEvidence) -> float | None:
     for step, gap in zip(direction.steps[::-1], direction.gaps[::-1]):
         if step < direction.step:
             continue
-        if abs(gap - direction.gap) > SAME_GAP_SHARE * direction.size:
+        if abs(gap - direction.gap) > REVIEW.same_gap_share * direction.size:
             break
         coarsest = float(step)
     return coarsest
@@ -278,7 +290,7 @@ def _drop_absolute_steps(audit: Any) -> None:
     for group in audit.groups:
         relative += [direction for direction in group.directions if not direction.direction.startswith(ABSOLUTE)]
     if audit.covered == 1 and all(direction.word in CONFIRMING_WORDS for direction in relative):
-        _drop(audit, ABSOLUTE, (*UNDECIDED, *WRONG))
+        _drop(audit, ABSOLUTE, (*UNDECIDED_WORDS, "constant", *WRONG_WORDS))
 
 
 def _drop(audit: Any, name: str, words: Sequence[str]) -> None:

@@ -29,9 +29,20 @@ from sparsedp.check.evaluations import Line
 from sparsedp.check.summary import Result
 from sparsedp.check.thresholds import THRESHOLDS
 
-__all__ = ["CONFIRMING_WORDS", "DirectionEvidence", "DirectionResult", "pairwise_orders", "rms_of_both_sides", "weigh"]
+__all__ = [
+    "CONFIRMING_WORDS",
+    "UNDECIDED_WORDS",
+    "WRONG_WORDS",
+    "DirectionEvidence",
+    "DirectionResult",
+    "pairwise_orders",
+    "rms_of_both_sides",
+    "weigh",
+]
 
 CONFIRMING_WORDS = ("agrees", "vanishes")  # results that confirm the gradient
+WRONG_WORDS = ("disagrees", "outside")  # results that show an error of the gradient
+UNDECIDED_WORDS = ("few", "noise", "rough", "masked")  # results that more or other steps may change
 FEW_EPS = 8.0  # assumed rounding error of x, in units of eps, in the error bar
 SINGLE_PRECISION_EPS = 300.0  # smallest detectable gap in units of the eps of x; matters in single precision
 

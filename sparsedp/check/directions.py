@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sparsedp._utils.validation import place
-from sparsedp.check.direction_evidence import DirectionEvidence, weigh
+from sparsedp.check.direction_evidence import WRONG_WORDS, DirectionEvidence, weigh
 from sparsedp.check.evaluations import EVALUATION_ERRORS, Evaluations, Line
 from sparsedp.check.loss_noise import measure_noise
 from sparsedp.check.overall_verdict import overall_verdict
@@ -229,7 +229,7 @@ def reclassify_kinks(evaluations: Evaluations, directions: Sequence[DirectionEvi
         if overall_verdict(*found)[0] == "disagrees":
             return
         for direction in directions:
-            if direction.word in ("outside", "disagrees"):
+            if direction.word in WRONG_WORDS:
                 direction.word = "kink"
                 direction.note = "kinks, or parts of a direction that do not add up; beside x all agrees"
 

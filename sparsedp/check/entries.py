@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sparsedp._utils.counters import recording
-from sparsedp.check.direction_evidence import DirectionEvidence
+from sparsedp.check.direction_evidence import WRONG_WORDS, DirectionEvidence
 from sparsedp.check.evaluations import EVALUATION_ERRORS, Evaluations, Line
 from sparsedp.check.point import Point
 from sparsedp.grid.grid import node_axes
@@ -384,7 +384,7 @@ def gaps_along_entries(
         Empty if no direction disagrees, or if `x` has only one entry.
     """
     point = evaluations.point
-    wrong = [direction for direction in directions if direction.word in ("disagrees", "outside")]
+    wrong = [direction for direction in directions if direction.word in WRONG_WORDS]
     if point.entries < 2 or not wrong:
         return []
     if units is None:

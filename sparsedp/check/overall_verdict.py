@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import inf
 
-from sparsedp.check.direction_evidence import CONFIRMING_WORDS, DirectionEvidence
+from sparsedp.check.direction_evidence import CONFIRMING_WORDS, WRONG_WORDS, DirectionEvidence
 from sparsedp.check.thresholds import THRESHOLDS
 
 __all__ = ["overall_verdict"]
@@ -15,7 +15,7 @@ VERDICTS = (
     (("unsound",), "inconclusive"),
     (("broken",), "disagrees"),
     (("ripple",), "inconclusive"),
-    (("disagrees", "outside"), "disagrees"),
+    (WRONG_WORDS, "disagrees"),
     (("open", "hidden modes", "kink", "rough", "noise", "masked", "few", "loose steps"), "inconclusive"),
 )
 

@@ -1,10 +1,10 @@
-"""The thresholds of `check.gradient`, each with its derivation."""
+"""The thresholds of `check.gradient` and of the checks of derivatives of other programs, each with its derivation."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["THRESHOLDS", "AuditThresholds"]
+__all__ = ["REVIEW", "THRESHOLDS", "AuditThresholds", "ReviewThresholds"]
 
 
 @dataclass(frozen=True)
@@ -153,3 +153,100 @@ class AuditThresholds:
 
 
 THRESHOLDS = AuditThresholds()
+
+
+@dataclass(frozen=True)
+class ReviewThresholds:
+    """Thresholds by which `check.vjp` and the other checks of derivatives tell errors from properties of a program.
+
+    A gap of linearity is the relative gap between the derivative of a linear combination of vectors and the combination
+    of their derivatives. It is about eps for a right derivative, 1e-8 to 1e-7 if numbers are rounded to single
+    precision, and about the tolerance of an inexact solve. A nudge is a tiny relative change of a vector: a smooth
+    function of it has a second difference far below its first difference, and rounding errors have one of equal size.
+
+    Attributes
+    ----------
+    rounding_gap : float
+        A gap of linearity up to this value is due to rounding: about 500 eps.
+    rounding_gap_eps : float
+        The same limit in units of the eps of x and f(x); matters in single precision.
+    linear_share : float
+        A gap of linearity up to this value is allowed: above single precision, below solves that are called loose.
+    nonlinear_gap : float
+        A larger gap of linearity is an error. A smaller one may be that of an inexact solve; tolerances above 1 % are
+        unusual.
+    inexact_shares : float
+        A gap along a direction up to this multiple of the gap of linearity may be due to the same inexact solve, whose
+        error is amplified by the condition number and by terms that cancel.
+    single_precision_gap : float
+        A smaller gap of linearity is not due to single precision: a hundredth of its eps.
+    resolved_share : float
+        The differences at x are exact if their error bars are below this share of the gap of linearity.
+    coarse_step : float
+        Steps from this one on are coarse: an inexact solve changes a difference by its tolerance divided by the step.
+    exact_share : float
+        The solves of f are exact if differences with coarse steps vary by at most this share of the gap.
+    nudge : float
+        Relative change of a vector far below the rounding of single precision, and far above eps.
+    rough_share : float
+        A second difference of a derivative above this share of its first difference is due to rounding.
+    larger_nudge : float
+        Relative change of x above the rounding of single precision.
+    single_precision_share : float
+        A second difference above this share, for the larger nudge, shows the rounding of single precision, which
+        changes the first difference by 6e-8 / 1e-6. That of a smooth derivative is about 1e-6.
+    least_change : float
+        A smaller change of a VJP, relative to that of x, is due to rounding in double precision: eps / larger_nudge is
+        2e-10, amplified by terms that cancel.
+    smooth_noise : float
+        With more noise of f, in units of its rounding, the roughness of a derivative shows nothing about single
+        precision.
+    long_scale : float
+        Ratio of two steps over which the change of a differentiable function decreases clearly.
+    unchanged_share : float
+        f varies on a finer scale than the steps if its change decreases less than by this factor over such a ratio.
+    rounding_step : float
+        Rounding of intermediate values may be visible in steps below this one: half of the digits, eps^(1/2) / 2.
+    far_steps : float
+        Steps from this multiple on are far above the best one.
+    steep_share : float
+        Fine steps show rounding inside f if all far steps show a derivative below this share of theirs.
+    stairs : int
+        Number of steps without any change of f that show a staircase.
+    clear_of_rounding : float
+        A change above this number of roundings of f should be visible.
+    amplified_share : float
+        A change of a derivative in other rounding modes is that of an ill-conditioned problem only if the differences
+        of f change by at least this share of it. It is between the ratio of double to single precision, 2e-9, amplified
+        by steps and sums, and the ratio of 1/20 that was measured for Vandermonde matrices and their transposes.
+    same_gap_share : float
+        A step shows the same gap as the best one if it differs by at most this share.
+    """
+
+    rounding_gap: float = 1e-13
+    rounding_gap_eps: float = 100.0
+    linear_share: float = 1e-5
+    nonlinear_gap: float = 1e-2
+    inexact_shares: float = 1e3
+    single_precision_gap: float = 1e-9
+    resolved_share: float = 0.01
+    coarse_step: float = 2.0**-6
+    exact_share: float = 1e-3
+    nudge: float = 1e-10
+    rough_share: float = 0.3
+    larger_nudge: float = 1e-6
+    single_precision_share: float = 2e-3
+    least_change: float = 1e-4
+    smooth_noise: float = 1e3
+    long_scale: float = 2.0**6
+    unchanged_share: float = 0.1
+    rounding_step: float = 2.0**-27
+    far_steps: float = 2.0**9
+    steep_share: float = 0.05
+    stairs: int = 2
+    clear_of_rounding: float = 100.0
+    amplified_share: float = 1 / 30
+    same_gap_share: float = 0.1
+
+
+REVIEW = ReviewThresholds()
