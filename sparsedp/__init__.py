@@ -34,6 +34,7 @@ _PUBLIC_NAMES = {
     "solvers.continuation": "continuation",
     "solvers.eigenpairs": "eigenpairs",
     "solvers.parametric": "elliptic_solver matrix_solver",
+    "solvers.cut_cells": "cut_cells",
     "solvers.roots": "implicit steady",
     "solvers.spectral": "matrix_exponential matrix_function matrix_power",
     "flow.momentum": "convection face_laplacian face_lift",

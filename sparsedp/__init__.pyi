@@ -79,6 +79,7 @@ from .report.plots import v_curve as v_curve
 from .report.stress_table import stress as stress
 from .report.work_precision import work_precision as work_precision
 from .solvers.continuation import continuation as continuation
+from .solvers.cut_cells import cut_cells as cut_cells
 from .solvers.eigenpairs import eigenpairs as eigenpairs
 from .solvers.inverse import inverse as inverse
 from .solvers.parametric import elliptic_solver as elliptic_solver

@@ -166,7 +166,7 @@ def brinkman(grid: Grid) -> Callable[[Any], Any]:
 
     See Also
     --------
-    flow_step, forces
+    cut_cells, flow_step, forces
 
     Notes
     -----

@@ -201,7 +201,7 @@ def laplacian(
 
     See Also
     --------
-    gradient, divergence, lift, inverse, face_laplacian, dirichlet, neumann, robin, patch
+    gradient, divergence, lift, inverse, face_laplacian, cut_cells, dirichlet, neumann, robin, patch
 
     Notes
     -----

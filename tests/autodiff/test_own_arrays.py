@@ -107,6 +107,11 @@ BUILDERS = {
         lambda rtol: dp.elliptic_solver(dp.divergence(GRID), dp.gradient(GRID, dp.dirichlet), "krylov", rtol),
         lambda solve: solve(K, CELLS),
     ),
+    "cut_cells": (
+        (np.add.outer(np.arange(-1.3, 3.0), np.arange(4.0)), walls("pressure")),
+        lambda level, b: dp.cut_cells(GRID, level, b, dp.dirichlet),
+        lambda body: body.solve(CELLS),
+    ),
     "implicit": ((sp.csr_array(np.eye(12)),), lambda s: dp.implicit(cubic, sparsity=s), lambda f: f(CELLS, CELLS)),
     "ensemble": (
         ([CELLS.copy(), 2 * CELLS], np.array([1.0, 2.0])),

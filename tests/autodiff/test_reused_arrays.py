@@ -27,8 +27,8 @@ face_laplacian flux face_lift free_slip from_blackbox from_functions from_linear
 gradient harmonic_average hvp identity inflow interior jit jvp laplace laplacian lift mask matrix_exponential
 matrix_function matrix_power minimize neumann no_slip Operator outflow
 patch physical_gradient plot projection prolong report restrict robin sample set_threads smoothness stress
-brinkman distribute equal flatten gather interop total_variation update_direction upwind v_curve value_and_grad vjp
-work_precision eigenpairs from_image load save testing
+brinkman cut_cells distribute equal flatten gather interop total_variation update_direction upwind v_curve
+value_and_grad vjp work_precision eigenpairs from_image load save testing
 """.split()
 
 

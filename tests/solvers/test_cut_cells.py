@@ -1,0 +1,337 @@
+"""cut_cells: geometry of planes, exact linear solutions, limits, orders around and inside of a disc, derivatives."""
+
+import autograd.numpy as np
+import pytest
+
+import sparsedp as dp
+from sparsedp.errors import DerivativeError, IncompatibleError, JitError, NonFiniteError, ShapeError
+
+CONDITIONS = [dp.dirichlet, dp.neumann, dp.robin(1.0, 0.3)]
+GRID = dp.Grid((7, 6), spacing=[np.linspace(0.1, 0.2, 7), 0.15])
+ONES = np.ones(GRID.shape)
+
+
+def hypot(*coordinates):
+    return np.sqrt(sum(x**2 for x in coordinates))
+
+
+def plane(dim):
+    """A plane that is aligned with no axis: a level, the unit normal that points into the fluid, and a point on it."""
+    normal = np.array([0.6, -0.3, 0.5][:dim])
+    normal = normal / np.linalg.norm(normal)
+    point = np.array([0.47, 0.36, 0.41][:dim])
+    return (lambda *x: 3.0 * sum(n * (c - p) for n, c, p in zip(normal, x, point))), normal, point
+
+
+# ------------------------------------------------------------ geometry
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_planes_are_exact(dim):
+    """Volumes by Gauss's theorem for the field x: dim V = sum of A x.n over the closed surface of the fluid."""
+    grid = dp.Grid((5, 4, 3)[:dim], size=(1.1, 0.9, 0.8)[:dim])
+    level, normal, point = plane(dim)
+    body = dp.cut_cells(grid, level)
+    on_wall = body.areas > 0
+    assert np.count_nonzero(on_wall) >= 1
+    assert all(np.allclose(n[on_wall], expected, atol=1e-14) for n, expected in zip(body.normals, normal))
+    distance = sum(n * (x - p) for n, x, p in zip(normal, body.centroids, point))
+    assert np.all(abs(distance[on_wall]) < 1e-15)
+    through_wall = -np.sum(body.areas) * np.dot(normal, point)
+    position = grid.join(*(grid.face_centres(a)[a] for a in range(dim)))
+    through_sides = np.sum(body.volumes * body.divergence(position))
+    assert np.isclose(dim * np.sum(body.volumes), through_sides + through_wall, rtol=1e-14)
+    for axis in range(dim):  # the surface of the fluid of each cell is closed
+        constant = grid.join(*(float(a == axis) for a in range(dim)))
+        assert np.allclose(body.volumes * body.divergence(constant), body.areas * body.normals[axis], atol=1e-15)
+
+
+def test_volumes_of_a_wedge_and_of_a_ball():
+    corner = dp.cut_cells(dp.Grid((3, 3, 3)), lambda x, y, z: x + y + z - 7.5)  # the corner of a cell: 1.5^3 / 6
+    assert np.isclose(np.sum(corner.volumes), 1.5**3 / 6, rtol=1e-14)
+    assert np.isclose(np.sum(corner.areas), np.sqrt(3) / 2 * 1.5**2, rtol=1e-14)
+    ball = dp.cut_cells(dp.Grid((12,) * 3, size=2.0, origin=-1.0), lambda *x: 0.7 - hypot(*x))
+    assert np.isclose(np.sum(ball.volumes), 4 / 3 * np.pi * 0.7**3, rtol=0.03)
+    assert np.isclose(np.sum(ball.areas), 4 * np.pi * 0.7**2, rtol=0.03)
+    assert np.isclose(np.sum(ball.centroids[0] * ball.areas), 0.0, atol=1e-14)  # the cells have no preferred diagonal
+
+
+# ------------------------------------------------------------ exact solutions and limits
+
+
+@pytest.mark.parametrize("condition", CONDITIONS, ids=repr)
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_linear_solutions_are_exact(dim, condition):
+    grid = dp.Grid((6, 5, 4)[:dim], size=(1.1, 0.9, 0.8)[:dim], periodic=(False, True, True)[:dim])
+    body = dp.cut_cells(grid, lambda x, *_: 0.47 - x, {"x": dp.dirichlet}, condition)
+    walls = dp.lift(grid, {"x": dp.dirichlet}).domain.join(1.0, 0.0)
+    values = condition.a * (1.0 + 2.0 * 0.47) + condition.b * 2.0
+    u = body.solve(np.zeros(grid.shape), values, walls, k=2.5)
+    assert np.allclose(u, body.is_fluid * (1.0 + 2.0 * grid.centres()[0]), atol=1e-8)
+    assert np.all(abs(body.slopes(u, values) - 2.0)[body.areas > 0] < 1e-8)
+    assert np.all(abs(body.diffusion(u, values, walls, k=2.5)) < 1e-8)
+    inflow = np.sum(body.volumes * body.divergence(body.gradient(u, walls)))
+    assert np.isclose(inflow + np.sum(body.flux(u, values)), 0.0, atol=1e-12)  # conservative
+
+
+@pytest.mark.parametrize("condition", CONDITIONS, ids=repr)
+@pytest.mark.parametrize("dim", [2, 3])
+def test_slopes_of_linear_fields_are_exact_at_walls_of_any_direction(dim, condition):
+    grid = dp.Grid((8, 9, 7)[:dim], size=(1.1, 0.9, 0.8)[:dim])
+    level, normal, _ = plane(dim)
+    body = dp.cut_cells(grid, level, dp.dirichlet, condition)
+    steepness = np.array([2.0, -3.0, 0.7][:dim])
+    u, at_wall = (1.0 + sum(s * x for s, x in zip(steepness, points)) for points in (grid.centres(), body.centroids))
+    slope = -np.dot(steepness, normal)
+    errors = abs(body.slopes(u, condition.a * at_wall + condition.b * slope) - slope)
+    inside = (slice(2, -2),) * dim
+    assert np.count_nonzero(body.areas[inside]) > 3
+    assert np.all(errors[inside][body.areas[inside] > 0] < 1e-7)
+
+
+def test_limits_are_the_plain_solver():
+    box = (abs(GRID.centres()[0] - 0.5) < 0.2) & (abs(GRID.centres()[1] - 0.45) < 0.2)
+    x, y = (GRID.coordinates(axis, "nodes") for axis in (0, 1))
+    left, right = x[np.where(box.any(1))[0][[0, -1]] + [0, 1]]
+    low, high = y[np.where(box.any(0))[0][[0, -1]] + [0, 1]]
+    middle, half = 0.5 * np.array([left + right, low + high]), 0.5 * np.array([right - left, high - low])
+    aligned = dp.cut_cells(
+        GRID,
+        lambda x, y: np.maximum(abs(x - middle[0]) - half[0], abs(y - middle[1]) - half[1]).round(14),
+        dp.dirichlet,
+    )
+    assert np.array_equal(aligned.is_fluid, ~box)
+    plain = dp.inverse(-dp.laplacian(GRID, dp.dirichlet, solid=box))
+    assert np.allclose(aligned.solve(ONES), plain(ONES * ~box), rtol=1e-9)
+    fluid = dp.cut_cells(GRID, np.ones((8, 7)), dp.dirichlet, dp.dirichlet)
+    assert np.allclose(fluid.solve(ONES), dp.inverse(-dp.laplacian(GRID, dp.dirichlet))(ONES), rtol=1e-9)
+    solid = dp.cut_cells(GRID, np.zeros((8, 7)), dp.dirichlet, dp.dirichlet)
+    assert np.all(solid.solve(ONES) == 0) and not solid.is_fluid.any()
+    nothing = dp.cut_cells(dp.Grid((0, 2)), np.ones((1, 3)), dp.dirichlet)
+    assert nothing.solve(np.ones((0, 2))).shape == (0, 2)
+
+
+@pytest.mark.parametrize("condition", CONDITIONS, ids=repr)
+def test_tiny_cells_change_nothing(condition):
+    """Slivers, and a pocket of fluid around one node."""
+    grid = dp.Grid((6, 5), size=1.0)
+    sizes = []
+    for sliver in (0.0, 1e-14, 1e-9, 1e-6):
+        body = dp.cut_cells(grid, lambda x, y, sliver=sliver: x - 0.5 + sliver, dp.dirichlet, condition)
+        sizes.append(np.sum(body.volumes * body.solve(np.ones(grid.shape), 0.1)))
+    assert np.allclose(sizes, sizes[0], rtol=1e-5) and np.allclose(sizes[:3], sizes[0], rtol=1e-8)
+    pocket = -np.ones(grid.nodes.shape)
+    pocket[3, 2] = 1e-3
+    body = dp.cut_cells(grid, pocket, dp.dirichlet, condition, nullspace="project")
+    assert np.all(np.isfinite(body.solve(np.zeros(grid.shape), 0.7)))
+    if condition == dp.dirichlet:
+        assert np.allclose(body.solve(np.zeros(grid.shape), 0.7)[body.is_fluid], 0.7)
+
+
+def test_steps_are_not_limited_by_small_cells():
+    body = dp.cut_cells(GRID, lambda x, y: hypot(x - 0.5, y - 0.45) - 0.2, dp.dirichlet, dp.robin(1.0, 0.3))
+    assert np.min(body.fractions[body.is_fluid]) < 0.1
+    step = dp.stepper("tr_bdf2", None, 10.0, linear=body.laplacian, source=lambda _: ONES * body.is_fluid)
+    u = dp.rollout(step, 0 * ONES, None, 30)
+    assert np.allclose(u, body.solve(ONES), rtol=1e-9)
+    assert np.allclose(body.laplacian(u), body.diffusion(u), atol=1e-11)
+
+
+def test_periodic_sides_have_no_seam():
+    grid = dp.Grid((8, 6), size=1.0, periodic=True)
+    x, y = np.meshgrid(*(grid.coordinates(axis, "nodes") for axis in (0, 1)), indexing="ij")
+    level = np.cos(2 * np.pi * x) * np.cos(2 * np.pi * y) + 0.37
+    b = np.cos(2 * np.pi * grid.centres()[0])
+    u = dp.cut_cells(grid, level, solid_boundary=dp.dirichlet).solve(b)
+    shifted = dp.cut_cells(grid, np.roll(level, 3, 0), solid_boundary=dp.dirichlet).solve(np.roll(b, 3, 0))
+    assert np.allclose(np.roll(u, 3, 0), shifted, rtol=1e-9)
+
+
+def test_dtypes_batches_and_coefficients():
+    body = dp.cut_cells(GRID, lambda x, y: hypot(x - 0.5, y - 0.45) - 0.2, dp.dirichlet, dp.dirichlet)
+    u = body.solve(ONES)
+    single = body.solve(ONES.astype(np.float32))
+    assert single.dtype == np.float32 and np.allclose(single, u, rtol=1e-6)
+    assert np.array_equal(body.solve(ONES.astype(int)), u)
+    assert np.allclose(body.solve(np.stack([ONES, 3 * ONES]))[1], 3 * u, rtol=1e-12)
+    assert np.allclose(body.solve(ONES * 1j), 1j * u, rtol=1e-12)
+    assert np.allclose(body.solve(1e250 * ONES, k=1e200), 1e50 * u, rtol=1e-9)
+    far = dp.cut_cells(GRID, lambda x, y: 1e200 * (hypot(x - 0.5, y - 0.45) - 0.2), dp.dirichlet, dp.dirichlet)
+    assert np.allclose(far.solve(ONES), u, rtol=1e-9)
+    k = np.full(GRID.faces.size, 2.0)
+    assert np.allclose(body.solve(ONES, 0.3, k=k), body.solve(ONES, 0.3, k=2.0), rtol=1e-12)
+    assert np.allclose(body.solve(ONES, 0.3, k=k, wall_k=2.0), body.solve(ONES, 0.3, k=2.0), rtol=1e-12)
+    assert np.allclose(body.solve(ONES + 5 * u, shift=5.0), u, rtol=1e-9)
+    solve = dp.jit(lambda b, k: np.sum(body.solve(b, 0.3, k=k)))
+    assert np.isclose(solve(ONES, 2.0), np.sum(body.solve(ONES, 0.3, k=2.0)), rtol=1e-12)
+    assert np.isclose(solve(2 * ONES, 3.0), np.sum(body.solve(2 * ONES, 0.3, k=3.0)), rtol=1e-12)
+    assert repr(body) == "<cut_cells: 42 of 42 cells hold fluid, 12 are cut, dirichlet on the wall>"
+
+
+# ------------------------------------------------------------ derivatives
+
+
+def scene(dim, condition, n):
+    """A loss of a body and of everything that it depends on."""
+    grid = dp.Grid((n,) * dim, size=2.0, origin=-1.0)
+    b, weights, values = np.random.default_rng(dim).standard_normal((3, *grid.shape))
+    nodes = np.meshgrid(*(grid.coordinates(axis, "nodes") for axis in range(dim)), indexing="ij")
+
+    def loss(q):
+        radius = np.sqrt(sum((x - 0.03 * q[2]) ** 2 * (1 + 0.1 * q[1] * axis) for axis, x in enumerate(nodes)))
+        body = dp.cut_cells(grid, radius - 0.61 * q[0], dp.dirichlet, condition)
+        k = q[5] * (1 + 0.1 * np.sin(np.arange(grid.faces.size)))
+        u = body.solve(b * np.sin(q[3]), values * q[4], k=k, shift=q[6])
+        flux = np.sum(body.flux(u, values * q[4], k))
+        return np.sum(weights * u * body.volumes) + flux + np.sum(body.areas * body.centroids[-1] ** 2)
+
+    return loss, np.array([1.0, 1.1, 0.9, 0.7, 0.8, 1.2, 0.3])
+
+
+def test_derivatives_agree_with_differences():
+    loss, q = scene(2, dp.robin(1.0, 0.3), 7)
+    direction = np.array([1.0, -0.5, 0.7, 0.2, -0.3, 0.4, 0.6])
+    exact = np.dot(dp.grad(loss)(q), direction)
+    assert np.isclose(dp.jvp(loss, q, direction)[1], exact, rtol=1e-10)
+    differences = [(loss(q + h * direction) - loss(q - h * direction)) / (2 * h) for h in (1e-4, 2e-4)]
+    assert np.isclose((4 * differences[0] - differences[1]) / 3, exact, rtol=1e-7)
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("condition", CONDITIONS, ids=repr)
+@pytest.mark.parametrize("dim", [1, 2])
+def test_first_and_second_derivatives(dim, condition):
+    loss, q = scene(dim, condition, 9)
+    assert dp.check.gradient(loss, q, quick=True).verdict == "agrees"
+    slope = dp.grad(loss)
+    assert dp.check.gradient(lambda q: np.dot(slope(q), np.arange(1.0, 8.0)), q, quick=True).verdict == "agrees"
+
+
+@pytest.mark.whole
+def test_derivatives_in_three_dimensions():
+    loss, q = scene(3, dp.dirichlet, 6)
+    direction = np.array([1.0, -0.5, 0.7, 0.2, -0.3, 0.4, 0.6])
+    value = dp.hvp(loss, q, direction)
+    h = 1e-4
+    slope = dp.grad(loss)
+    assert np.allclose(value, (slope(q + h * direction) - slope(q - h * direction)) / (2 * h), rtol=1e-4, atol=1e-4)
+
+
+def test_the_level_on_a_grid_line_has_the_derivative_of_the_fluid_side():
+    grid = dp.Grid(6, size=1.0)
+
+    def size(x):
+        rod = dp.cut_cells(grid, lambda c: x - c, dp.dirichlet, dp.dirichlet)
+        return np.sum(rod.volumes * rod.solve(np.ones(6))) / (1 / 12)
+
+    assert np.isclose(size(0.5), 0.125, rtol=0.2)
+    h = 1e-5
+    assert np.isclose(dp.grad(size)(0.5), (size(0.5) - size(0.5 - h)) / h, rtol=1e-3)
+
+
+# ------------------------------------------------------------ convergence
+
+
+def disc_errors(n, inside, condition):
+    """Error in L2, in the maximum norm, and of the flux, for a field with all derivatives, around and inside a disc."""
+    grid = dp.Grid((n, n), size=2.0, origin=-1.0)
+    x0, y0, radius = 0.03, -0.021, 0.6183
+    side = 1.0 if inside else -1.0
+    body = dp.cut_cells(
+        grid,
+        lambda x, y: side * (radius - hypot(x - x0, y - y0)),
+        dp.dirichlet,
+        condition,
+        nullspace="project",
+    )
+
+    def exact(x, y):
+        return np.sin(1.7 * x + 0.3) * np.exp(0.8 * y) + x * x * y
+
+    x, y = body.centroids
+    distance = hypot(x - x0, y - y0)
+    slope_x = 1.7 * np.cos(1.7 * x + 0.3) * np.exp(0.8 * y) + 2 * x * y
+    slope_y = 0.8 * np.sin(1.7 * x + 0.3) * np.exp(0.8 * y) + x * x
+    slope = side * (slope_x * (x - x0) + slope_y * (y - y0)) / distance
+    values = condition.a * exact(x, y) + condition.b * slope
+    c = grid.coordinates(0)
+    sides = exact(-1, c)[None], exact(1, c)[None], exact(c, -1)[:, None], exact(c, 1)[:, None]
+    x, y = grid.centres()
+    laplacian = (0.64 - 2.89) * np.sin(1.7 * x + 0.3) * np.exp(0.8 * y) + 2 * y
+    u = body.solve(-laplacian, values, dp.lift(grid, dp.dirichlet).domain.join(*sides))
+    error = body.is_fluid * (u - exact(x, y))
+    if inside and condition == dp.neumann:
+        error = body.is_fluid * (error - np.sum(body.volumes * error) / np.sum(body.volumes))
+    flux = np.sum(body.flux(u, values))
+    expected = side * -0.8693302
+    return np.array([np.sqrt(np.sum(body.volumes * error**2)), np.max(abs(error)), abs(flux / expected - 1)])
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("inside", [True, False])
+@pytest.mark.parametrize("condition", [*CONDITIONS, dp.robin(1.0, 0.01)], ids=repr)
+def test_orders_around_and_inside_a_disc(inside, condition):
+    errors = np.array([disc_errors(n, inside, condition) for n in (16, 32, 64, 128)])
+    orders = np.log2(errors[0] / errors[-1]) / 3
+    assert orders[0] >= 1.9 and orders[1] >= 1.5, orders
+    assert errors[2, 2] < 5e-3 and errors[3, 2] < 1e-3
+
+
+def test_charge_of_a_coaxial_line():
+    """Two cylinders at the potentials 1 and 0: the charge is 2 pi / log(b / a)."""
+    grid = dp.Grid((64, 64), size=2.0, origin=-1.0)
+    line = dp.cut_cells(
+        grid, lambda x, y: np.minimum(hypot(x, y) - 0.35, 0.9 - hypot(x, y)), solid_boundary=dp.dirichlet
+    )
+    inner = hypot(*grid.centres()) < 0.6
+    u = line.solve(np.zeros(grid.shape), inner * 1.0)
+    charges = line.flux(u, inner * 1.0)
+    expected = 2 * np.pi / np.log(0.9 / 0.35)
+    assert np.isclose(np.sum(charges[inner]), expected, rtol=5e-3)
+    assert np.isclose(np.sum(charges), 0.0, atol=1e-9)
+
+
+# ------------------------------------------------------------ errors
+
+
+def test_errors_name_the_argument():
+    level = np.ones(GRID.nodes.shape)
+    body = dp.cut_cells(GRID, lambda x, y: x - 0.5, dp.dirichlet)
+    wrong_shape = (
+        r"^the level of cut_cells takes a field on nodes\(7, 6\) of shape \(8, 7\), got an array of shape \(7, 6\)$"
+    )
+    with pytest.raises(ShapeError, match=wrong_shape):
+        dp.cut_cells(GRID, ONES)
+    with pytest.raises(NonFiniteError, match="the level of cut_cells must be finite"):
+        dp.cut_cells(GRID, np.nan * level)
+    with pytest.raises(TypeError, match="the level of cut_cells must hold real numbers"):
+        dp.cut_cells(GRID, 1j * level)
+    with pytest.raises(TypeError, match="solid_boundary needs one condition"):
+        dp.cut_cells(GRID, level, solid_boundary={"x": dp.neumann})
+    with pytest.raises(
+        ShapeError, match=r"^b of cut_cells takes a field on cells\(7, 6\), got an array of shape \(3,\)$"
+    ):
+        body.solve(np.ones(3))
+    with pytest.raises(
+        ShapeError,
+        match=r"^values of cut_cells takes a number or a field on cells\(7, 6\), got an array of shape \(3,\)$",
+    ):
+        body.solve(ONES, np.ones(3))
+    with pytest.raises(NonFiniteError, match="values of cut_cells must be finite"):
+        body.solve(ONES, np.inf)
+    with pytest.raises(ValueError, match=r"^k of cut_cells must be >= 0, got -2$"):
+        body.solve(ONES, k=-2.0)
+    with pytest.raises(IncompatibleError, match="cut_cells is singular"):
+        dp.cut_cells(GRID, lambda x, y: x - 0.5).solve(ONES)
+    with pytest.raises(
+        JitError,
+        match="^dp.jit cannot record the level of cut_cells, whose values decide which cells are cut; call the "
+        "function without dp.jit$",
+    ):
+        dp.jit(lambda level: np.sum(dp.cut_cells(GRID, level, dp.dirichlet).solve(ONES)))(level)
+    with pytest.raises(
+        DerivativeError,
+        match=r"^the laplacian of cut_cells needs a plain level, got a traced one; write body.diffusion\(u\) or "
+        r"body.solve\(b\)$",
+    ):
+        dp.grad(lambda r: np.sum(dp.cut_cells(GRID, lambda x, y: x - r).laplacian(ONES)))(0.5)
