@@ -64,7 +64,7 @@ from sparsedp.flow.pressure_projection import projection
 from sparsedp.flow.projection_setup import mask_of_faces
 from sparsedp.flow.scalars import Scalar
 from sparsedp.flow.settings import FlowSettings, takes_params_alone
-from sparsedp.flow.variable_density import WeightedProjection, density_on_faces
+from sparsedp.flow.variable_density import density_on_faces
 from sparsedp.flow.variable_diffusion import Coefficient, VariableDiffusion, is_constant
 from sparsedp.flow.viscous_stress import ViscousStress
 from sparsedp.grid.boundary_conditions import inflow as inflow_side
@@ -394,7 +394,7 @@ class FlowStep(Reconstructible):
         if settings.density is not None:
             self._density = Coefficient("density", settings.density, settings, "> 0")
             self._to_faces = density_on_faces(grid)
-            self._weighted_projection = WeightedProjection(setup)
+            self._weighted_projection = self.project.weighted
         self._extrapolates = self.viscous.varies and settings.implicit and self.viscous.coefficient.needs_fields
         self.walls = moving_walls(settings, setup.sides)
         self.scalars = {

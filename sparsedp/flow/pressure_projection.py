@@ -22,8 +22,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sparsedp._utils.base_classes import Frozen
+from sparsedp._utils.calls import public
+from sparsedp._utils.validation import check_on
+from sparsedp.autodiff.tape import dtype_of
 from sparsedp.errors import ShapeError
 from sparsedp.flow.projection_setup import ProjectionSetup
+from sparsedp.flow.variable_density import WeightedProjection
 from sparsedp.grid.boundary_conditions import describe_patches, no_slip
 from sparsedp.grid.grid import check_grid
 from sparsedp.operators.operator import Operator
@@ -66,13 +70,17 @@ def projection(
         in: faces [velocity]; out: faces [velocity], with a divergence that is 0 to the relative tolerance `rtol`.
         ``P.pressure(v)`` returns the potential p [velocity length] with P(v) = v + G(p) on free faces; ``P.info``
         records the solves.
+        ``P(v, density)`` returns v + G(p) / density without divergence, for a fluid whose density varies: a number > 0,
+        or one for each cell or each face. The density of a face is the mean of its two cells, weighted by their widths.
+        Differentiable in both, to every order.
 
     Raises
     ------
     ShapeError
-        If `solid` has another shape than the grid.
+        If `solid` has another shape than the grid; on use, if the density has one other than those of cells and faces.
     ValueError
-        If an axis is named that is periodic or does not exist, or an inflow enters a region without an outflow.
+        If an axis is named that is periodic or does not exist, or an inflow enters a region without an outflow. On use,
+        if the density is not > 0.
     TypeError
         If `boundary` is not a flow condition.
     NonFiniteError
@@ -88,7 +96,8 @@ def projection(
     -----
     Null space: in a region without an outflow the pressure is determined only up to a constant, which is removed.
     Transpose: ``P.T(g)`` equals ``P(g)`` bit for bit on uniform grids without inflow or outflow.
-    Cost: one pressure solve for each application, forward or transposed; one node on the tape.
+    Cost: one pressure solve for each application, forward or transposed; one node on the tape. With a density, a new
+    set-up for each new content of it; the last two are cached. The arguments of the solve also apply there.
 
     References
     ----------
@@ -96,10 +105,16 @@ def projection(
 
     Examples
     --------
-    >>> from sparsedp import Grid
+    >>> from sparsedp import Grid, inflow, outflow
     >>> P = projection(Grid((2, 2), periodic=True))
     >>> P(np.array([1.0, 2.0, 3.0, 4.0, 0.0, 0.0, 0.0, 0.0]))
     array([2., 3., 2., 3., 0., 0., 0., 0.])
+
+    A density that varies, between an inflow and an outflow:
+
+    >>> P = projection(Grid(2), boundary={"x": (inflow, outflow)})
+    >>> P(np.array([1.0, 0.0, 0.0]), np.array([1.0, 3.0]))
+    array([1., 1., 1.])
     """
     check_grid("projection", grid)
     if solid is not None and np.shape(solid) == grid.faces.shape != grid.shape:
@@ -131,6 +146,30 @@ class Projection(Operator):
     def recipe(self) -> tuple:
         """Return the call that builds an equal object, for pickling and copying."""
         return Projection, (self.setup,)
+
+    def __call__(self, v: Any, density: Any = None) -> Any:
+        """Return the velocity without divergence.
+
+        Parameters
+        ----------
+        v : array on faces
+        density : number, array on cells or array on faces, optional
+            > 0; see `projection`. Default: the same everywhere.
+        """
+        if density is None:
+            return super().__call__(v)
+        return self._with_density(v, density)
+
+    @public("dp.projection(grid)")
+    def _with_density(self, v: Any, density: Any) -> Any:
+        check_on("projection", v, self.domain, "; join its components with grid.join")
+        projected, _ = self.weighted.split(v, self.weighted.face_density(density, dtype_of(v)))
+        return projected
+
+    @cached_property
+    def weighted(self) -> WeightedProjection:
+        """The projection for a density that varies, with its solver."""
+        return WeightedProjection(self.setup)
 
     @property
     def info(self) -> Any:

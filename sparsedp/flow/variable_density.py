@@ -12,8 +12,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import scipy.sparse as sp
 
+from sparsedp._utils.validation import check_finite, check_kind
+from sparsedp.autodiff.program_trace import check_values
+from sparsedp.autodiff.tape import cast, dtype_of, isbox, sample
+from sparsedp.errors import ShapeError
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.operators.harmonic import lower_share
 from sparsedp.operators.masks_and_lift import mask
@@ -56,13 +61,40 @@ class WeightedProjection:
 
     def __init__(self, setup: ProjectionSetup) -> None:
         grid = setup.grid
+        self._to_faces = density_on_faces(grid)
         self._open = mask(grid.faces, setup.open)
         self._divergence = divergence(grid)
         self._gradient = gradient(grid, setup.pressure_conditions, setup.solid)
         self.solver = EllipticSolver(self._divergence, self._gradient, setup.settings)
+
+    def face_density(self, density: Any, dtype: np.dtype) -> Any:
+        """Return a density on faces or as a number, given as a number, on cells or on faces; raise if it is invalid."""
+        grid = self._open.domain.grid
+        grid.backend.check("density in projection")
+        value = density
+        if not isbox(density):
+            value = np.asarray(density)
+        shape = np.shape(sample(value))
+        if shape not in ((), grid.cells.shape, grid.faces.shape):
+            raise ShapeError(
+                f"projection takes a density that is a number or a field on {grid.cells} or {grid.faces}, got an array "
+                f"of shape {shape}"
+            )
+        check_kind("the density of projection", dtype_of(value), "real numbers", "; write its .real")
+        check_values(_check_density, value)
+        if shape == grid.cells.shape:
+            value = self._to_faces(value)
+        return cast(value, dtype)
 
     def split(self, v: Any, density: Any) -> tuple[Any, Any]:
         """Return the velocity without divergence, and the q of the module docstring."""
         v = self._open(v)
         q = self.solver(1.0 / density, self._divergence(v))
         return v + self._gradient(q) / density, q
+
+
+def _check_density(density):
+    """Raise an error for a density that is not finite or not > 0."""
+    check_finite("the density of projection", density)
+    if np.any(density <= 0):
+        raise ValueError(f"the density of projection must be > 0, got {np.min(density):.6g}")

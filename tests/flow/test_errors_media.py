@@ -125,3 +125,24 @@ def test_traced_media_are_functions(argument, build):
     words = rf"flow_step needs a constant {argument}.*, got a traced one; a derivative in the {argument} takes "
     with pytest.raises(dp.errors.DerivativeError, match=f"{words}{argument}=lambda params: ..."):
         dp.grad(lambda x: anp.sum(build(dp.Grid((4, 4)), x).start(np.zeros(40))["v"]))(np.ones((4, 4)))
+
+
+PROJECTION = [
+    (
+        np.ones(5),
+        dp.errors.ShapeError,
+        "projection takes a density that is a number or a field on cells(4, 4) or faces(4, 4), got an array of shape "
+        "(5,)",
+    ),
+    (0.0, ValueError, "the density of projection must be > 0, got 0"),
+    (NEGATIVE, ValueError, "the density of projection must be > 0, got -1"),
+    (1j, TypeError, "the density of projection must hold real numbers, got dtype complex128; write its .real"),
+    (np.nan, dp.errors.NonFiniteError, "the density of projection must be finite, got nan; write a finite number"),
+]
+
+
+@pytest.mark.parametrize("density, error, message", PROJECTION)
+def test_refused_densities(density, error, message):
+    with pytest.raises(error) as caught:
+        dp.projection(dp.Grid((4, 4)))(np.ones(40), density)
+    assert str(caught.value) == message

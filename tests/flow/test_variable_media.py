@@ -124,6 +124,36 @@ def test_density_one_is_no_density(rng):
     np.testing.assert_allclose(ends[2]["p"], 3.0 * ends[0]["p"], rtol=1e-9, atol=1e-9)
 
 
+def test_projection_with_a_density(rng):
+    """No divergence, v - P(v) is a gradient divided by the density, and all derivatives are right."""
+    grid = dp.Grid((4, 3), spacing=[rng.uniform(0.5, 1, 4), rng.uniform(0.5, 1, 3)])
+    solid = np.zeros((4, 3), bool)
+    solid[1, 1] = True
+    project = dp.projection(grid, solid, {"x": (dp.inflow, dp.outflow)})
+    v = rng.standard_normal(grid.faces.size)
+    density = 10.0 ** rng.uniform(-1, 2, grid.shape)
+    result = project(v, density)
+    assert np.max(np.abs(dp.divergence(grid)(result))) < 1e-10
+    np.testing.assert_allclose(project(v, 7.0), project(v), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(project(v, np.full(v.shape, 3.0)), project(v), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(project(result, density), result, rtol=1e-9, atol=1e-9)
+    pushed = project(
+        dp.gradient(grid, {"x": (dp.neumann, dp.dirichlet)}, solid)(rng.standard_normal((4, 3))) / 5.0, 5.0
+    )
+    np.testing.assert_allclose(pushed, 0.0, atol=1e-9)
+    weights = rng.standard_normal(grid.faces.size)
+    loss = lambda x: anp.sum(weights * project(x["v"], x["density"]) ** 2)
+    given = {"v": v, "density": density}
+    direction = {"v": rng.standard_normal(v.shape), "density": density * rng.standard_normal(density.shape)}
+    moved = lambda t: {key: given[key] + t * direction[key] for key in given}
+    inner = lambda a: sum(np.sum(a[key] * direction[key]) for key in a)
+    slope = inner(dp.grad(loss)(given))
+    assert dp.jvp(loss, given, direction)[1] == pytest.approx(slope, rel=1e-8)
+    assert (loss(moved(1e-5)) - loss(moved(-1e-5))) / 2e-5 == pytest.approx(slope, rel=1e-6)
+    curvature = (inner(dp.grad(loss)(moved(1e-5))) - inner(dp.grad(loss)(moved(-1e-5)))) / 2e-5
+    assert inner(dp.hvp(loss, given, direction)) == pytest.approx(curvature, rel=1e-5)
+
+
 @pytest.mark.whole
 def test_rayleigh_taylor():
     """Growth of a wave on the interface of two fluids without viscosity, by linear theory."""
