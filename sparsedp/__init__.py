@@ -40,6 +40,7 @@ _PUBLIC_NAMES = {
     "flow.momentum": "convection face_laplacian face_lift",
     "advection.transport": "transport",
     "flow.finite_volumes": "conservation_law",
+    "flow.shallow_water": "shallow_water",
     "flow.obstacles": "brinkman forces",
     "flow.pressure_projection": "projection",
     "flow.flow_step": "flow_step",

@@ -21,6 +21,7 @@ from .flow.momentum import face_lift as face_lift
 from .flow.obstacles import brinkman as brinkman
 from .flow.obstacles import forces as forces
 from .flow.pressure_projection import projection as projection
+from .flow.shallow_water import shallow_water as shallow_water
 from .grid.boundary_conditions import dirichlet as dirichlet
 from .grid.boundary_conditions import free_slip as free_slip
 from .grid.boundary_conditions import inflow as inflow

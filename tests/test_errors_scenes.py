@@ -11,6 +11,7 @@ import sparsedp as dp
 
 LINE = dp.Grid(4)
 BOX = dp.Grid((4, 4))
+WATER = np.array([[1.0, 1.0, 1.0, 1.0], [0.0, 0.0, 0.0, 0.0]])
 RATES = (lambda v, c: v), (lambda p, c: p)
 SHAPE = dp.errors.ShapeError
 UNSTABLE = dp.errors.UnstableStepError
@@ -155,6 +156,84 @@ TABLE = [
         "conservation_law, as flux, takes a function, got ndarray; write lambda u, params, axis: ...",
     ),
     (
+        lambda: dp.shallow_water(LINE, scheme="weno"),
+        VALUE,
+        "scheme of shallow_water must be one of upwind, van_leer, got 'weno'",
+    ),
+    (
+        lambda: dp.shallow_water(LINE, boundary=dp.no_slip),
+        VALUE,
+        "shallow_water takes outflow, free_slip or inflow, got no_slip; write one of them",
+    ),
+    (
+        lambda: dp.shallow_water(LINE, inflow=1.0),
+        VALUE,
+        "shallow_water got a side of dp.inflow without inflow=, or inflow= without such a side; give both or none",
+    ),
+    (
+        lambda: dp.shallow_water(LINE, source=1.0),
+        TYPE,
+        "shallow_water, as source, takes a function, got float; write lambda u, params: ...",
+    ),
+    (
+        lambda: dp.shallow_water(LINE, gravity=-9.81),
+        VALUE,
+        "gravity of shallow_water must be > 0, got -9.81; write gravity=9.81",
+    ),
+    (
+        lambda: dp.shallow_water(LINE, gravity=lambda p: p)(WATER, 0.0),
+        VALUE,
+        "gravity of shallow_water must be > 0, got 0; write gravity=9.81",
+    ),
+    (
+        lambda: dp.shallow_water(LINE, dry=0.0),
+        VALUE,
+        "dry of shallow_water must be > 0, got 0; write dry=1e-6",
+    ),
+    (
+        lambda: dp.shallow_water(LINE, np.ones(3)),
+        SHAPE,
+        "the bathymetry of a shallow_water must have shape (4,), got (3,)",
+    ),
+    (
+        lambda: dp.shallow_water(LINE, np.ones(4, complex)),
+        TYPE,
+        "the bathymetry of a shallow_water must hold real numbers, got dtype complex128; write its .real",
+    ),
+    (
+        lambda: dp.shallow_water(LINE, lambda p: p)(WATER, np.nan),
+        dp.errors.NonFiniteError,
+        "the bathymetry of a shallow_water must be finite, got 4 that are NaN or infinite, the first at 0",
+    ),
+    (
+        lambda: dp.shallow_water(LINE)(np.ones(4)),
+        SHAPE,
+        "shallow_water needs a field for each number in momentum=(1,), got u of shape (4,); give a state that holds "
+        "them all",
+    ),
+    (
+        lambda: dp.shallow_water(LINE)(WATER - 2.0),
+        UNSTABLE,
+        "the depth of a shallow_water must be >= 0, got -1 in cell 0 and in 3 more; give a state without such cells, "
+        "or take smaller steps, dt <= law.time_step(u, params)",
+    ),
+    (
+        lambda: dp.rollout(dp.stepper("ssprk3", dp.shallow_water(LINE), 9.0), WATER * [4, 4, 1, 1], None, 2),
+        UNSTABLE,
+        "in step 0 of rollout: the depth of a shallow_water must be >= 0, got -80.5665 in cell 1; give a state without "
+        "such cells, or take smaller steps, dt <= law.time_step(u, params)",
+    ),
+    (
+        lambda: dp.shallow_water(LINE)(WATER * [[np.nan], [1.0]]),
+        dp.errors.NonFiniteError,
+        "the depth of a shallow_water must be finite, got 4 that are NaN or infinite, the first at 0",
+    ),
+    (
+        lambda: dp.shallow_water(LINE)(WATER * [[1.0], [np.nan]]),
+        dp.errors.NonFiniteError,
+        "the rate of a shallow_water must be finite, got 8 that are NaN or infinite, the first at (0, 0)",
+    ),
+    (
         lambda: law(positive=["density"]),
         TYPE,
         'positive of conservation_law must be a dict of functions, got list; write {"density": lambda u, params: u[0]}',
@@ -172,14 +251,14 @@ TABLE = [
     (
         lambda: law(positive={"depth": lambda u, p: u})(np.array([1.0, 0.0, 1.0, 1.0])),
         UNSTABLE,
-        "the depth of a conservation_law must be > 0, got 0 in cell 1; give a state where it is positive, or take "
+        "the depth of a conservation_law must be > 0, got 0 in cell 1; give a state without such cells, or take "
         "smaller steps, dt <= law.time_step(u, params)",
     ),
     (
         lambda: dp.conservation_law(BOX, carry, carry, positive={"depth": lambda u, p: -u[0]})(np.ones((2, 4, 4))),
         UNSTABLE,
-        "the depth of a conservation_law must be > 0, got -1 in cell (0, 0) and in 15 more; give a state where it is "
-        "positive, or take smaller steps, dt <= law.time_step(u, params)",
+        "the depth of a conservation_law must be > 0, got -1 in cell (0, 0) and in 15 more; give a state without "
+        "such cells, or take smaller steps, dt <= law.time_step(u, params)",
     ),
     (
         lambda: law(positive={"depth": lambda u, p: u})(np.array([1.0, 1.0, np.nan, 1.0])),

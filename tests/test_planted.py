@@ -425,6 +425,30 @@ BUGS = {
         "",
         "tests/flow/test_positivity.py::test_time_step_knows_the_waves_at_the_ends_of_the_cells",
     ),
+    "water that flows through a step of the ground": Bug(
+        "flow/shallow_water.py",
+        "lower_depth - anp.maximum(step, 0.0)",
+        "lower_depth - anp.maximum(0.5 * step, 0.0)",
+        "tests/flow/test_shallow_water.py::test_a_lake_with_islands_stays_at_rest",
+    ),
+    "the weight of water on a slope": Bug(
+        "flow/shallow_water.py",
+        "2.0 * axis.part(slopes[1:2], 1, -1)",
+        "1.0 * axis.part(slopes[1:2], 1, -1)",
+        "tests/flow/test_shallow_water.py::test_flat_ground_has_the_rate_of_the_law_of_water",
+    ),
+    "slopes of the velocity that change the discharge": Bug(
+        "flow/shallow_water.py",
+        "slopes[2:] * (1.0 - share)",
+        "slopes[2:] * (1.0 + share)",
+        "tests/flow/test_shallow_water.py::test_values_and_derivatives_agree_with_the_reference",
+    ),
+    "the pressure of a face on the wrong cell": Bug(
+        "flow/shallow_water.py",
+        "carried + normal * (upper_share * pressure_jump)",
+        "carried + normal * (lower_share * pressure_jump)",
+        "tests/flow/test_shallow_water.py::test_a_moving_shore_line",
+    ),
     "leapfrog with a limit of Euler's method": Bug(
         "integrators",
         "if fastest > 4 * (1 + SLACK):",

@@ -40,6 +40,7 @@ flux, speed and source have them. The limiter is one differentiation rule with f
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -78,7 +79,7 @@ if TYPE_CHECKING:
     from sparsedp.grid.grid import Grid
     from sparsedp.kernels.fluxes import Scheme
 
-__all__ = ["ConservationLaw", "conservation_law"]
+__all__ = ["ConservationLaw", "FiniteVolumes", "check_positive", "checked_result", "conservation_law", "sides_of"]
 
 IF_NOT_FINITE = "; a density or a depth may have become negative: take a smaller dt"
 POSITIVE_FLOOR = (
@@ -163,7 +164,7 @@ def conservation_law(
 
     See Also
     --------
-    transport, free_slip, inflow, outflow, stepper
+    shallow_water, transport, free_slip, inflow, outflow, stepper
 
     Notes
     -----
@@ -220,21 +221,26 @@ def conservation_law(
     if source is not None:
         check_function("conservation_law, as source,", source, "lambda u, params: ...", 2)
     quantities = _checked_quantities(positive)
-    sides = resolve(grid, boundary, outflow, name="conservation_law")
-    conditions = [condition for pair in sides for condition in pair or ()]
-    for condition in conditions:
-        if condition not in PAD_MODES:
-            raise ValueError(f"conservation_law takes outflow, free_slip or inflow, got {condition}; write one of them")
-    if (inflow_side in conditions) != (inflow is not None):
-        raise ValueError(
-            "conservation_law got a side of dp.inflow without inflow=, or inflow= without such a side; "
-            "give both or none"
-        )
-    if free_slip in conditions:
+    sides = sides_of("conservation_law", grid, boundary, inflow)
+    if any(free_slip in (pair or ()) for pair in sides):
         fields = _momentum_fields(grid, momentum)
     else:
         fields = None
     return ConservationLaw(grid, flux, speed, scheme, sides, fields, inflow, source, equilibrium, quantities)
+
+
+def sides_of(name: str, grid: Grid, boundary: Any, inflow: Any) -> tuple:
+    """Return the conditions at both ends of each axis; raise if one of them, or `inflow`, does not fit."""
+    sides = resolve(grid, boundary, outflow, name=name)
+    conditions = [condition for pair in sides for condition in pair or ()]
+    for condition in conditions:
+        if condition not in PAD_MODES:
+            raise ValueError(f"{name} takes outflow, free_slip or inflow, got {condition}; write one of them")
+    if (inflow_side in conditions) != (inflow is not None):
+        raise ValueError(
+            f"{name} got a side of dp.inflow without inflow=, or inflow= without such a side; give both or none"
+        )
+    return sides
 
 
 def _checked_quantities(positive: Any) -> dict[str, Callable]:
@@ -266,7 +272,144 @@ def _momentum_fields(grid: Grid, momentum: Any) -> tuple[int, ...]:
     return tuple(map(int, fields))
 
 
-class ConservationLaw(Reconstructible):
+class FiniteVolumes(Reconstructible):
+    """The part that all laws on finite volumes share: the state, its ghost cells, and the time step.
+
+    A law defines `_check_physical`, `_rate` and `_fastest_waves`.
+
+    Parameters
+    ----------
+    grid, scheme, inflow, source
+        As `conservation_law` takes them.
+    sides : tuple
+        The conditions as `resolve` returns them.
+    momentum : tuple of int or None
+        For each axis, the index of the field that is the momentum along this axis.
+
+    Attributes
+    ----------
+    domain : Space
+        The cells.
+    """
+
+    name = ""
+
+    def __init__(
+        self,
+        grid: Grid,
+        scheme: str,
+        sides: tuple,
+        momentum: tuple[int, ...] | None,
+        inflow: Any,
+        source: Callable | None,
+    ) -> None:
+        self.grid = grid
+        self.domain = grid.cells
+        self.scheme = scheme
+        self.sides = sides
+        self.momentum = momentum
+        self.inflow = constant(inflow)
+        self.source = source
+        self.axes: list[AxisFluxes] = []
+        if not grid.cells.size:
+            return
+        for axis in range(grid.dim):
+            self.axes.append(
+                AxisFluxes(
+                    grid,
+                    axis,
+                    sides[axis] or (None, None),
+                    None if momentum is None else momentum[axis],
+                    self.inflow,
+                    SCHEMES[scheme],
+                    self.name,
+                )
+            )
+
+    def _checked_rate(self, u: Any, params: Any) -> Any:
+        """Return the rate of change of a state, after and before checks."""
+        u = self._checked_state(u)
+        self._check_physical(u, params)
+        rate = self._rate(u, params)
+        check_values(partial(check_finite, self._what("rate")), rate)
+        return cast(rate, dtype_of(u))
+
+    @abstractmethod
+    def _check_physical(self, u: Any, params: Any) -> None:
+        """Raise if a quantity of the state is not positive."""
+
+    @abstractmethod
+    def _rate(self, u: Any, params: Any) -> Any:
+        """Return the rate of a state."""
+
+    @abstractmethod
+    def _fastest_waves(self, axis: AxisFluxes, u: NDArray, params: Any) -> NDArray:
+        """Return the speed of the fastest wave along an axis in each cell, including waves of the inflow."""
+
+    def _source_term(self, u: Any, params: Any) -> Any:
+        """Return the source in the cells, zeros without one."""
+        if self.source is None:
+            return np.zeros(u.shape)
+        return checked_result(self._what("source"), self.source(u, params), u)
+
+    def _what(self, part: str) -> str:
+        """Return the subject of a message."""
+        return f"the {part} of a {self.name}"
+
+    def _checked_state(self, u: Any) -> Any:
+        """Return the state as a floating-point array; raise if its shape or dtype is wrong."""
+        values = field_array(self, sample(u), batch=True)
+        fields = values.shape[: values.ndim - self.grid.dim]
+        if len(fields) > 1:
+            expected = ", ".join(map(str, ("fields", *self.grid.shape)))
+            raise ShapeError(f"{self.name} takes u of shape ({expected}), got {values.shape}")
+        if fields:
+            count = fields[0]
+        else:
+            count = 1
+        if self.momentum is not None and max(self.momentum) >= count:
+            raise ShapeError(
+                f"{self.name} needs a field for each number in momentum={self.momentum}, got u of shape "
+                f"{values.shape}; give a state that holds them all"
+            )
+        check_kind(f"u of {self.name}", values.dtype, "real numbers", "; write u.real")
+        return frozen(u if isbox(u) else values)
+
+    def _first_field(self, u: Any) -> Any:
+        """Return the first field of a state, or the state if it is one field."""
+        return u[(0,) * (u.ndim - self.grid.dim)]
+
+    def time_step(self, u: Any, params: Any = None, cfl: float = 0.4) -> float:
+        """Return a stable dt: `cfl` divided by the largest sum over the axes of speed / width in a cell.
+
+        Parameters
+        ----------
+        u : array
+            The state, as for the call. The speeds are taken in the cells and, at inflow boundaries, of the inflow; of
+            `shallow_water` and with `positive` also on both sides of the faces.
+        params : tree, optional
+        cfl : float
+            Up to 0.5 for limited slopes, up to 1 for "upwind".
+
+        Returns
+        -------
+        float [time]
+            Infinite if all speeds are 0. Not differentiated.
+        """
+        check_number("cfl of time_step", cfl, "> 0", "; write cfl=0.4")
+        u = plain(self._checked_state(u))
+        params = mapped(plain, params)
+        rates = sum(self._fastest_waves(axis, u, params) / axis.widths for axis in self.axes)
+        largest = np.max(rates, initial=0.0)
+        if largest:
+            return float(cfl / largest)
+        return np.inf
+
+    def __repr__(self) -> str:
+        return f"<{self.name} {self.scheme}: {self.grid.cells}>"
+
+
+class ConservationLaw(FiniteVolumes):
     """The rate of change of a conservation law, ``law(u, params=None)``, as `conservation_law` returns it.
 
     Parameters
@@ -299,31 +442,11 @@ class ConservationLaw(Reconstructible):
         equilibrium: Any,
         positive: dict[str, Callable] | None = None,
     ) -> None:
-        self.grid = grid
-        self.domain = grid.cells
+        super().__init__(grid, scheme, sides, momentum, inflow, source)
         self.flux = flux
         self.speed = speed
-        self.scheme = scheme
-        self.sides = sides
-        self.momentum = momentum
-        self.inflow = constant(inflow)
-        self.source = source
         self.equilibrium = constant(equilibrium)
         self.positive = positive or {}
-        self.axes: list[AxisFluxes] = []
-        if not grid.cells.size:
-            return
-        for axis in range(grid.dim):
-            self.axes.append(
-                AxisFluxes(
-                    grid,
-                    axis,
-                    sides[axis] or (None, None),
-                    None if momentum is None else momentum[axis],
-                    self.inflow,
-                    SCHEMES[scheme],
-                )
-            )
 
     def recipe(self) -> tuple:
         """Return the call that builds an equal object, for pickling and copying."""
@@ -354,35 +477,12 @@ class ConservationLaw(Reconstructible):
         -------
         array like u
         """
-        u = self._checked_state(u)
-        for name, quantity in self.positive.items():
-            check_values(partial(_check_positive, name), self._quantity(name, quantity, u, params))
-        e = self._equilibrium_state(u, params)
-        if e is None:
-            rate = self._rate(u, None, params)
-        else:
-            rate = self._rate(u, e, params) - self._rate(e, e, params, with_inflow=False)
-        check_values(_check_rate, rate)
-        return cast(rate, dtype_of(u))
+        return self._checked_rate(u, params)
 
-    def _checked_state(self, u: Any) -> Any:
-        """Return the state as a floating-point array; raise if its shape or dtype is wrong."""
-        values = field_array(self, sample(u), batch=True)
-        fields = values.shape[: values.ndim - self.grid.dim]
-        if len(fields) > 1:
-            expected = ", ".join(map(str, ("fields", *self.grid.shape)))
-            raise ShapeError(f"conservation_law takes u of shape ({expected}), got {values.shape}")
-        if fields:
-            count = fields[0]
-        else:
-            count = 1
-        if self.momentum is not None and max(self.momentum) >= count:
-            raise ShapeError(
-                f"conservation_law needs a field for each number in momentum={self.momentum}, got u of shape "
-                f"{values.shape}; give a state that holds them all"
-            )
-        check_kind("u of conservation_law", values.dtype, "real numbers", "; write u.real")
-        return frozen(u if isbox(u) else values)
+    def _check_physical(self, u: Any, params: Any) -> None:
+        """Raise if a quantity of the state is not positive."""
+        for name, quantity in self.positive.items():
+            check_values(partial(check_positive, self._what(name)), self._quantity(name, quantity, u, params))
 
     def _equilibrium_state(self, u: Any, params: Any) -> Any:
         """Return the equilibrium for these params, or None."""
@@ -391,27 +491,26 @@ class ConservationLaw(Reconstructible):
             return None
         if callable(equilibrium):
             equilibrium = equilibrium(params)
-        return _checked_result("equilibrium", equilibrium, u)
+        return checked_result(self._what("equilibrium"), equilibrium, u)
 
     def _quantity(self, name: str, quantity: Callable, u: Any, params: Any) -> Any:
         """Return a positive quantity of states; raise unless it is real and has the shape of one field."""
         value = quantity(u, params)
-        _checked_result(name, sample(value), self._first_field(u))
+        checked_result(self._what(name), sample(value), self._first_field(u))
         return value
 
-    def _first_field(self, u: Any) -> Any:
-        """Return the first field of a state, or the state if it is one field."""
-        return u[(0,) * (u.ndim - self.grid.dim)]
+    def _rate(self, u: Any, params: Any) -> Any:
+        e = self._equilibrium_state(u, params)
+        if e is None:
+            return self._rate_beside(u, None, params)
+        return self._rate_beside(u, e, params) - self._rate_beside(e, e, params, with_inflow=False)
 
-    def _rate(self, u: Any, equilibrium: Any, params: Any, with_inflow: bool = True) -> Any:
+    def _rate_beside(self, u: Any, equilibrium: Any, params: Any, with_inflow: bool = True) -> Any:
         """Return the rate of a state; `equilibrium` affects the slopes only.
 
         For `with_inflow` see `AxisFluxes.padded`.
         """
-        if self.source is None:
-            total = np.zeros(u.shape)
-        else:
-            total = _checked_result("source", self.source(u, params), u)
+        total = self._source_term(u, params)
         for axis in self.axes:
             lower, upper = self._beside_faces(axis, u, equilibrium, params, with_inflow)
             f = self._numerical_flux(axis, lower, upper, params)
@@ -450,7 +549,7 @@ class ConservationLaw(Reconstructible):
     def _numerical_flux(self, axis: AxisFluxes, lower: Any, upper: Any, params: Any) -> Any:
         """Return the flux of Harten, Lax and van Leer for the values below and above each face."""
         both = frozen(anp.concatenate([lower, upper], axis.place))
-        f_lower, f_upper = axis.halves(_checked_result("flux", self.flux(both, params, axis.number), both))
+        f_lower, f_upper = axis.halves(checked_result(self._what("flux"), self.flux(both, params, axis.number), both))
         slowest, fastest = self._wave_speeds(axis.number, both, params)
         a = anp.minimum(anp.minimum(*axis.halves(slowest)), 0.0)
         b = anp.maximum(anp.maximum(*axis.halves(fastest)), 0.0)
@@ -466,35 +565,9 @@ class ConservationLaw(Reconstructible):
             speeds = (-speeds, speeds)
         first_field = self._first_field(u)
         for speed in speeds:
-            _checked_result("speed", sample(speed), first_field)
+            checked_result(self._what("speed"), sample(speed), first_field)
         check_values(partial(_check_speeds, axis), *speeds)
         return speeds
-
-    def time_step(self, u: Any, params: Any = None, cfl: float = 0.4) -> float:
-        """Return a stable dt: `cfl` divided by the largest sum over the axes of speed / width in a cell.
-
-        Parameters
-        ----------
-        u : array
-            The state, as for the call. The speeds are taken in the cells and, at inflow boundaries, of the inflow; with
-            `positive` also on both sides of the faces.
-        params : tree, optional
-        cfl : float
-            Up to 0.5 for limited slopes, up to 1 for "upwind".
-
-        Returns
-        -------
-        float [time]
-            Infinite if all speeds are 0. Not differentiated.
-        """
-        check_number("cfl of time_step", cfl, "> 0", "; write cfl=0.4")
-        u = plain(self._checked_state(u))
-        params = mapped(plain, params)
-        rates = sum(self._fastest_waves(axis, u, params) / axis.widths for axis in self.axes)
-        largest = np.max(rates, initial=0.0)
-        if largest:
-            return float(cfl / largest)
-        return np.inf
 
     def _fastest_waves(self, axis: AxisFluxes, u: NDArray, params: Any) -> NDArray:
         """Return the speed of the fastest wave along an axis in each cell, including waves of the inflow."""
@@ -514,29 +587,35 @@ class ConservationLaw(Reconstructible):
             speeds = np.maximum(speeds, at_ends)
         return speeds
 
-    def __repr__(self) -> str:
-        return f"<conservation_law {self.scheme}: {self.grid.cells}>"
 
+def check_positive(what: str, values: Any, slack: float | None = None) -> None:
+    """Raise an error that names the quantity and the cell where it is not positive.
 
-def _check_rate(rate):
-    check_finite("the rate of a conservation_law", rate)
-
-
-def _check_positive(name, values):
-    """Raise an error that names the quantity and the cell where it is not positive."""
-    what = f"the {name} of a conservation_law"
+    Parameters
+    ----------
+    what : str
+        Subject of the message.
+    values : array
+    slack : float, optional
+        If it is given, 0 is valid, and so are negative values of at most this size.
+    """
     check_finite(what, values)
-    not_positive = values <= 0
-    if np.any(not_positive):
-        first = int(np.argmax(not_positive))
-        count = np.count_nonzero(not_positive)
+    if slack is None:
+        wrong = values <= 0
+        needs = "> 0"
+    else:
+        wrong = values < -slack
+        needs = ">= 0"
+    if np.any(wrong):
+        first = int(np.argmax(wrong))
+        count = np.count_nonzero(wrong)
         if count > 1:
             others = f" and in {count - 1} more"
         else:
             others = ""
         raise UnstableStepError(
-            f"{what} must be > 0, got {values.flat[first]:g} in cell {place(first, values.shape)}{others}; give a "
-            f"state where it is positive, or take smaller steps, dt <= law.time_step(u, params)"
+            f"{what} must be {needs}, got {values.flat[first]:g} in cell {place(first, values.shape)}{others}; give a "
+            f"state without such cells, or take smaller steps, dt <= law.time_step(u, params)"
         )
 
 
@@ -551,10 +630,10 @@ def _check_speeds(axis, slowest, fastest):
         )
 
 
-def _checked_result(name: str, value: Any, u: Any) -> Any:
+def checked_result(what: str, value: Any, u: Any) -> Any:
     """Return the result of a user-supplied function; raise unless it is real and has the shape of u."""
-    check_shape(f"the {name} of a conservation_law", value, np.shape(u))
-    check_kind(f"the {name} of a conservation_law", dtype_of(value), "real numbers", "; write its .real")
+    check_shape(what, value, np.shape(u))
+    check_kind(what, dtype_of(value), "real numbers", "; write its .real")
     return value
 
 
@@ -572,11 +651,14 @@ class AxisFluxes:
     inflow : array, number or callable
         As `conservation_law` takes it.
     scheme : Scheme
+    name : str
+        Name of the law, for error messages.
     """
 
     def __init__(
-        self, grid: Grid, number: int, sides: tuple, momentum: int | None, inflow: Any, scheme: Scheme
+        self, grid: Grid, number: int, sides: tuple, momentum: int | None, inflow: Any, scheme: Scheme, name: str
     ) -> None:
+        self.name = name
         self.number = number
         self.place = number - grid.dim  # index of this axis in an array of fields, counted from the end
         self.dim = grid.dim
@@ -625,6 +707,11 @@ class AxisFluxes:
         upper = self.ghost_values(u, params, 1, with_inflow)
         return anp.concatenate([lower, u, upper], self.place)
 
+    def extended(self, field: Any) -> Any:
+        """Return a field with its ghost cells, which repeat cells at all boundaries."""
+        lower, upper = (field[self.at(ghosts)] for ghosts in self.ghosts)
+        return anp.concatenate([lower, field, upper], self.place)
+
     def ghost_values(self, u: Any, params: Any, upper: int, with_inflow: bool = True) -> Any:
         """Return the values of the ghost cells beyond the lower (0) or the upper (1) end."""
         ghosts = u[self.at(self.ghosts[upper])]
@@ -641,7 +728,7 @@ class AxisFluxes:
             value = value(params, self.number, upper)
         if np.ndim(value) == 1 and u.ndim > self.dim:
             value = self._per_field(value)
-        return _checked_result("inflow", value + np.zeros(ghosts.shape, dtype_of(ghosts)), ghosts)
+        return checked_result(f"the inflow of a {self.name}", value + np.zeros(ghosts.shape, dtype_of(ghosts)), ghosts)
 
     def _per_field(self, numbers: Any) -> Any:
         """Reshape an array with one number for each field, so that it broadcasts to the fields."""
@@ -656,11 +743,15 @@ class AxisFluxes:
         cells = self.part(padded, 1, -1)
         if not self.limiters:
             return cells, cells
+        slopes = self.slopes(padded)
+        return cells - slopes[-1], cells + slopes[0]
+
+    def slopes(self, padded: Any) -> list:
+        """Return the limited differences between the upper end, or the lower end, of each cell and the cell."""
         differences = self.part(padded, 1) - self.part(padded, 0, -1)
         below = self.part(differences, 0, -1)
         above = self.part(differences, 1)
-        slopes = [limiter(below, above) for limiter in self.limiters]
-        return cells - slopes[-1], cells + slopes[0]
+        return [limiter(below, above) for limiter in self.limiters]
 
     def _limiter(self, limiter: Callable, end: int) -> Any:
         """Return the differentiation rule of the limited slope at an end of each cell (0 upper, 1 lower).

@@ -195,6 +195,19 @@ def conservation_law_positive():
 
 
 @scene
+def shallow_water():
+    """Cells that are dry in one argument and wet in another."""
+    law = dp.shallow_water(SQUARE, lambda p: p, boundary=dp.free_slip)
+
+    def start(seed):
+        u = np.stack([field(SQUARE.shape, seed + k, -0.5, 1.0) for k in range(3)])
+        u[0] = np.maximum(u[0], 0.0)
+        return u
+
+    return law, [start, of(SQUARE)]
+
+
+@scene
 def conservation_law_still():
     """Speeds are 0 at some faces, other ones for other arguments."""
     law = dp.conservation_law(RING, lambda u, p, axis: p * u**2, lambda u, p, axis: anp.abs(2 * p * u))

@@ -193,6 +193,11 @@ BUILDERS = {
         ),
         lambda law: value_and_grad(lambda u: anp.sum(law(u) ** 2))(CELLS**2),
     ),
+    "shallow_water": (
+        (0.1 * CELLS, {"y": [dp.inflow, dp.outflow]}, np.ones((3, *CELLS[:, :1].shape))),
+        lambda ground, sides, given: dp.shallow_water(GRID, ground, boundary=sides, inflow=given),
+        lambda law: value_and_grad(lambda u: anp.sum(law(u) ** 2))(1.0 + np.stack([CELLS, CELLS, CELLS]) ** 2),
+    ),
     "stepper, leapfrog": (
         ((np.ones(12), np.ones(12)),),
         lambda damping: dp.stepper("leapfrog", (lambda q, p: -q, lambda p, c: p), 0.1, damping=damping),

@@ -59,6 +59,12 @@ def conservation_law():
     return law, [lambda s: field((2, *GRID.shape), s), lambda s: field((), s)]
 
 
+@case("shallow_water")
+def shallow_water():
+    law = dp.shallow_water(GRID, lambda p: p, source=lambda u, p: -p * u)
+    return law, [lambda s: 3.0 + field((3, *GRID.shape), s), lambda s: 0.1 * field(GRID.shape, s)]
+
+
 @case("ensemble")
 def ensemble():
     total = dp.ensemble(lambda x, scene: anp.sum((x[0] * x[1]) ** 2 * scene), [0.5, 2.0])

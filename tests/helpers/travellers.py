@@ -277,6 +277,8 @@ def travellers():
         LINE, burgers_flux, burgers_speed, boundary=(dp.inflow, dp.free_slip), momentum=0, inflow=np.array([1.0, 2.0])
     )
     yield "conservation_law", "walls and inflow", law, lambda law: bits(law, numbers((2, 12)), 0.3)
+    law = dp.shallow_water(BOX, numbers(BOX.shape), boundary=dp.free_slip, source=push, dry=1e-4)
+    yield "shallow_water", "", law, lambda law: bits(law, 9.0 + numbers((3, *BOX.shape)), 0.3)
     channel = {"x": (dp.inflow, dp.outflow), "y": dp.no_slip}
     lift = dp.face_lift(GRID, channel)
     yield "face_lift", "", lift, lambda lift: bits(lift, numbers(lift.domain.size))

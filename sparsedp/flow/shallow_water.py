@@ -1,0 +1,375 @@
+"""shallow_water: depth and discharge of water over any ground, with dry cells, by hydrostatic reconstruction.
+
+With depth h, velocity v, discharge q = h v, bathymetry z and surface w = h + z, along an axis with cells of width d,
+
+    h' = -(q)_x,   q' = -(q v + g h^2 / 2)_x - g h z_x.
+
+In a cell the limited slopes s_h, s_w and s_v of depth, surface and velocity (differences between an end and the cell)
+give the values at its ends: h + s_h, w + s_w and z = w - h at the upper end, h - s_h, w - s_w at the lower end. The
+velocity there is v + s_v (h - s_h) / h and v - s_v (h + s_h) / h, so that the mean of the discharges is q. Limited
+depths lie between neighbouring cells; thus they are not negative.
+
+At a face the water above the higher of both grounds flows. With z_lower and z_upper from the cells below and above, the
+depths are
+
+    h_lower* = max(0, h_lower - max(0, z_upper - z_lower)),   h_upper* = max(0, h_upper - max(0, z_lower - z_upper)),
+
+and the numerical flux F (Harten, Lax and van Leer) is that of the states (h*, h* v). The cell below feels F, and the
+pressure g (h_lower^2 - h_lower*^2) / 2 of the step of the ground. Inside the cell the weight of the water on the slope
+is g h (z_upper_end - z_lower_end). Since the sum of the depths at both ends is 2 h, all terms that do not vanish at
+rest add up to
+
+    q' = (F_lower - P_lower) / d - (F_upper - P_upper) / d - g h (w_upper_end - w_lower_end) / d,
+
+where P = g h*^2 / 2 belongs to the side of the face in this cell. At rest w is constant, h* is the same on both sides,
+F = P, and nothing moves, beside dry ground too.
+
+The outflow through a face is at most s h_end with the largest wave speed s, and the depths at both ends add up to 2 h.
+Therefore an Euler step with dt s / d <= 1/2, summed over the axes, leaves h >= 0.
+
+The velocity is q / h. Below the depth `dry` it is multiplied by a factor that decreases to 0 with the depth, since
+q / h is the quotient of two rounding errors there.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import autograd.numpy as anp
+import numpy as np
+
+from sparsedp._utils.calls import public
+from sparsedp._utils.validation import check_choice, check_finite, check_function, check_number
+from sparsedp.autodiff.program_trace import check_values
+from sparsedp.autodiff.tape import plain
+from sparsedp.autodiff.tape_constants import constant
+from sparsedp.flow.finite_volumes import FiniteVolumes, check_positive, checked_result, sides_of
+from sparsedp.grid.boundary_conditions import outflow
+from sparsedp.grid.grid import check_grid
+from sparsedp.kernels.fluxes import SCHEMES
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from sparsedp.flow.finite_volumes import AxisFluxes
+    from sparsedp.grid.grid import Grid
+
+__all__ = ["ShallowWater", "shallow_water"]
+
+ROUNDING = 16  # a depth that is negative by this many roundings of the largest depth counts as 0
+
+
+def shallow_water(
+    grid: Grid,
+    bathymetry: Any = 0.0,
+    gravity: Any = 9.81,
+    *,
+    scheme: str = "van_leer",
+    boundary: Any = outflow,
+    inflow: Any = None,
+    source: Callable | None = None,
+    dry: float = 1e-6,
+) -> ShallowWater:
+    """Return the rate of change of shallow water over any ground, with wet and dry cells.
+
+    Parameters
+    ----------
+    grid : Grid
+        One or two axes are usual; the grid may have three.
+    bathymetry : number, array, or callable, optional
+        Height of the ground in the cells [length], an array of shape grid.shape; or ``bathymetry(params)`` that
+        returns one, to differentiate with respect to it.
+    gravity : number > 0, or callable, optional
+        Gravity [length / time^2]; or ``gravity(params)`` that returns it.
+    scheme : str
+        "van_leer" (limited slopes, second order) or "upwind" (first order).
+    boundary : condition, or dict of conditions
+        outflow: waves leave the domain. free_slip: a wall. inflow: the state outside the boundary is given by
+        `inflow`, above the ground of the last cell.
+    inflow : number, array, or callable, optional
+        The state outside inflow boundaries, as `conservation_law` takes it.
+    source : callable, optional
+        ``source(u, params)`` returns rates that are added in the cells [unit / time], for example rain or friction.
+    dry : float, optional
+        Depth [length] below which the velocity is reduced, to 0 for no water: thin layers that a wave leaves behind
+        would otherwise be fast and require small steps. Take about 1e-6 of the largest depth.
+
+    Returns
+    -------
+    ShallowWater
+        ``law(u, params=None)`` returns the rate, for `stepper`. u has the shape (1 + grid.dim, *grid.shape): depth, and
+        discharge (depth times velocity) along each axis. Further fields are amounts of tracers: depth times
+        concentration. Differentiable in u and params. ``law.time_step(u, params)`` returns a stable dt.
+
+    Raises
+    ------
+    ValueError
+        If scheme or boundary is not one of the above, if `inflow` does not go together with an inflow boundary, or if
+        gravity or dry is not > 0.
+    ShapeError
+        If the bathymetry, the state or the result of a function has the wrong shape.
+    NonFiniteError
+        If the bathymetry, the depth or the rate contains NaN or infinity.
+    UnstableStepError
+        On use, if a depth is negative: a previous step was too long, or the state is wrong.
+    TypeError
+        If source is not a function, or if the bathymetry, the state or the result of a function is not real.
+
+    See Also
+    --------
+    conservation_law
+
+    Notes
+    -----
+    Water at rest stays at rest to rounding, beside islands too, and water that is lost by no boundary is conserved.
+    Depths stay >= 0 in an Euler step, and therefore in one of "ssprk3", if dt <= ``law.time_step(u, params, cfl=0.5)``
+    in each stage. Water that runs onto dry ground becomes up to twice as fast as the waves of the first state: take a
+    smaller cfl, or compute dt again after some steps. A source is not part of this bound.
+
+    Order: 2 where the solution is smooth and has no extremum, about 1.5 with a moving shore line.
+
+    Derivatives: limiters, shocks, shore lines, and steps of the ground that change their sign have kinks, where
+    `check.gradient` returns "inconclusive". One is a flat ground with respect to the bathymetry.
+
+    References
+    ----------
+    Audusse, Bouchut, Bristeau, Klein, Perthame, SIAM J. Sci. Comput. 25 (2004) 2050-2065.
+    Kurganov, Petrova, Commun. Math. Sci. 5 (2007) 133-160 (velocity of thin layers).
+
+    Examples
+    --------
+    A lake at rest with an island, and a dam that breaks onto dry ground:
+
+    >>> import numpy as np
+    >>> from sparsedp import Grid
+    >>> ground = np.array([0.0, 0.5, 2.0, 0.5])
+    >>> lake = np.stack([np.maximum(1.0 - ground, 0.0), np.zeros(4)])
+    >>> bool(np.all(shallow_water(Grid(4), ground)(lake) == 0))
+    True
+    >>> dam = np.array([[1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]])
+    >>> shallow_water(Grid(4), gravity=16.0)(dam).round(12)
+    array([[ 0., -2.,  2.,  0.],
+           [ 0.,  4.,  4.,  0.]])
+    """
+    check_grid("shallow_water", grid)
+    check_choice("scheme of shallow_water", scheme, SCHEMES)
+    if source is not None:
+        check_function("shallow_water, as source,", source, "lambda u, params: ...", 2)
+    if not callable(gravity):
+        check_number("gravity of shallow_water", gravity, "> 0", "; write gravity=9.81")
+    check_number("dry of shallow_water", dry, "> 0", "; write dry=1e-6")
+    sides = sides_of("shallow_water", grid, boundary, inflow)
+    law = ShallowWater(grid, bathymetry, gravity, scheme, sides, inflow, source, dry)
+    if not callable(bathymetry):
+        law.ground(None)  # raises an error for a wrong bathymetry
+    return law
+
+
+class Faces(NamedTuple):
+    """The water beside the faces along an axis."""
+
+    lower_depth: Any  # (1, *shape): above the higher ground, from the cell below the face
+    lower_velocity: Any  # (fields - 1, *shape), with the concentrations of tracers
+    upper_depth: Any
+    upper_velocity: Any
+    slowest: Any  # speeds of the slowest wave, <= 0, and of the fastest, >= 0
+    fastest: Any
+
+
+class ShallowWater(FiniteVolumes):
+    """The rate of change of shallow water, ``law(u, params=None)``, as `shallow_water` returns it.
+
+    Parameters
+    ----------
+    grid, bathymetry, gravity, scheme, inflow, source, dry
+        As `shallow_water` takes them.
+    sides : tuple
+        The conditions as `resolve` returns them.
+
+    Attributes
+    ----------
+    domain : Space
+        The cells.
+    """
+
+    name = "shallow_water"
+
+    def __init__(
+        self,
+        grid: Grid,
+        bathymetry: Any,
+        gravity: Any,
+        scheme: str,
+        sides: tuple,
+        inflow: Any,
+        source: Callable | None,
+        dry: float,
+    ) -> None:
+        super().__init__(grid, scheme, sides, tuple(range(1, 1 + grid.dim)), inflow, source)
+        self.bathymetry = constant(bathymetry)
+        self.gravity = constant(gravity)
+        self.dry = dry
+
+    def recipe(self) -> tuple:
+        """Return the call that builds an equal object, for pickling and copying."""
+        return ShallowWater, (
+            self.grid,
+            self.bathymetry,
+            self.gravity,
+            self.scheme,
+            self.sides,
+            self.inflow,
+            self.source,
+            self.dry,
+        )
+
+    @public("dp.shallow_water(grid)")
+    def __call__(self, u: Any, params: Any = None) -> Any:
+        """Return the rate of change of a state.
+
+        Parameters
+        ----------
+        u : array, shape (1 + grid.dim, *grid.shape)
+            Depth and discharges; further fields are amounts of tracers.
+        params : tree, optional
+            Passed to bathymetry, gravity, inflow and source.
+
+        Returns
+        -------
+        array like u
+        """
+        return self._checked_rate(u, params)
+
+    def ground(self, params: Any = None) -> Any:
+        """Return the height of the ground in the cells.
+
+        Parameters
+        ----------
+        params : tree, optional
+            Passed to the bathymetry.
+
+        Returns
+        -------
+        array, shape grid.shape
+        """
+        z = self.bathymetry
+        if callable(z):
+            z = z(params)
+        flat = np.zeros(self.grid.shape)
+        if np.ndim(z) == 0:
+            z = z + flat
+        checked_result(self._what("bathymetry"), z, flat)
+        check_values(partial(check_finite, self._what("bathymetry")), z)
+        return z
+
+    def _pull(self, params: Any) -> Any:
+        """Return gravity."""
+        if not callable(self.gravity):
+            return self.gravity
+        g = self.gravity(params)
+        check_values(_check_gravity, g)
+        return g
+
+    def _check_physical(self, u: Any, params: Any) -> None:
+        check_values(partial(_check_depth, self._what("depth")), u[0])
+
+    def _rate(self, u: Any, params: Any) -> Any:
+        g = self._pull(params)
+        ground = self.ground(params)
+        total = self._source_term(u, params)
+        for axis in self.axes:
+            faces, rise = self._faces(axis, u, g, ground, params)
+            total = total + self._rate_along(axis, u, g, faces, rise)
+        return total
+
+    def _velocity(self, depth: Any, discharge: Any) -> Any:
+        """Return discharge / depth, reduced for depths below `dry`, and without overflow."""
+        wet_depth = anp.maximum(depth, self.dry)
+        share = depth / wet_depth  # 1 in wet cells
+        return 2.0 * share / (share * share + 1.0) * (discharge / wet_depth)
+
+    def _faces(self, axis: AxisFluxes, u: Any, g: Any, ground: Any, params: Any) -> tuple[Faces, Any]:
+        """Return the water beside the faces along an axis, and the rise of the surface along each cell."""
+        padded = axis.padded(u, params)
+        padded_depth = anp.maximum(padded[:1], 0.0)
+        padded_surface = padded_depth + axis.extended(ground)[None]
+        padded_velocity = self._velocity(padded_depth, padded[1:])
+        fields = anp.concatenate([padded_depth, padded_surface, padded_velocity])
+        cells = axis.part(fields, 1, -1)
+        depth = cells[:1]
+        ground_in_cells = cells[1:2] - depth
+        if axis.limiters:
+            (slopes,) = axis.slopes(fields)
+        else:
+            slopes = np.zeros(cells.shape)
+        depth_slope = slopes[:1]
+        ground_slope = slopes[1:2] - depth_slope
+        share = depth_slope / anp.where(depth > 0.0, depth, 1.0)  # the slope is 0 where the depth is 0
+
+        # from the cell below: values at its upper end; from the cell above: values at its lower end
+        lower_depth = axis.part(depth + depth_slope, 0, -1)
+        lower_ground = axis.part(ground_in_cells + ground_slope, 0, -1)
+        lower_velocity = axis.part(cells[2:] + slopes[2:] * (1.0 - share), 0, -1)
+        upper_depth = axis.part(depth - depth_slope, 1)
+        upper_ground = axis.part(ground_in_cells - ground_slope, 1)
+        upper_velocity = axis.part(cells[2:] - slopes[2:] * (1.0 + share), 1)
+
+        step = upper_ground - lower_ground
+        lower_depth = anp.maximum(lower_depth - anp.maximum(step, 0.0), 0.0)
+        upper_depth = anp.maximum(upper_depth - anp.maximum(-step, 0.0), 0.0)
+        # Of dry states too, waves have a positive speed here: sqrt has no derivative at 0.
+        lower_wave = anp.sqrt(g * anp.maximum(lower_depth, self.dry))
+        upper_wave = anp.sqrt(g * anp.maximum(upper_depth, self.dry))
+        lower_normal = self._along(axis, lower_velocity)
+        upper_normal = self._along(axis, upper_velocity)
+        slowest = anp.minimum(anp.minimum(lower_normal - lower_wave, upper_normal - upper_wave), 0.0)
+        fastest = anp.maximum(anp.maximum(lower_normal + lower_wave, upper_normal + upper_wave), 0.0)
+        faces = Faces(lower_depth, lower_velocity, upper_depth, upper_velocity, slowest, fastest)
+        return faces, 2.0 * axis.part(slopes[1:2], 1, -1)
+
+    def _along(self, axis: AxisFluxes, velocity: Any) -> Any:
+        """Return the component of the velocity along an axis."""
+        return velocity[axis.number : axis.number + 1]
+
+    def _rate_along(self, axis: AxisFluxes, u: Any, g: Any, faces: Faces, rise: Any) -> Any:
+        """Return the part of the rate that is due to the fluxes along an axis."""
+        lower_depth, lower_velocity, upper_depth, upper_velocity, slowest, fastest = faces
+        width = fastest - slowest  # positive, because waves of dry states have a speed too
+        lower_share = fastest / width
+        upper_share = -slowest / width
+        diffusion = slowest * fastest / width
+
+        lower_mass = lower_depth * self._along(axis, lower_velocity)
+        upper_mass = upper_depth * self._along(axis, upper_velocity)
+        mass = lower_share * lower_mass + upper_share * upper_mass + diffusion * (upper_depth - lower_depth)
+        carried = lower_share * lower_mass * lower_velocity + upper_share * upper_mass * upper_velocity
+        carried = carried + diffusion * (upper_depth * upper_velocity - lower_depth * lower_velocity)
+
+        # The pressure without that of the side of the face in the cell: exactly 0 if the depths are equal.
+        pressure_jump = 0.5 * g * (upper_depth - lower_depth) * (upper_depth + lower_depth)
+        normal = (np.arange(len(u) - 1) == axis.number).reshape(-1, *[1] * self.grid.dim)
+        for_cell_below = carried + normal * (upper_share * pressure_jump)
+        for_cell_above = carried - normal * (lower_share * pressure_jump)
+        weight = normal * (g * anp.maximum(u[:1], 0.0) * rise)
+
+        depth_change = axis.part(mass, 0, -1) - axis.part(mass, 1)
+        change = axis.part(for_cell_above, 0, -1) - axis.part(for_cell_below, 1) - weight
+        return anp.concatenate([depth_change, change]) / axis.widths
+
+    def _fastest_waves(self, axis: AxisFluxes, u: NDArray, params: Any) -> NDArray:
+        faces, _ = self._faces(axis, u, self._pull(params), self.ground(params), params)
+        at_faces = np.maximum(-plain(faces.slowest), plain(faces.fastest))[0]
+        return np.maximum(axis.part(at_faces, 0, -1), axis.part(at_faces, 1))
+
+
+def _check_depth(what, depth):
+    """Raise an error for a depth that is negative, and not only by rounding."""
+    rounding = ROUNDING * np.finfo(depth.dtype).eps * np.max(np.abs(depth), initial=0.0)
+    check_positive(what, depth, rounding)
+
+
+def _check_gravity(g):
+    check_number("gravity of shallow_water", g, "> 0", "; write gravity=9.81")
