@@ -9,10 +9,16 @@ Exact states and gradients: SciPy's Radau with rtol 1e-10 on the rate with its v
 prints them; of E5 the gradient is a difference of its runs, good to 1e-6); Prothero and Robinson's is known. Errors
 below 1e-9 are those of the reference, too.
 
-Run ``python -m benchmarks.stiff [--quick] [--out FOLDER]`` in the root of the repository.
+``--grids``: reactions on grids with about 10 000 unknowns, rodas5p beside Radau and BDF of SciPy with `jac_sparsity`.
+The reference of their errors is rodas5p with a tolerance of 1e-8; the rows of SciPy show that it is right. The time of
+the gradient is that of value and gradient together, in times of the value; "refused" is a DerivativeError, as the
+tolerance is too coarse for the derivative.
+
+Run ``python -m benchmarks.stiff [--quick] [--grids] [--out FOLDER]`` in the root of the repository.
 """
 
 import argparse
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 
@@ -20,6 +26,7 @@ import autograd.numpy as anp
 import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.linalg import block_diag
+from scipy.sparse import kron
 
 import sparsedp as dp
 
@@ -239,6 +246,114 @@ def picture(found, folder):
     figure.savefig(Path(folder) / "stiff.png", dpi=150)
 
 
+# ---- reactions on grids ----------------------------------------------------------------------------------------------
+
+
+def brusselator(cells):
+    """(rate, start, params, end): two species, Neumann walls, diffusion numbers of 100 and more in a step."""
+    grid = dp.Grid(cells, size=1.0)
+    spread = dp.laplacian(grid, dp.neumann)
+
+    def rate(s, p):
+        reaction = s["u"] ** 2 * s["v"]
+        u = p["a"] - (p["b"] + 1) * s["u"] + reaction + p["D"] * spread(s["u"])
+        return {"u": u, "v": p["b"] * s["u"] - reaction + p["D"] * spread(s["v"])}
+
+    wave = np.cos(2 * np.pi * grid.centres()[0]) * np.cos(np.pi * grid.centres()[-1])
+    return rate, {"u": 1.0 + 0.8 * wave, "v": 3.0 - wave}, {"a": 1.0, "b": 3.0, "D": 0.02}, 5.0
+
+
+def robertson_on_a_line(cells):
+    """(rate, start, params, end): three species with rate constants over nine decades, and diffusion."""
+    grid = dp.Grid(cells, size=1.0)
+    spread = dp.laplacian(grid, dp.neumann)
+
+    def rate(s, p):
+        slow, back, fast = p["k"][0] * s["a"], p["k"][1] * s["b"] * s["c"], p["k"][2] * s["b"] ** 2
+        terms = {"a": back - slow, "b": slow - back - fast, "c": fast}
+        return {name: terms[name] + p["D"] * spread(s[name]) for name in s}
+
+    (x,) = grid.centres()
+    start = {"a": 1.0 + 0.5 * np.cos(np.pi * x), "b": 0.0 * x, "c": 0.1 * x}
+    return rate, start, {"k": np.array([0.04, 1e4, 3e7]), "D": 1e-3}, 40.0
+
+
+GRIDS = {  # scene, size of the cells of its grid, floor
+    "Brusselator, 70 x 70": (brusselator, (70, 70), 1e-1),
+    "Brusselator, 5000": (brusselator, 5000, 1e-1),
+    "Robertson, 3333": (robertson_on_a_line, 3333, {"a": 0.1, "b": 1e-6, "c": 0.1}),
+}
+
+
+def flat(tree):
+    """One array."""
+    return np.concatenate([np.ravel(leaf) for leaf in tree.values()])
+
+
+def floors_of(start, floor):
+    """The floor of each number of a state."""
+    if not isinstance(floor, dict):
+        floor = dict.fromkeys(start, floor)
+    return flat({name: np.full(u.shape, floor[name]) for name, u in start.items()})
+
+
+def pattern_of(rate, start, p):
+    """The sparsity pattern of the Jacobian: all species of a cell, and those of its neighbours."""
+    shape = next(iter(start.values())).shape
+    stencil = abs(dp.laplacian(dp.Grid(shape), dp.neumann).matrix)
+    return kron(np.ones((len(start), len(start))), stencil, "csc")
+
+
+def on_a_grid(name, tolerances, methods):
+    """Print one row for each tolerance."""
+    scene, cells, floor = GRIDS[name]
+    rate, start, p, end = scene(cells)
+    sizes = [u.size for u in start.values()]
+    floors = floors_of(start, floor)
+    pattern = pattern_of(rate, start, p)
+
+    def numbers(t, z):
+        parts = np.split(z, np.cumsum(sizes)[:-1])
+        fields = {key: part.reshape(start[key].shape) for key, part in zip(start, parts, strict=True)}
+        return flat(rate(fields, p))
+
+    def by_us(tolerance):
+        step = dp.stepper("rodas5p", rate, end, tolerance=tolerance, floor=floor)
+        return step, lambda p: step(start, p)
+
+    def error_of(new):
+        return np.max(np.abs(flat(new) - reference) / (np.abs(reference) + floors))
+
+    reference = flat(by_us(1e-8)[1](p))
+    print(f"\n{name}: {sum(sizes)} unknowns\n  tolerance steps | rodas5p: error     s | gradient x value", end="")
+    print("".join(f" | {method}: error     s" for method in methods), flush=True)
+    for tolerance in tolerances:
+        step, run = by_us(tolerance)
+        run(p)  # the pattern is found in the first call
+        new, seconds = fastest(partial(run, p), 1)
+        text = f"  {tolerance:9.0e} {len(step.taken):5} | {error_of(new):14.1e} {seconds:5.1f}"
+        text += f" | {times_of_gradient(run, p, seconds):>16}"
+        for method in methods:
+            settings = {"rtol": tolerance, "atol": tolerance * floors, "jac_sparsity": pattern}
+            solve = partial(solve_ivp, numbers, (0, end), flat(start), method, **settings)
+            theirs, seconds = fastest(solve, 1)
+            error = np.max(np.abs(theirs.y[:, -1] - reference) / (np.abs(reference) + floors))
+            text += f" | {error:12.1e} {seconds:5.1f}"
+        print(text, flush=True)
+
+
+def times_of_gradient(run, p, seconds):
+    """Text: seconds of value and gradient over those of the value."""
+    both = dp.value_and_grad(lambda p: anp.mean(next(iter(run(p).values())) ** 2))
+    clock = perf_counter()
+    word = ""
+    try:
+        both(p)
+    except dp.errors.DerivativeError:
+        word = " refused"
+    return f"{(perf_counter() - clock) / seconds:.1f}{word}"
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
@@ -246,7 +361,12 @@ if __name__ == "__main__":
     )
     parser.add_argument("--quick", action="store_true", help="three tolerances, one run each")
     parser.add_argument("--out", help="folder of a picture")
+    parser.add_argument("--grids", action="store_true", help="reactions on grids in place of small systems")
     given, found = parser.parse_args(), {}
+    if given.grids:
+        for scene in GRIDS:
+            on_a_grid(scene, TOLERANCES[:3] if given.quick else TOLERANCES[:4], ("Radau", "BDF"))
+        raise SystemExit
     for scene in SCENES:
         if given.reference:
             print(f'    "{scene}": {tuple(reference(scene))},', flush=True)

@@ -193,6 +193,15 @@ def test_stiff_chemistry():
     assert explicit > 10 * implicit
 
 
+@example("reaction_waves.py")
+def test_reaction_waves():
+    """Equal cells follow two ODEs, and three ways to a derivative agree."""
+    printed = run("reaction_waves.py")
+    assert float(re.search(r"largest error (\S+)", printed)[1]) <= 5e-3
+    assert float(re.search(r"mode differ by (\S+)", printed)[1]) <= 1e-10
+    assert float(re.search(r"two runs: off by (\S+)", printed)[1]) <= 1e-2
+
+
 @example("plan.py")
 def test_plan():
     """Two scenes that share a law: one forward and one adjoint solve each, different derivatives left out."""

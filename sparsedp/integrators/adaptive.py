@@ -152,10 +152,13 @@ class Adaptive(Scheme):
         Weight of the extrapolation: 1 / (2^p - 1), or 0 for none.
     allowance : float
         Factor by which the estimated error of a derivative may be larger for each order above the first.
+    overestimate : float
+        Factor by which the estimated error of a derivative may be larger because it exceeds the error.
     """
 
     window = WINDOW
     allowance = 1.0
+    overestimate = 1.0
 
     def __init__(self, scheme: Scheme, tolerance: Any, floor: Any, max_step: float | None = None) -> None:
         super().__init__(scheme.problem, f"stepper({scheme.name})", scheme.order)
@@ -685,7 +688,7 @@ class Adaptive(Scheme):
         """
         share = self.compared / (self.compared + 1)
         if self.weight:
-            limit = LARGEST_DERIVATIVE_ERROR * self.tolerance**share
+            limit = self.overestimate * LARGEST_DERIVATIVE_ERROR * self.tolerance**share
             limit = limit * self.allowance ** (len(traces_of(leaves(arguments))) - 1)
         else:
             limit = TIMES * self.tolerance

@@ -229,6 +229,10 @@ class Embedded(Adaptive):
             return None
         return RateInspector(self, self.params, *arguments[2:])
 
+    def _leaves_zero(self, u: Any, new: Any) -> bool:
+        """Return True if a step changes an array that is 0 and has no floor: see `Adaptive`."""
+        return super()._leaves_zero(self.problem.state(u), self.problem.state(new))
+
     def sizes(self, *states: Any) -> list:
         """Return |u| + floor, the unit of errors, as a flat array; |u| is the largest of several states."""
         return [np.concatenate([*map(np.ravel, super().sizes(*map(self.problem.state, states)))])]

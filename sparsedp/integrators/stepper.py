@@ -225,8 +225,8 @@ def stepper(
     steps. The contribution of the extrapolation to it, relative to the params and to its largest entry, must be less
     than 6 tolerance^(p / (p + 1)) with the order p (crank_nicolson: less than 10 tolerance); otherwise a
     DerivativeError is raised. This may also happen for a derivative that is small because terms cancel. radau and
-    rodas5p use an embedded formula instead of the extrapolation (p = 3 and p = 4 in the bound). For each order above
-    the first their bound is ten times larger.
+    rodas5p use an embedded formula instead of the extrapolation (p = 3 and p = 4 in the bound, and three
+    times the bound for rodas5p). For each order above the first their bound is ten times larger.
 
     Cost: n linear steps and their gradient take one set-up and 2 n solves (tr_bdf2: 4 n). With a tolerance a gradient
     takes about six times the steps of its value, and three times the time of a gradient without the error estimate.

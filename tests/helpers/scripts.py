@@ -22,6 +22,7 @@ SMALL = {
     "burgers.py": "128",
     "shock.py": "64",
     "stiff_chemistry.py": "50",
+    "reaction_waves.py": "10",
     "pressure_projection.py": "80",
     "plume.py": "32",
     "plume_inverse.py": "6",
