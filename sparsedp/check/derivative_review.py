@@ -249,7 +249,7 @@ def _rounding_reason(audit: Any, group: Any, direction: DirectionEvidence) -> st
     and changes f there by no more than its rounding error, f may be a staircase at these steps.
     """
     step = _coarsest_step(direction)
-    if step is None:
+    if not step > 0:  # no step changes f
         return None
     in_f = rounding_error(partial(audit.difference_along, group, direction, step))
     in_derivative = rounding_error(partial(audit.slope_along, group, direction))
@@ -268,11 +268,14 @@ def _rounding_reason(audit: Any, group: Any, direction: DirectionEvidence) -> st
     return None
 
 
-def _coarsest_step(direction: DirectionEvidence) -> float | None:
-    """Return the coarsest step that, like all steps down to the best one, shows its gap; None if there is none."""
-    coarsest = None
+def _coarsest_step(direction: DirectionEvidence) -> float:
+    """Return the coarsest step that, like all steps down to the best one, shows its gap.
+
+    If plain differences do not show it, because it is an extrapolation, this is the step that is closest to it.
+    """
+    coarsest = direction.difference_step
     for step, gap in zip(direction.steps[::-1], direction.gaps[::-1]):
-        if step < direction.step:
+        if step < coarsest:
             continue
         if abs(gap - direction.gap) > REVIEW.same_gap_share * direction.size:
             break

@@ -62,6 +62,20 @@ def test_right_derivatives_of_ill_conditioned_solves_are_no_error(name):
 
 
 @needs_modes
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.whole)])
+def test_a_stage_with_an_ill_conditioned_matrix(seed):
+    """Here the gap along the last direction is visible after extrapolation only."""
+    A = MATRICES["Hilbert"]
+    x = np.random.default_rng(0).normal(size=12)
+    for factor, verdict in ((1.0, "inconclusive"), (2.0, "disagrees")):
+        stages = [
+            (np.sin, lambda u, g, factor=factor: factor * np.cos(u) * g),
+            (lambda b: np.linalg.solve(A, b), lambda b, g: np.linalg.solve(A.T, g)),
+        ]
+        assert dp.check.vjp(None, x=x, stages=stages, rng=seed).verdict == verdict
+
+
+@needs_modes
 def test_a_staircase_of_rounding_errors():
     """With partial pivoting the entries of this matrix grow to 2^39, and the last digits of x are lost."""
     A = np.eye(40) - np.tril(np.ones((40, 40)), -1)
