@@ -8,12 +8,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp._utils.validation import check_type
 from sparsedp.grid.boundary_conditions import check_condition, describe_patches, neumann, resolve
 from sparsedp.grid.grid import Grid, check_grid
 from sparsedp.grid.space import Space
 from sparsedp.operators.masks_and_lift import check_solid, region_of, solid_faces
 from sparsedp.operators.operator import Operator
-from sparsedp.operators.stencils import along, differences, kronecker_operator, one_sided, pick, slope_terms, to_faces
+from sparsedp.operators.stencils import (
+    along,
+    check_order,
+    differences,
+    differences_4,
+    kronecker_operator,
+    one_sided,
+    pick,
+    slope_terms,
+    slopes_4,
+    to_faces,
+)
 from sparsedp.operators.structure.base import Matrix
 from sparsedp.operators.structure.lazy import Mask, compose, total
 
@@ -24,7 +36,11 @@ __all__ = ["curl", "divergence", "flux", "gradient", "laplacian", "upwind"]
 
 
 def gradient(
-    grid: Grid, boundary: Any = neumann, solid: ArrayLike | None = None, solid_boundary: Any = neumann
+    grid: Grid,
+    boundary: Any = neumann,
+    solid: ArrayLike | None = None,
+    solid_boundary: Any = neumann,
+    order: int = 2,
 ) -> Operator:
     """Return the gradient operator from cells to faces, (u[i] - u[i - 1]) / d[i] on every face.
 
@@ -40,6 +56,9 @@ def gradient(
         True for cells that are not part of the domain. On a face between two solid cells the gradient is 0.
     solid_boundary : condition
         Boundary condition, with boundary value 0, on every face between a solid cell and a cell of the domain.
+    order : 2 or 4
+        Order of accuracy. 4 needs cells of one width along each axis, at least four of them between two walls, no solid
+        cells and no `patch`.
 
     Returns
     -------
@@ -53,7 +72,8 @@ def gradient(
     TypeError
         If `grid` is not a Grid, `solid` is not boolean, or `solid_boundary` is not a single condition.
     ValueError
-        If `boundary` names an axis that is periodic or that the grid does not have.
+        If `boundary` names an axis that is periodic or that the grid does not have, or if the grid does not allow the
+        order.
 
     See Also
     --------
@@ -66,6 +86,9 @@ def gradient(
     `interior` operator on faces. Then V D I = -(W I G)^T. If all walls are neumann or periodic, the null space of G
     consists of the constant fields.
 
+    With ``order=4`` the slope on a face is (27 (u[i] - u[i - 1]) - (u[i + 1] - u[i - 2])) / (24 h). The two faces next
+    to a wall use one-sided differences of order 3, so that V D I = -(W I G)^T holds on periodic axes only.
+
     Examples
     --------
     >>> import numpy as np
@@ -75,8 +98,13 @@ def gradient(
     >>> gradient(Grid(3), {"x": (dirichlet, neumann)})(np.array([1.0, 2.0, 4.0]))
     array([2., 1., 2., 0.])
     """
-    sides = resolve(grid, boundary, patches=True)
     check_condition("solid_boundary", solid_boundary)
+    if order != 2:
+        check_type("gradient", grid, Grid, "a Grid", "dp.Grid((64, 64), size=1.0)")
+        check_order("gradient", grid, order, solid)
+        sides = resolve(grid, boundary, name="gradient with order=4")
+        return to_faces("gradient", grid, [slopes_4(grid, axis, sides[axis]) for axis in range(grid.dim)])
+    sides = resolve(grid, boundary, patches=True)
     name = f"gradient{describe_patches(sides)}"
     slope = to_faces(name, grid, [slope_terms(grid, axis, sides[axis]) for axis in range(grid.dim)])
     if solid is None:
@@ -93,12 +121,16 @@ def gradient(
     return Operator(structure, grid.cells, grid.faces, name)
 
 
-def divergence(grid: Grid) -> Operator:
+def divergence(grid: Grid, order: int = 2, axis: int | str | None = None) -> Operator:
     """Return the divergence operator from faces to cells, the sum over the axes of (v[i + 1] - v[i]) / h[i].
 
     Parameters
     ----------
     grid : Grid
+    order : 2 or 4
+        Order of accuracy; see `gradient`.
+    axis : int or "x", "y", "z", optional
+        Compute the term of this axis only. Default: the sum over all axes.
 
     Returns
     -------
@@ -109,6 +141,8 @@ def divergence(grid: Grid) -> Operator:
     ------
     TypeError
         If `grid` is not a Grid.
+    ValueError
+        If the grid does not allow the order, or has no such axis.
 
     See Also
     --------
@@ -117,7 +151,7 @@ def divergence(grid: Grid) -> Operator:
     Notes
     -----
     The discrete divergence theorem holds exactly on any grid: sum(grid.volumes * D(v)) is the net outflow through the
-    walls.
+    walls. With ``order=4`` it holds on periodic axes only; the cells at walls use one-sided differences of order 3.
 
     Examples
     --------
@@ -127,7 +161,13 @@ def divergence(grid: Grid) -> Operator:
     array([1., 2., 0.])
     """
     check_grid("divergence", grid)
-    blocks = {(0, a): along(a, grid.dim, differences(grid, a)) for a in range(grid.dim)}
+    check_order("divergence", grid, order)
+    axes: Any = range(grid.dim)
+    if axis is not None:
+        grid.backend.check("divergence along one axis")
+        axes = [grid.axis(axis)]
+    factor = differences if order == 2 else differences_4
+    blocks = {(0, a): along(a, grid.dim, factor(grid, a)) for a in axes}
     return kronecker_operator(grid.faces, grid.cells, blocks, "divergence")
 
 
@@ -179,15 +219,19 @@ def flux(grid: Grid, cells: Any) -> Operator:
 
 
 def laplacian(
-    grid: Grid, boundary: Any = neumann, solid: ArrayLike | None = None, solid_boundary: Any = neumann
+    grid: Grid,
+    boundary: Any = neumann,
+    solid: ArrayLike | None = None,
+    solid_boundary: Any = neumann,
+    order: int = 2,
 ) -> Operator:
     """Return the Laplacian on cells, divergence(grid) @ gradient(grid, boundary, solid, solid_boundary).
 
     Parameters
     ----------
     grid : Grid
-    boundary, solid, solid_boundary
-        As for `gradient`.
+    boundary, solid, solid_boundary, order
+        As for `gradient`. The divergence has the same order.
 
     Returns
     -------
@@ -198,6 +242,8 @@ def laplacian(
     ------
     ShapeError
         If `solid` has another shape than the grid.
+    ValueError
+        If the grid does not allow the order.
 
     See Also
     --------
@@ -206,7 +252,9 @@ def laplacian(
     Notes
     -----
     The truncation error is of order 2 inside the domain, and of order 1 (neumann) or 0 (dirichlet) next to a wall;
-    solutions of Poisson problems are nevertheless second-order accurate. Values of the field in solid cells have no
+    solutions of Poisson problems are nevertheless second-order accurate. With ``order=4`` the truncation error is of
+    order 2 next to a wall, and solutions are fourth-order accurate. The operator is then symmetric on periodic axes
+    only. Values of the field in solid cells have no
     effect on the other cells. The result in a solid cell is the net flux through its faces to cells of the domain;
     linear solves exclude solid cells.
 
@@ -218,8 +266,9 @@ def laplacian(
     array([ 1.,  1., -2.])
     """
     check_grid("laplacian", grid)
-    G = gradient(grid, boundary, solid, solid_boundary)
-    product = divergence(grid) @ G
+    check_order("laplacian", grid, order, solid)
+    G = gradient(grid, boundary, solid, solid_boundary, order)
+    product = divergence(grid, order) @ G
     return Operator(product.structure, grid.cells, grid.cells, G.name.replace("gradient", "laplacian", 1))
 
 

@@ -13,7 +13,7 @@ from sparsedp.grid.boundary_conditions import SIDES, MixedWall, describe_patches
 from sparsedp.grid.grid import Grid, check_grid
 from sparsedp.grid.space import Space
 from sparsedp.operators.operator import Operator
-from sparsedp.operators.stencils import kronecker_operator, wall_slope_terms
+from sparsedp.operators.stencils import along, check_order, kronecker_operator, wall_slope_terms, wall_slopes_4
 from sparsedp.operators.structure.kronecker import Kronecker
 from sparsedp.operators.structure.lazy import Diagonal, Mask
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["diagonal", "identity", "interior", "lift", "mask"]
 
 
-def lift(grid: Grid, boundary: Any) -> Operator:
+def lift(grid: Grid, boundary: Any, order: int = 2) -> Operator:
     """Return the operator B that adds nonzero boundary values to a gradient G: the gradient is G(u) + B(values).
 
     Parameters
@@ -33,6 +33,8 @@ def lift(grid: Grid, boundary: Any) -> Operator:
         The conditions that G was built with. The boundary values are u [unit] for dirichlet, du/dn [unit / length] for
         neumann, and the right-hand side of a u + b du/dn = value for robin. On a wall with a `patch`, the value of
         each face belongs to the condition of this face.
+    order : 2 or 4
+        The order of G.
 
     Returns
     -------
@@ -45,7 +47,8 @@ def lift(grid: Grid, boundary: Any) -> Operator:
     Raises
     ------
     ValueError
-        If `boundary` names a periodic axis. On use of ``join``, if a wall with a patch gets a number other than 0.
+        If `boundary` names a periodic axis, or the grid does not allow the order. On use of ``join``, if a wall with a
+        patch gets a number other than 0.
 
     See Also
     --------
@@ -74,9 +77,14 @@ def lift(grid: Grid, boundary: Any) -> Operator:
     """
     parts: list[tuple[int, ...]] = []
     blocks = {}
-    sides = resolve(grid, boundary, patches=True)
+    sides = resolve(grid, boundary, patches=order == 2, name="lift with order=4")
+    check_order("lift", grid, order)
     for axis, side, wall in walls_of(sides):
-        blocks[axis, len(parts)] = wall_slope_terms(grid, axis, side, wall)
+        if order == 2:
+            terms = wall_slope_terms(grid, axis, side, wall)
+        else:
+            terms = along(axis, grid.dim, wall_slopes_4(grid, axis, side, wall))
+        blocks[axis, len(parts)] = terms
         parts.append(tuple(1 if a == axis else n for a, n in enumerate(grid.shape)))
     mixed = {}
     for number, (axis, side, wall) in enumerate(walls_of(sides)):

@@ -19,7 +19,9 @@ from sparsedp.operators.structure.kronecker import Kronecker, Term
 __all__ = [
     "along",
     "adjacent_cell",
+    "check_order",
     "differences",
+    "differences_4",
     "kronecker_operator",
     "mean_of_faces",
     "mean_terms",
@@ -29,9 +31,11 @@ __all__ = [
     "pick",
     "slope_terms",
     "slopes",
+    "slopes_4",
     "to_faces",
     "wall_slope_terms",
     "wall_slopes",
+    "wall_slopes_4",
     "with_ends",
 ]
 
@@ -93,6 +97,103 @@ def means(grid: Grid, axis: int, sides: Any) -> Factor:
     return Factor.from_diagonals(
         _cells_to_faces(grid, axis), (face, upper, h[lower] / both), (face, lower, h[upper] / both), *walls
     )
+
+
+# ---- order 4 on staggered points: (27 (u[i] - u[i - 1]) - (u[i + 1] - u[i - 2])) / (24 h) between the points ----
+
+CENTRED = (1 / 24, -27 / 24, 27 / 24, -1 / 24)
+FEWEST = 4  # cells between two walls, so that the rows next to one wall do not reach the other one
+# Next to a wall the slope of a cubic polynomial. Its error of order 3 keeps solutions at order 4. Rows: the wall face
+# and the next face; columns: the value on the wall and in the first three cells.
+AT_WALL = ((-46 / 15, 15 / 4, -5 / 6, 3 / 20), (2 / 15, -5 / 4, 7 / 6, -1 / 20))
+FIRST_CELL = (-23 / 24, 7 / 8, 1 / 8, -1 / 24)  # from the first four faces
+
+
+def check_order(name: str, grid: Grid, order: Any, solid: Any = None) -> None:
+    """Raise an error if `order` is neither 2 nor 4, or if the function `name` has no stencil of order 4 on the grid."""
+    if isinstance(order, bool) or order not in (2, 4):
+        raise ValueError(f"order of {name} must be 2 or 4, got {order!r}")
+    if order == 2:
+        return
+    grid.backend.check(f"{name} with order=4")
+    if solid is not None:
+        raise ValueError(f"{name} with order=4 takes no solid cells; leave solid out or take order=2")
+    for axis, uniform, periodic, n in zip(grid.axes, grid.uniform, grid.periodic, grid.shape, strict=True):
+        if not uniform:
+            raise ValueError(f"{name} with order=4 needs cells of one width, but {axis} is stretched; take order=2")
+        if not periodic and n < FEWEST:
+            raise ValueError(
+                f"{name} with order=4 needs at least {FEWEST} cells between two walls, got {n} along {axis}; take "
+                "order=2"
+            )
+
+
+def differences_4(grid: Grid, axis: int) -> Factor:
+    """Return the factor of `differences` of order 4, for an axis of equal widths; of order 3 in the cells at walls."""
+    n = grid.shape[axis]
+    nodes = grid.node_count(axis)
+    cells = np.arange(n) if grid.periodic[axis] else np.arange(1, n - 1)
+    ends = []
+    if not grid.periodic[axis]:
+        ends = [(0, np.arange(4), FIRST_CELL), (n - 1, n - np.arange(4), [-weight for weight in FIRST_CELL])]
+    return _four_points(grid, axis, (n, nodes), cells, -1, ends)
+
+
+def slopes_4(grid: Grid, axis: int, sides: Any) -> Factor:
+    """Return the factor of `slopes` of order 4, for an axis of equal widths; of order 3 on two faces at each wall."""
+    n = grid.shape[axis]
+    nodes = grid.node_count(axis)
+    if grid.periodic[axis]:
+        return _four_points(grid, axis, (nodes, n), np.arange(n), -2, [])
+    ends = []
+    for side, condition in enumerate(sides):
+        sign = 1 - 2 * side  # from the wall inwards
+        for row, (at_wall, *at_cells) in enumerate(AT_WALL):
+            weights = np.array(at_cells) + at_wall * _shares_on_wall(grid, axis, condition)
+            if row == 0 and condition.a == 0:
+                weights = np.zeros(3)  # exactly, without the rounding of the line above
+            cells = np.arange(3) if side == 0 else n - 1 - np.arange(3)
+            ends.append((row if side == 0 else n - row, cells, sign * weights))
+    return _four_points(grid, axis, (nodes, n), np.arange(2, n - 1), -2, ends)
+
+
+def wall_slopes_4(grid: Grid, axis: int, side: int, condition: Any) -> Factor:
+    """Return the factor of `wall_slopes` that belongs to `slopes_4`."""
+    nodes = grid.node_count(axis)
+    h = grid.widths[axis][0]
+    rows = np.array([0, 1]) if side == 0 else np.array([nodes - 1, nodes - 2])
+    slope = (1 - 2 * side) * np.array([row[0] for row in AT_WALL]) / h * _value_on_wall(h, condition)
+    if condition.a == 0:
+        slope[0] = (2 * side - 1) / condition.b
+    return Factor.from_diagonals((nodes, 1), (rows, np.zeros_like(rows), slope))
+
+
+def _shares_on_wall(grid, axis, condition):
+    """Return the weights of the first three cells in the value on a wall that a condition with value 0 implies."""
+    h = grid.widths[axis][0]
+    return condition.b / h * np.array(AT_WALL[0][1:]) * _value_on_wall(h, condition)
+
+
+def _value_on_wall(h, condition):
+    """Return the value on a wall for a condition with value 1, where the field is 0 in the cells."""
+    return 1 / (condition.a - condition.b * AT_WALL[0][0] / h)
+
+
+def _four_points(grid, axis, shape, rows, first, ends):
+    """Return a factor with the weights CENTRED / h, and the rows `ends` = (row, columns, weights times h) at walls.
+
+    `first` is the first column of a row minus the number of the row.
+    """
+    columns = max(shape[1], 1)
+    if columns == 1:  # one periodic cell: differences are exactly 0
+        rows = rows[:0]
+    h = grid.widths[axis][:1]
+    diagonals = [
+        (rows, (rows + first + place) % columns, np.full(rows.size, weight) / h) for place, weight in enumerate(CENTRED)
+    ]
+    for row, cells, weights in ends:
+        diagonals.append((np.full(len(cells), row), cells, np.array(weights) / h))
+    return Factor.from_diagonals(shape, *diagonals)
 
 
 def wall_slopes(grid: Grid, axis: int, side: int, condition: Any) -> Factor:

@@ -247,6 +247,36 @@ TABLE = [
         FINITE,
         "coefficients underflow: the spacing is too large; rescale the lengths of the grid",
     ),
+    # stencils of order 4
+    (lambda: dp.laplacian(RING, order=3), VALUE, "order of laplacian must be 2 or 4, got 3"),
+    (lambda: dp.gradient(RING, order=True), VALUE, "order of gradient must be 2 or 4, got True"),
+    (lambda: dp.divergence(RING, order="4"), VALUE, "order of divergence must be 2 or 4, got '4'"),
+    (
+        lambda: dp.gradient(dp.Grid(4), solid=np.zeros(4, bool), order=4),
+        VALUE,
+        "gradient with order=4 takes no solid cells; leave solid out or take order=2",
+    ),
+    (
+        lambda: dp.divergence(dp.Grid(4, spacing=[np.arange(1.0, 5.0)]), order=4),
+        VALUE,
+        "divergence with order=4 needs cells of one width, but x is stretched; take order=2",
+    ),
+    (
+        lambda: dp.laplacian(BOX, order=4),
+        VALUE,
+        "laplacian with order=4 needs at least 4 cells between two walls, got 2 along x; take order=2",
+    ),
+    (
+        lambda: dp.lift(LINE, dp.dirichlet, order=4),
+        VALUE,
+        "lift with order=4 needs at least 4 cells between two walls, got 3 along x; take order=2",
+    ),
+    (
+        lambda: dp.lift(dp.Grid((4, 4)), {"x": dp.patch((1, 3), dp.dirichlet)}, order=4),
+        TYPE,
+        "lift with order=4 takes one condition for each wall, but x-lower has a patch; write one condition, such as "
+        "dp.dirichlet",
+    ),
 ]
 
 
