@@ -37,7 +37,7 @@ from sparsedp._utils.pytree import copied
 from sparsedp._utils.validation import check_finite, check_kind, check_native, check_on, check_plain
 from sparsedp.autodiff.program_trace import check_values, recording_trace
 from sparsedp.autodiff.tape import cast, dtype_of, isbox, sample
-from sparsedp.errors import DerivativeError, JitError, ShapeError
+from sparsedp.errors import DerivativeError, IncompatibleError, JitError, ShapeError
 from sparsedp.grid.boundary_conditions import check_condition, neumann
 from sparsedp.grid.grid import check_grid
 from sparsedp.operators.cut_geometry import cut_geometry, sum_at_places
@@ -45,6 +45,7 @@ from sparsedp.operators.difference import divergence, gradient
 from sparsedp.operators.given import from_matrix
 from sparsedp.operators.masks_and_lift import lift
 from sparsedp.operators.operator import Operator
+from sparsedp.operators.stencils import adjacent_cell, to_faces
 from sparsedp.solvers.choose_method import check_settings
 from sparsedp.solvers.parametric import from_coo
 
@@ -66,6 +67,7 @@ SLOPE_DAMPING = 1e-10
 CURVATURE_DAMPING = 1e-3
 # The weighted sum of squared distances of cells from the wall, in cell widths, from which on the fit alone is used.
 ENOUGH = 0.4
+LARGEST_IMBALANCE = 1e-6  # outflow of a cell that `project` may leave, relative to the flow through its faces
 
 
 def cut_cells(
@@ -213,7 +215,7 @@ class CutCells(Reconstructible):
         self.areas = self._at_walls(self._geometry.areas)
         outflow = sp.diags_array(grid.volumes.reshape(-1)) @ divergence(grid).matrix
         self._outflow = from_matrix(outflow, grid.faces, grid.cells, "outflow")  # through the areas of whole faces
-        self._solver: Any = None
+        self._solvers: dict[str, Any] = {}
 
     def recipe(self) -> tuple[type[CutCells], tuple[Any, ...]]:
         """Return the call that constructs an equal object, without its set-ups."""
@@ -334,6 +336,115 @@ class CutCells(Reconstructible):
         terms = slope.coefficients * anp.reshape(u, (-1,))[slope.cells]
         return self._sum_of_pairs(terms) + slope.of_value * values
 
+    # ------------------------------------------------------------ flows around the body
+
+    def project(self, v: Any) -> Any:
+        """Return the divergence-free part v - grad p of a velocity; nothing flows through the wall of the body.
+
+        On the walls of the grid, p has the conditions `boundary`: neumann keeps v there, dirichlet lets it flow freely.
+
+        Parameters
+        ----------
+        v : array, a field on the faces
+
+        Returns
+        -------
+        array, a field on the faces; 0 on faces without fluid
+
+        Raises
+        ------
+        ValueError
+            If `solid_boundary` is not neumann.
+        IncompatibleError
+            If more enters a region through neumann walls than leaves it.
+        """
+        if self._condition != neumann:
+            raise ValueError(
+                f"project of cut_cells needs solid_boundary=dp.neumann, got {self._condition}; build another body"
+            )
+        pressure = self._solve(-self.divergence(v), nullspace="project")
+        free = self._is_open * v - self.gradient(pressure)
+        check_values(_check_balance, self._outflow(self.apertures * free), self._passing(self.apertures * abs(v)))
+        return free
+
+    @cached_property
+    def _passing(self):
+        """The operator that sums a face field, times the areas of the faces, over the faces of each cell."""
+        return from_matrix(abs(self._outflow.matrix), self.grid.faces, self.grid.cells, "flow through faces")
+
+    def advection(self, u: Any, v: Any, inflow: Any = 0.0) -> Any:
+        """Return -div(v u) by upwind fluxes, redistributed: the rate of an explicit step.
+
+        The sum of ``volumes * advection(u, v)`` is the flux through the walls of the grid, up to rounding.
+
+        Parameters
+        ----------
+        u : array, a field on the cells
+        v : array, a field on the faces
+            For example of `project`: its apertures-weighted divergence should be 0.
+        inflow : number, or array, a field on the faces
+            The value of u that enters through the walls of the grid.
+
+        Returns
+        -------
+        array, a field on the cells
+        """
+        below, above, at_lower, at_upper = self._beside_faces
+        entering = self._field("inflow", inflow, self.grid.faces)
+        from_below = anp.where(at_lower, entering, below(u))
+        from_above = anp.where(at_upper, entering, above(u))
+        flux = anp.maximum(v, 0.0) * from_below + anp.minimum(v, 0.0) * from_above
+        return -self.redistribute(self.divergence(flux))
+
+    def redistribute(self, rate: Any) -> Any:
+        """Return a rate without the step limit of small cells: what a small cell cannot take goes to its neighbours.
+
+        A cell with a fluid fraction f below 1/2 keeps the share 2 f of its rate; the rest becomes the mean over the
+        cell and those behind its open faces. The difference is given to all of these, so that the sum of
+        ``volumes * rate`` is kept up to rounding. Other cells keep their rate.
+
+        Parameters
+        ----------
+        rate : array, a field on the cells
+            An explicit rate, such as ``body.divergence(flux)``.
+
+        Returns
+        -------
+        array, a field on the cells
+
+        References
+        ----------
+        I-L. Chern, P. Colella, UCRL-97200, Lawrence Livermore National Laboratory (1987).
+        """
+        around = self._neighbourhood(self.volumes)
+        around = anp.where(self.is_fluid, around, 1.0)
+        mean = self._neighbourhood(self.volumes * rate) / around
+        excess = anp.maximum(1.0 - 2.0 * self.fractions, 0.0) * (rate - mean)
+        return self.is_fluid * (rate - excess + self._neighbourhood(self.volumes * excess / around))
+
+    @cached_property
+    def _neighbourhood(self):
+        """The operator that sums a field over each cell and the cells behind its open faces."""
+        touching = abs(self._outflow.matrix) @ sp.diags_array(self._is_open.astype(float))
+        links = sp.csr_array((touching @ touching.T + sp.eye_array(touching.shape[0]) > 0).astype(float))
+        return from_matrix(links, self.grid.cells, self.grid.cells, "sum over neighbours")
+
+    @cached_property
+    def _beside_faces(self):
+        """Operators to the values below and above each face, and masks of the faces on lower and on upper walls."""
+        grid = self.grid
+        axes = range(grid.dim)
+        below = to_faces("cell below", grid, [adjacent_cell(grid, axis, False) for axis in axes])
+        above = to_faces("cell above", grid, [adjacent_cell(grid, axis, True) for axis in axes])
+        masks = []
+        for end in (0, -1):
+            parts = [np.zeros(shape, bool) for shape in grid.faces.parts]
+            for axis, part in enumerate(parts):
+                if not grid.periodic[axis]:
+                    np.moveaxis(part, axis, 0)[end] = True  # a view
+            masks.append(np.concatenate([part.reshape(-1) for part in parts]))
+        return below, above, *masks
+
     # ------------------------------------------------------------ solving
 
     @property
@@ -381,6 +492,10 @@ class CutCells(Reconstructible):
         -------
         array of the shape and dtype of b; 0 in cells without fluid
         """
+        return self._solve(b, values, walls, k, shift, wall_k, self._arguments[-1].nullspace)
+
+    def _solve(self, b, values=0.0, walls=None, k=1.0, shift=0.0, wall_k=None, nullspace="raise"):
+        """Return the solution; see `solve`."""
         check_plain("cut_cells", b, values, k, shift)
         if not isbox(b):
             b = np.asarray(b)
@@ -393,11 +508,23 @@ class CutCells(Reconstructible):
         right = self.volumes * b + self._at_walls(self._wall_terms(values, k, wall_k))
         if walls is not None:
             right = right + self._outflow(self.apertures * k * self._lift(walls))
-        if self._solver is None:  # the pattern does not depend on the coefficients
-            self._solver = from_coo(rows, columns, self.grid.cells, **_options(self._arguments[-1]))
-            self._solver.name = "cut_cells"
-            self.info = self._solver.info
-        u = self._solver(entries, self.is_fluid * right)
+        solver = self._solvers.get(nullspace)
+        if solver is None:  # the pattern does not depend on the coefficients
+            settings = self._arguments[-1]
+            solver = from_coo(
+                rows,
+                columns,
+                self.grid.cells,
+                method=settings.method,
+                rtol=settings.rtol,
+                maxiter=settings.maxiter,
+                nullspace=nullspace,
+                **settings.options,
+            )
+            solver.name = "cut_cells"
+            self._solvers[nullspace] = solver
+        self.info = solver.info
+        u = solver(entries, self.is_fluid * right)
         if dtype_of(u).kind == "f":
             return cast(u, np.result_type(dtype_of(b), np.float32))
         return u
@@ -556,17 +683,6 @@ class CutCells(Reconstructible):
         return f"<cut_cells: {counts}, {self._geometry.cut.size} are cut, {self._condition} on the wall>"
 
 
-def _options(settings):
-    """Return the keywords of `inverse` for its checked settings."""
-    return dict(
-        method=settings.method,
-        rtol=settings.rtol,
-        maxiter=settings.maxiter,
-        nullspace=settings.nullspace,
-        **settings.options,
-    )
-
-
 def _checked_level(grid, level):
     """Return the level at the nodes, traced or not, in double precision."""
     if callable(level) and not isbox(level):
@@ -582,6 +698,16 @@ def _checked_level(grid, level):
     check_kind("the level of cut_cells", values.dtype, "real numbers", "; write level.real")
     check_finite("the level of cut_cells", values)
     return cast(level if isbox(level) else values, np.dtype(float))
+
+
+def _check_balance(outflow, size):
+    """Raise IncompatibleError if a projected velocity is not free of divergence."""
+    left = np.max(np.abs(outflow), initial=0.0)
+    if left > LARGEST_IMBALANCE * np.max(np.abs(size), initial=0.0):
+        raise IncompatibleError(
+            "project of cut_cells: more enters a region through the walls of the grid than leaves it; make the "
+            "velocity on the walls balance, or open a wall with boundary=dp.dirichlet"
+        )
 
 
 def _check_not_negative(k):

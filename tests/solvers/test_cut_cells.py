@@ -291,6 +291,91 @@ def test_charge_of_a_coaxial_line():
     assert np.isclose(np.sum(charges), 0.0, atol=1e-9)
 
 
+# ------------------------------------------------------------ flows around a body
+
+
+def stream(n, radius=0.61):
+    """A body in a stream along x, a velocity that enters and leaves, and the exact potential flow in a plane."""
+    grid = dp.Grid((n, n), size=4.0, origin=-2.0)
+    body = dp.cut_cells(grid, lambda x, y: hypot(x - 0.013, y + 0.021) - radius)
+
+    def exact(axis):
+        x, y = grid.face_centres(axis)
+        x, y = x - 0.013, y + 0.021
+        squares = np.maximum(x * x + y * y, 0.1)
+        along = 1.0 - radius**2 * (x * x - y * y) / squares**2
+        return along if axis == 0 else -2.0 * radius**2 * x * y / squares**2
+
+    u, v = exact(0), exact(1)
+    start_u, start_v = np.ones(u.shape), np.zeros(v.shape)
+    start_u[[0, -1]], start_v[:, [0, -1]] = u[[0, -1]], v[:, [0, -1]]
+    entering = grid.join(start_u, start_v)
+    net = np.sum(body.volumes * body.divergence(entering))
+    start_u[-1] -= net / 4.0
+    return grid, body, grid.join(start_u, start_v), grid.join(u, v)
+
+
+def test_projection_around_a_body():
+    grid, body, entering, exact = stream(32)
+    v = body.project(entering)
+    assert np.max(abs(body.volumes * body.divergence(v))) < 1e-10
+    assert np.sqrt(np.mean(((v - exact) * (body.apertures > 0)) ** 2)) < 0.01
+    assert np.allclose(body.project(v), v, atol=1e-9)
+    w = np.random.default_rng(0).standard_normal(grid.faces.size)
+    w = dp.interior(grid)(w) * (body.apertures > 0)
+    weights = body.apertures * grid.faces.volumes  # the projection is orthogonal in this inner product
+    assert np.isclose(np.sum(weights * body.project(w) * (w - body.project(w))), 0.0, atol=1e-9)
+    with pytest.raises(
+        IncompatibleError,
+        match="^project of cut_cells: more enters a region through the walls of the grid than leaves it; make the "
+        "velocity on the walls balance, or open a wall with boundary=dp.dirichlet$",
+    ):
+        body.project(entering * (grid.join(grid.face_centres(0)[0], grid.face_centres(1)[0]) < 1.9))
+    with pytest.raises(
+        ValueError,
+        match="^project of cut_cells needs solid_boundary=dp.neumann, got dirichlet; build another body$",
+    ):
+        dp.cut_cells(GRID, np.ones(GRID.nodes.shape), dp.dirichlet, dp.dirichlet).project(np.ones(GRID.faces.size))
+
+
+def test_explicit_transport_with_small_cells_is_stable_and_conservative():
+    grid, body, entering, _ = stream(32)
+    assert np.min(body.fractions[body.is_fluid]) < 0.02
+    v = body.project(entering)
+    x, y = grid.centres()
+    u = np.exp(-((x + 1.2) ** 2 + (y - 0.1) ** 2) / 0.1) * body.is_fluid
+    dt = 0.4 * (4.0 / 32) / np.max(abs(v))
+    mass = np.sum(body.volumes * u)
+    for _ in range(15):
+        u = u + dt * body.advection(u, v)
+    assert np.isclose(np.sum(body.volumes * u), mass, rtol=1e-6)  # almost nothing has arrived at the walls
+    for _ in range(100):
+        u = u + dt * body.advection(u, v)
+    assert -1e-6 < np.min(u) and np.max(u) < 1.0
+    ones = 1.0 * body.is_fluid
+    assert np.allclose(body.advection(ones, v, 1.0), 0.0, atol=1e-7)  # constants are kept
+    rate = np.random.default_rng(0).standard_normal(grid.shape) * body.is_fluid
+    assert np.isclose(np.sum(body.volumes * body.redistribute(rate)), np.sum(body.volumes * rate), atol=1e-14)
+
+
+def test_derivatives_of_flows_around_a_body():
+    grid = dp.Grid((7, 6), size=(1.1, 0.9))
+    u, w = np.random.default_rng(0).standard_normal((2, *grid.shape))
+    wind = dp.interior(grid)(np.random.default_rng(1).standard_normal(grid.faces.size))
+
+    def loss(q):
+        body = dp.cut_cells(grid, lambda x, y: hypot(x - 0.52, y - 0.41) - 0.2 * q[0])
+        v = body.project(q[1] * wind)
+        return np.sum(w * body.advection(u * q[2], v, 0.3)) + np.sum(w * body.divergence(v**2))
+
+    q = np.array([1.05, 0.9, 1.1])
+    direction = np.array([1.0, -0.5, 0.7])
+    slope = np.dot(dp.grad(loss)(q), direction)
+    h = 1e-5
+    assert np.isclose(slope, (loss(q + h * direction) - loss(q - h * direction)) / (2 * h), rtol=1e-6)
+    assert np.isclose(dp.jvp(loss, q, direction)[1], slope, rtol=1e-9)
+
+
 # ------------------------------------------------------------ errors
 
 
