@@ -156,8 +156,10 @@ FORWARD = """
 def robertson_forward():
     """Forward sensitivities of Robertson's kinetics by `jvp`, as cvsRoberts_FSA_dns (relative tolerance 1e-4)."""
     quantities = "y1, y2, y3, " + ", ".join(f"dy{i}/dp{k}" for k in (1, 2, 3) for i in (1, 2, 3))
-    found, time = [], 0.0
-    state, slopes = np.array([1.0, 0.0, 0.0]), np.zeros((3, 3))
+    found = []
+    time = 0.0
+    state = np.array([1.0, 0.0, 0.0])
+    slopes = np.zeros((3, 3))
     for end, bound, *published in np.reshape(FORWARD.split(), (12, 14)):
         floor = np.minimum(state / 10 + 1e-13, [1e-3, 1e-6, 1e-3])
         step = dp.stepper("radau", robertson, float(end) - time, tolerance=1e-5, floor=floor)
@@ -165,7 +167,9 @@ def robertson_forward():
         z = np.concatenate([state, ROBERTSON])
         tangents = (np.concatenate([slope, unit]) for slope, unit in zip(slopes, np.eye(3), strict=True))
         results = [dp.jvp(last, z, tangent) for tangent in tangents]
-        state, slopes, time = results[0][0], np.array([slope for _, slope in results]), float(end)
+        state = results[0][0]
+        slopes = np.array([slope for _, slope in results])
+        time = float(end)
         names = ", ".join(f"{name} at {end}" for name in quantities.split(", "))
         found += numbers(names, " ".join(published), [*state, *slopes.ravel()], float(bound))
     step = dp.stepper("radau", robertson, 40.0, tolerance=1e-9, floor=np.array([1e-3, 1e-6, 1e-3]))
@@ -176,7 +180,8 @@ def robertson_hessian():
     """Hessian of Robertson's kinetics in two parameters, as idasHessian_ASA_FSA (relative tolerance 1e-8)."""
     rate = with_integral(robertson, lambda u: np.sum(u**2) / 2)
     step = dp.stepper("radau", rate, 80.0, tolerance=1e-7, floor=np.array([1e-3, 1e-7, 1e-3, 1.0]))
-    start, scale = np.array([1.0, 0.0, 0.0, 0.0]), ROBERTSON[:2]
+    start = np.array([1.0, 0.0, 0.0, 0.0])
+    scale = ROBERTSON[:2]
     integral = lambda q: step(start, np.concatenate([q * scale, ROBERTSON[2:]]))[3]
     q = np.ones(2)
     value, slopes = dp.value_and_grad(integral)(q)
@@ -234,7 +239,8 @@ def lotka_volterra():
     step = dp.jit(dp.stepper("rk4", predator_prey, 0.01))
     last = lambda z: dp.rollout(step, z[:2], z[2:], 1000)
     loss = lambda z: np.sum((1 - last(z)) ** 2) / 2
-    u, slopes = last(LOTKA_VOLTERRA), dp.grad(loss)(LOTKA_VOLTERRA)
+    u = last(LOTKA_VOLTERRA)
+    slopes = dp.grad(loss)(LOTKA_VOLTERRA)
     found = numbers("u1, u2", "1.026344801589377e+00 9.096910639243128e-01", u, 1e-6)
     found += numbers("u1 of ARKODE, u2 of ARKODE", "1.026344767571517e+00 9.096910781383605e-01", u, 1e-7)
     found += numbers("dg/du1, dg/du2", "2.634480158937702e-02 -9.030893607568724e-02", u - 1, 1e-5)
@@ -411,7 +417,8 @@ def shadowing(start, steps=2000, dt=0.01, dilation=10.0):
 
     def slope(q):
         w = solve(np.dot(q, in_p))
-        v, stretch = np.reshape(B.T(w), (steps + 1, 3)), -C.T(w) / dilation**2
+        v = np.reshape(B.T(w), (steps + 1, 3))
+        stretch = -C.T(w) / dilation**2
         return np.mean(v[:, 2]) + np.mean(stretch * (middle[2] - np.mean(middle[2])))
 
     return slope

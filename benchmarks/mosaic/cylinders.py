@@ -70,8 +70,12 @@ class DragTask:
     second half of 200 steps of 0.02. The inflow has one value for each cell, between 0 and 1.5.
     """
 
-    NU, DT, STEPS = 2.5e-3, 0.02, 200
-    MEAN, LARGEST, PENALTY = 0.5, 1.5, 50.0
+    NU = 2.5e-3
+    DT = 0.02
+    STEPS = 200
+    MEAN = 0.5
+    LARGEST = 1.5
+    PENALTY = 50.0
     RADIUS = 0.05
 
     def __init__(self, n=32, steps=STEPS, dt=DT):

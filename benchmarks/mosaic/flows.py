@@ -146,7 +146,8 @@ class SpectralFlow:
 
     def step(self, v, params):
         """Return the velocity after one step: viscosity exact, advection by the scheme of Runge and Kutta."""
-        dt, half = self.dt, self.decay
+        dt = self.dt
+        half = self.decay
         old = self._transform(v)
         first = self.advection(old)
         second = self.advection(half * (old + 0.5 * dt * first))

@@ -13,8 +13,11 @@ __all__ = ["Cantilever", "Slab", "random_density", "simp"]
 
 VOID = 1e-3
 POWER = 3
-LENGTH, WIDTH, HEIGHT = 2.0, 1.0, 1.0
-YOUNG, POISSON = 70_000.0, 0.3
+LENGTH = 2.0
+WIDTH = 1.0
+HEIGHT = 1.0
+YOUNG = 70_000.0
+POISSON = 0.3
 
 
 def simp(density):

@@ -48,7 +48,8 @@ class OutputSchema(BaseModel):
 def _flow(inputs):
     """Return the function from the first velocity to the last one."""
     n, _, _, dim = inputs.v0.shape
-    nu, dt = float(inputs.viscosity[0]), float(inputs.dt[0])
+    nu = float(inputs.viscosity[0])
+    dt = float(inputs.dt[0])
     run = StaggeredFlow(n, dim, nu, dt, inputs.steps, side=inputs.domain_extent)
 
     def flow(v0):

@@ -136,11 +136,13 @@ def gas_law_by_bisection():
     """The volume of a gas at a pressure, by bisection to 1e-8."""
 
     def f(pressure):
-        low, high = np.zeros_like(pressure), np.full_like(pressure, 4.0)
+        low = np.zeros_like(pressure)
+        high = np.full_like(pressure, 4.0)
         for _ in range(28):
             middle = (low + high) / 2
             is_low = middle + middle**3 < pressure
-            low, high = np.where(is_low, middle, low), np.where(is_low, high, middle)
+            low = np.where(is_low, middle, low)
+            high = np.where(is_low, high, middle)
         return (low + high) / 2
 
     def vjp(pressure, g):

@@ -28,7 +28,8 @@ def euler_states(u, dt, steps):
 @wrong("off by one in time")
 def predators_and_prey():
     """Predators and prey after ten explicit Euler steps."""
-    dt, steps = 0.05, 10
+    dt = 0.05
+    steps = 10
 
     def f(u):
         return euler_states(u, dt, steps)[-1]
@@ -130,7 +131,9 @@ def observed_trajectory():
 @wrong("dropped history", entries=np.s_[:-1])
 def delayed_feedback():
     """A control loop with a delay: the state depends on the history before time 0."""
-    delay, dt, steps = 4, 0.1, 7
+    delay = 4
+    dt = 0.1
+    steps = 7
 
     def f(history):
         u = list(history)

@@ -41,6 +41,7 @@ from sparsedp.check.programs import Program, WrongResult
 from sparsedp.check.rounding_modes import ROUNDING_FACTOR, rounding_error
 from sparsedp.check.step_sizes import STEPS_BETWEEN, default_steps
 from sparsedp.check.summary import Row
+from sparsedp.check.thresholds import REVIEW
 
 __all__ = ["DerivativeAudit", "Group", "Options", "accept"]
 
@@ -50,8 +51,7 @@ FIRST_STEP = 2.0**-10  # step of the first difference
 SHORT_SWEEP = (16.0, 4.0, 1.0, 0.25)  # multiples of the best step of the first sweep
 NOISE_POINTS = 6
 COMBINATION = 0.75, -1.25  # factors of the test of linearity
-LINEAR_SHARE = 1e-5  # a larger relative gap of a linear combination is an error
-LINEAR_EPS = 1e4  # the same in units of machine epsilon; matters in single precision
+LINEAR_EPS = 1e4  # allowed relative gap of an identity in units of machine epsilon; matters in single precision
 REPEATED_EPS = 1e3  # two runs of f may differ by this multiple of machine epsilon, if threads add in another order
 REPEATED_SHARE = 1e-6  # a larger relative difference of two equal calls is an error
 DUALITY_SHARE = 1e-6  # a larger gap between VJP and JVP is an error
@@ -527,7 +527,7 @@ class DerivativeAudit:
         self.pairs = list(zip(vectors, results))
         found = self.derivative(combined)
         self.linear_gap = self.relative_gap(found, [a * results[0], b * results[1]], combined)
-        allowed = self.allowed(LINEAR_SHARE)
+        allowed = self.allowed(REVIEW.linear_share)
         argument = ARGUMENTS[self.kind]
         self.rows.append(Row(f"linear in {argument}", self.linear_gap, allowed, self.linear_gap <= allowed))
 
