@@ -70,6 +70,7 @@ ONE_BY_ONE_UP_TO = 2000  # columns: a product for each may still be worth the co
 SHORT_AXIS = 8  # an axis of at most this length counts kinds of values, such as two species, and not places
 STENCIL_FROM = 256  # unknowns below which a guess saves nothing
 LARGEST_STENCIL = 64  # cells that a value may reach; more are not a stencil
+COLUMNS_AT_ONCE = 2**16  # whose links are computed at once
 MOST_DIFFERENCES = 4096  # a pattern with more is not a stencil
 MOST_TRIALS = 2_000_000  # products of a lattice vector and a difference, for each number of colours
 
@@ -351,8 +352,10 @@ class ColouredPattern:
 
     def _set_pattern(self, pattern, colours):
         """Store the pattern, and where each of its entries stands in the table of products (colour, row)."""
-        self.pattern = pattern
-        row = rows_of(pattern)
+        # Ones of one byte, and short indices: large patterns are kept beside their matrices.
+        ones = np.ones(pattern.nnz, dtype=np.int8)
+        self.pattern = sp.csr_array((ones, pattern.indices, pattern.indptr), shape=pattern.shape)
+        row = rows_of(pattern).astype(np.int32)
         colours = colours.astype(np.int32)
         if self.by_rows:
             self._places = colours[row], pattern.indices
@@ -393,11 +396,11 @@ def colour_columns(pattern: sp.csr_array, shapes: Shapes | None = None) -> NDArr
     fullest_row = int(np.diff(pattern.indptr).max(initial=min(size, 1)))
     if fullest_row >= size:
         return np.arange(size)
-    links = sp.csr_array(pattern.astype(np.int32))
-    links = sp.csr_array(links.T @ links + sp.eye_array(size, dtype=np.int32))  # every column is linked to itself
-    colours = _colour_by_lattice(links, field_indices(shapes or [(size,)]), fullest_row)
+    ones = sp.csr_array(pattern.astype(np.int32))
+    colours = _colour_by_lattice(ones, field_indices(shapes or [(size,)]), fullest_row)
     if colours.max() < 2 * fullest_row:
         return colours
+    links = sp.csr_array(ones.T @ ones + sp.eye_array(size, dtype=np.int32))  # every column is linked to itself
     return min(colours, colour_graph(links), key=np.max)
 
 
@@ -425,15 +428,15 @@ def field_indices(shapes: Shapes, starts: Sequence[Sequence[int]] | None = None)
     return np.vstack([field_number, np.hstack(indices)])
 
 
-def _colour_by_lattice(links, index, fullest_row):
+def _colour_by_lattice(ones, index, fullest_row):
     """Return (a . i) mod c with the smallest valid c for columns with the given indices, or a colour for each."""
-    differences = _index_differences(links, index)
+    differences = _index_differences(ones, index)
     if differences is not None:
         lattice = find_lattice(differences, fullest_row, 3 * fullest_row + 8)
         if lattice is not None:
             vector, count = lattice
             return (vector @ index) % count
-    return np.arange(links.shape[0])
+    return np.arange(ones.shape[1])
 
 
 def find_lattice(differences: NDArray[Any], smallest: int, end: int) -> tuple[NDArray[Any], int] | None:
@@ -466,20 +469,23 @@ def find_lattice(differences: NDArray[Any], smallest: int, end: int) -> tuple[ND
     return None
 
 
-def _index_differences(links, index):
-    """Return the different index differences of linked columns, shape (axes, many); None if there are too many.
+def _index_differences(ones, index):
+    """Return the different index differences of columns with a common row, shape (axes, many); None if too many.
 
     Of two opposite differences one is returned.
     """
-    row = rows_of(links)
-    is_upper = links.indices > row
     extent = np.max(index, axis=1, keepdims=True) + 1
     # Differences are numbered in a box of twice the extent, whose middle is the difference 0.
     box = tuple(2 * extent[:, 0])
     middle = np.ravel_multi_index(tuple(extent[:, 0]), box)
     number = np.ravel_multi_index(tuple(index), box)
     occurs = np.zeros(prod(box), dtype=bool)
-    occurs[number[links.indices[is_upper]] - number[row[is_upper]] + middle] = True
+    by_columns = ones.T.tocsr()
+    for first in range(0, ones.shape[1], COLUMNS_AT_ONCE):  # all links of a flow in 3-D at once take gigabytes
+        links = sp.csr_array(by_columns[first : first + COLUMNS_AT_ONCE] @ ones)
+        column = rows_of(links) + first
+        is_upper = links.indices > column
+        occurs[number[links.indices[is_upper]] - number[column[is_upper]] + middle] = True
     numbers = np.flatnonzero(occurs)
     if numbers.size > MOST_DIFFERENCES:
         return None

@@ -126,7 +126,9 @@ class Structure(Uncached):
         If the entries of A are unknown, it computes an estimate.
         """
         if self.has_entries:
-            return abs(self.explicit()).dot
+            matrix = self.explicit()
+            magnitudes = (np.abs(matrix.data), matrix.indices, matrix.indptr)  # the indices are shared, not copied
+            return sp.csr_array(magnitudes, shape=matrix.shape).dot
         # Estimate the row sums of abs(A) by the largest entry of A x over a few random vectors x of signs.
         largest = max(float(np.max(np.abs(self.product(x)), initial=0.0)) for x in probes(self.shape[1]))
 
