@@ -41,6 +41,7 @@ _PUBLIC_NAMES = {
     "advection.transport": "transport",
     "flow.finite_volumes": "conservation_law",
     "flow.shallow_water": "shallow_water",
+    "flow.free_faces": "free_faces",
     "flow.obstacles": "brinkman forces",
     "flow.pressure_projection": "projection",
     "flow.flow_step": "flow_step",

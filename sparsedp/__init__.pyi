@@ -15,6 +15,7 @@ from .autodiff.jit import jit as jit
 from .autodiff.tape import differentiable as differentiable
 from .flow.finite_volumes import conservation_law as conservation_law
 from .flow.flow_step import flow_step as flow_step
+from .flow.free_faces import free_faces as free_faces
 from .flow.momentum import convection as convection
 from .flow.momentum import face_laplacian as face_laplacian
 from .flow.momentum import face_lift as face_lift

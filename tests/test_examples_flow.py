@@ -91,6 +91,18 @@ def test_steady_states():
     assert len(heat) == 2
 
 
+@example("backward_step.py")
+def test_backward_step():
+    """8 cells a step height: close to the published lengths up to Re 500, where the layers are thick."""
+    printed = run("backward_step.py")
+    assert "0 folds, reached_stop" in printed
+    lengths = rows(printed, r"^ +(\d+) +(\S+) +(\S+) +\S+% +(\S+)$")
+    assert [row[0] for row in lengths] == [100, 200, 300, 400, 500, 600, 700, 800]
+    assert all(ours == pytest.approx(known, rel=0.02) for _, ours, known, _ in lengths[:5])
+    slopes = [row[3] for row in lengths]
+    assert slopes[1] == pytest.approx((lengths[2][1] - lengths[0][1]) / 200, rel=0.05)
+
+
 @example("room.py")
 def test_room():
     """Air that enters leaves, walls are closed, the gradient is right and lowers the loss."""

@@ -187,7 +187,7 @@ def interior(grid: Grid, solid: ArrayLike | None = None) -> Operator:
 
     See Also
     --------
-    mask
+    mask, free_faces
 
     Examples
     --------

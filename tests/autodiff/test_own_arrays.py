@@ -86,6 +86,7 @@ BUILDERS = {
     "lift": ((walls("pressure"),), lambda b: dp.lift(GRID, b), applied),
     "average": ((walls("pressure"),), lambda b: dp.average(GRID, b), applied),
     "flux": ((SOLID,), lambda s: dp.flux(GRID, s), applied),
+    "free_faces": ((SOLID,), lambda s: dp.free_faces(GRID, solid=s), applied),
     "interior": ((SOLID,), lambda s: dp.interior(GRID, s), applied),
     "mask": ((SOLID,), lambda s: dp.mask(GRID.cells, s), applied),
     "diagonal": ((CELLS,), lambda v: dp.diagonal(GRID.cells, v), applied),

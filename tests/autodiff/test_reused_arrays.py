@@ -24,6 +24,7 @@ from sparsedp.errors import DerivativeError
 ALONE = """
 animate average certified certify check component convergence curl diagonal dirichlet divergence errors explain
 face_laplacian flux face_lift free_slip from_blackbox from_functions from_linear_operator from_matrix grad
+continuation free_faces
 gradient harmonic_average hvp identity inflow interior jit jvp laplace laplacian lift mask matrix_exponential
 matrix_function matrix_power minimize neumann no_slip Operator outflow
 patch physical_gradient plot projection prolong report restrict robin sample set_threads smoothness stress

@@ -31,6 +31,7 @@ SMALL = {
     "convection.py": "32",
     "cylinder.py": "10",
     "steady_states.py": "24",
+    "backward_step.py": "8",
     "stiff_and_extreme.py": "8",
     "obstacle.py": "10",
     "shape.py": "12",
