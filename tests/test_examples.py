@@ -351,3 +351,18 @@ def test_helmholtz():
     assert int(re.search(r"GMRES .*: (\d+) iterations", printed)[1]) <= 40
     assert float(re.search(r"off Hankel's function: (\S+)%", printed)[1]) <= 5
     assert "gradient in 4096 speeds: agrees" in printed
+
+
+@example("curved_walls.py")
+def test_curved_walls():
+    """Order 2 for cut cells, 1 for a staircase; the charge to 0.5 % on 64^2 cells."""
+    printed = run("curved_walls.py")
+    errors = [
+        list(map(float, row)) for row in re.findall(r"^ +64 +(\S+) +(\S+)% +(\S+) +(\S+)$", printed, re.MULTILINE)
+    ]
+    orders = [float(order) for order in re.search(r"^order (.*)$", printed, re.MULTILINE)[1].split()]
+    assert errors[0][1] < 0.5 and errors[0][2] < 0.05 * errors[0][3]
+    assert min(orders[:3]) > 1.8 > 1.3 > orders[3]
+    assert "agrees" in printed
+    radius, exact = map(float, re.search(r"^radius (\S+), exact (\S+),", printed, re.MULTILINE).groups())
+    assert abs(radius / exact - 1) < 0.02

@@ -55,6 +55,7 @@ SMALL = {
     "room.py": "8",
     "pylops_exchange.py": "32",
     "pendulums.py": "10",
+    "curved_walls.py": "64",
 }  # cells, the end time, or gradients; the others run with 16
 NEEDS = {
     "torch_training.py": ["torch"],
