@@ -21,8 +21,9 @@ import pint
 
 from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.pytree import flatten, labels, leaves, paired
-from sparsedp._utils.validation import check_function, check_number, check_whole
+from sparsedp._utils.validation import check_finite, check_function, check_number, check_whole
 from sparsedp.autodiff.derivative import value_and_grad
+from sparsedp.autodiff.tape import is_variable
 from sparsedp.errors import DerivativeError
 
 if TYPE_CHECKING:
@@ -58,7 +59,8 @@ def with_units(function: Callable, arguments: Sequence[Any], result: Any) -> Sce
     Raises
     ------
     TypeError
-        If `function` is not callable, or `arguments` is no tuple. On use, if an argument is missing or has no units.
+        If `function` is not callable, or `arguments` is no tuple. On use, if an argument is missing, has no unit, or
+        has one that is declared as None.
     ValueError
         If pint does not know a unit, or it has an offset. On use, if the dimension of an argument is another one.
 
@@ -129,12 +131,16 @@ class DimensionCheck:
     @property
     def passed(self) -> bool:
         """Return whether the scene gives the same result in all systems of units."""
-        return not any(self._differs(run) for run in self.runs)
+        return self.verdict == "homogeneous"
 
     @property
     def verdict(self) -> str:
-        """Return "homogeneous" or "not homogeneous"."""
-        return "homogeneous" if self.passed else "not homogeneous"
+        """Return "homogeneous", "not homogeneous", or "inconclusive" for a result that is 0 everywhere."""
+        if any(self._differs(run) for run in self.runs):
+            return "not homogeneous"
+        if self.runs and not any(np.isfinite(run.found) for run in self.runs):
+            return "inconclusive"
+        return "homogeneous"
 
     def _differs(self, run: ScaledRun) -> bool:
         return bool(run.failure) or not run.deviation <= self.rtol
@@ -229,6 +235,9 @@ class SceneWithUnits(Reconstructible):
         magnitudes = self._magnitudes(args)
         value = self.function(*magnitudes)
         names = self._names_of_result(value)
+        for place, leaf in zip(labels(value, "result"), leaves(value), strict=True):
+            if is_variable(leaf):
+                check_finite(f"{place} of {self.name}", leaf)
         dimensions = sorted({dimension for unit in self._units.values() for dimension in unit.exponents})
         runs: list[ScaledRun] = []
         for dimension in dimensions:
@@ -267,11 +276,11 @@ class SceneWithUnits(Reconstructible):
 
     def _names(self, argument: Any, number: int) -> list:
         """Return the unit of each leaf of an argument."""
-        place = f"argument {number}"
+        place = f"units of argument {number}"
         return paired(self.arguments[number], argument, place, prefix=_is_unit, error=TypeError)
 
     def _names_of_result(self, value: Any) -> list:
-        return paired(self.result, value, "result", prefix=_is_unit, error=TypeError)
+        return paired(self.result, value, "units of the result", prefix=_is_unit, error=TypeError)
 
     def _magnitudes(self, args: tuple) -> list:
         """Return the arguments as plain arrays in base units."""
@@ -296,9 +305,11 @@ class SceneWithUnits(Reconstructible):
             )
         given = self._registry.Quantity(leaf.magnitude, str(leaf.units))  # it may belong to another registry
         if name is None:
-            wanted = Unit("no unit", 1.0, "", {})
-        else:
-            wanted = self._units[name]
+            raise TypeError(
+                f"{place} of {self.name} must have no unit, as declared by None, got {given.units}; declare its unit, "
+                "or give its magnitude"
+            )
+        wanted = self._units[name]
         if _exponents(given) != wanted.exponents:
             raise ValueError(
                 f"{place} of {self.name} must have a unit like {wanted.name}, got {given.units}; convert it, or "

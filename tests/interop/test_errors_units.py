@@ -49,6 +49,22 @@ TABLE = [
         "argument 1 of with_units(area) must have a unit like m, got second; convert it, or declare another unit",
     ),
     (
+        lambda: with_units(area, ("m", None), "m")(Q(1.0, "m"), Q(2, "s")),
+        TypeError,
+        "argument 1 of with_units(area) must have no unit, as declared by None, got second; declare its unit, or give "
+        "its magnitude",
+    ),
+    (
+        lambda: with_units(lambda p: p["a"], ({"a": "m", "b": "m"},), "m")({"a": Q(1.0, "m")}),
+        TypeError,
+        "units of argument 0: unknown key 'b'; expected 'a'",
+    ),
+    (
+        lambda: with_units(lambda a: a, ("m",), "m").check(Q(float("nan"), "m")),
+        dp.errors.NonFiniteError,
+        "result of with_units(<lambda>) must be finite, got nan; write a finite number",
+    ),
+    (
         lambda: with_units(area, ("m", "m"), None).value_and_grad(Q(1.0, "m"), Q(1.0, "m")),
         DerivativeError,
         "with_units(area) needs one number with one unit as its result, to have a gradient",

@@ -83,6 +83,12 @@ def test_a_number_with_a_dimension_is_found():
     assert report.runs[0].failure == "ValueError: too high" and not report.passed
 
 
+def test_a_result_of_zero_shows_nothing():
+    scene = dp.interop.with_units(lambda h: 0.0 * h, ("m",), "s")
+    report = scene.check(Q(3.0, "m"))
+    assert report.verdict == "inconclusive" and not report.passed
+
+
 def test_scenes_on_a_grid():
     """Solves and steps are homogeneous if their sizes are arguments; a fixed floor of error control is not."""
 

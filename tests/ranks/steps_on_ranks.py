@@ -138,8 +138,9 @@ def steps_of_arrays():
         words = f"{name}) does not work on a field on ranks; write dp.gather(u) for the whole array"
         refused(TypeError, words, lambda make=make, u=u, grid=grid: make(grid)(u, 0.7))
     grid = dp.distribute(PLAIN, COMM)
-    words = "stepper(radau) does not work on a field on ranks"
-    refused(TypeError, words, lambda: rates("radau")(grid)(np.ones(PLAIN.shape), 0.7))
+    for method in ("radau", "rodas5p"):
+        words = f"stepper({method}) does not work on a field on ranks"
+        refused(TypeError, words, lambda method=method: rates(method)(grid)(np.ones(PLAIN.shape), 0.7))
 
 
 def intermediate_states():
