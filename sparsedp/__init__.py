@@ -46,7 +46,7 @@ _PUBLIC_NAMES = {
     "flow.pressure_projection": "projection",
     "flow.flow_step": "flow_step",
     "integrators.stepper": "stepper",
-    "integrators.leapfrog": "sponge",
+    "integrators.leapfrog": "matched_layer sponge",
     "trajectory.rollout": "rollout",
     "optimize.update_direction": "update_direction",
     "optimize.constraints": "equal",

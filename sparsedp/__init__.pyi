@@ -33,6 +33,7 @@ from .grid.boundary_conditions import patch as patch
 from .grid.boundary_conditions import robin as robin
 from .grid.grid import Grid as Grid
 from .grid.space import Space as Space
+from .integrators.leapfrog import matched_layer as matched_layer
 from .integrators.leapfrog import sponge as sponge
 from .integrators.stepper import stepper as stepper
 from .interop.blackbox import from_blackbox as from_blackbox

@@ -358,6 +358,36 @@ TABLE = [
         "sponge needs a number of cells or a pair for axes of ['x'], got {'y': (2, 2)}",
     ),
     (
+        lambda: dp.matched_layer(LINE, {"y": (2, 2)}, 1.0),
+        VALUE,
+        "matched_layer needs a number of cells or a pair for axes of ['x'], got {'y': (2, 2)}",
+    ),
+    (
+        lambda: dp.matched_layer(LINE, 5, 1.0),
+        VALUE,
+        "matched_layer on x needs 0 to 4 cells, got 5",
+    ),
+    (
+        lambda: dp.matched_layer(LINE, 2, 0),
+        VALUE,
+        "speed of matched_layer must be > 0, got 0; give the speed of the fastest waves",
+    ),
+    (
+        lambda: dp.matched_layer(LINE, 2, 1.0, echo=2.0),
+        VALUE,
+        "echo of matched_layer must be between 0 and 1, got 2; the default is 1e-8",
+    ),
+    (
+        lambda: dp.matched_layer(LINE, 2, 1.0).coefficients(0.0),
+        VALUE,
+        "omega of a matched layer must be one finite number, not 0, got 0.0",
+    ),
+    (
+        lambda: dp.matched_layer(LINE, 2, 1.0).coefficients([1.0, 2.0]),
+        VALUE,
+        "omega of a matched layer must be one finite number, not 0, got [1.0, 2.0]",
+    ),
+    (
         lambda: dp.sponge(LINE, 5, 1.0),
         VALUE,
         "sponge on x needs 0 to 4 cells, got 5",

@@ -27,12 +27,15 @@ K. S. Yee, IEEE Trans. Antennas Propag. 14 (1966) 302-307 (the scheme); J.-P. Be
 
 from __future__ import annotations
 
+from functools import reduce
 from math import log
+from operator import mul as multiply
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.sparse.linalg import ArpackError, LinearOperator, eigs
 
+from sparsedp._utils.base_classes import Value
 from sparsedp._utils.pytree import flatten, is_uniform, leaves, mapped, paired
 from sparsedp._utils.validation import check_function, check_number, is_whole, number_beside, rounded_down
 from sparsedp.autodiff.backend import replicated
@@ -47,13 +50,13 @@ from sparsedp.integrators.runge_kutta import Scheme
 from sparsedp.solvers.cache import Cache
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     import numpy.typing as npt
 
     from sparsedp.grid.grid import Grid
 
-__all__ = ["Leapfrog", "sponge"]
+__all__ = ["Leapfrog", "MatchedLayer", "matched_layer", "sponge"]
 
 # Number of products and tolerance of Arnoldi's method. The error of (h w)^2 is 0.4 % on 300^2 cells, at most 2 %.
 PRODUCTS = 20
@@ -61,6 +64,7 @@ EIGENVALUE_TOLERANCE = 0.1
 SLACK = 1e-3  # relative excess of (h w)^2 over the stability limit above which an error is raised
 SAFE = 0.98  # fraction of the largest stable dt that the error message recommends
 POWER = 2  # the rate in a sponge grows with this power of the depth; of 1 to 4 it had the least echo for echo=1e-3
+MATCHED_POWER = 3  # of a matched layer; of 2 to 4 it had the least echo for 8 to 20 cells and echo=1e-8
 
 
 def _check_damping(*rates):
@@ -210,7 +214,7 @@ def sponge(
 
     See Also
     --------
-    stepper
+    matched_layer, stepper
 
     Notes
     -----
@@ -230,34 +234,180 @@ def sponge(
     >>> inside.round(3)
     array([0.   , 0.   , 0.   , 0.   , 0.216, 1.943])
     """
-    check_grid("sponge", grid)
-    check_number("speed of sponge", speed, "> 0", "; give the speed of the fastest waves")
-    check_number("echo of sponge", echo, "between 0 and 1", "; the default is 1e-3")
-    bounded = [name for name, periodic in zip(grid.axes, grid.periodic, strict=True) if not periodic]
-    depths: dict[str, Any] = dict(cells) if isinstance(cells, dict) else dict.fromkeys(bounded, cells)
-    if set(depths) - set(bounded) or any(np.shape(deep) not in ((), (2,)) for deep in depths.values()):
-        raise ValueError(f"sponge needs a number of cells or a pair for axes of {bounded}, got {cells!r}")
+    rate = _rates("sponge", grid, cells, speed, echo, "1e-3", POWER)
 
     def rates(places: Any) -> np.ndarray:
         """Return the rates at places, given as a list with the coordinates along each axis."""
-        total: Any = 0
-        for axis, name in enumerate(grid.axes):
-            for is_upper, count in enumerate(np.broadcast_to(depths.get(name, 0), 2)):
-                shape = _rate(grid, axis, is_upper, count, places[axis])
-                total = total + shape * (POWER + 1) / 2 * speed * log(1 / echo)
-        return total
+        return sum(rate(axis, places[axis]) for axis in range(grid.dim))
 
     return rates(grid.centres()), grid.join(*(rates(grid.face_centres(axis)) for axis in range(grid.dim)))
 
 
-def _rate(grid: Grid, axis: int, is_upper: int, count: Any, x: Any) -> np.ndarray:
-    """Return (depth / width)^POWER / width at the places x along an axis."""
+def matched_layer(grid: Grid, cells: int | Mapping[str, Any], speed: float, echo: float = 1e-8) -> MatchedLayer:
+    """Return perfectly matched layers at the ends of a grid, which absorb waves of every direction.
+
+    Parameters
+    ----------
+    grid : Grid
+    cells : int, or dict
+        Thickness of the layers in cells, as for `sponge`; at least eight.
+    speed : float
+        Largest speed of the waves in the layers [length / time].
+    echo : float
+        Ratio of the amplitude of a wave that leaves a layer, after reflection at the wall, to the amplitude of the wave
+        that entered it at a right angle. At an angle a from the normal it is ``echo**cos(a)``, in the limit of small
+        cells.
+
+    Returns
+    -------
+    MatchedLayer
+        ``layer.damping`` for waves in time, ``layer.coefficients(omega)`` for waves of one frequency.
+
+    Raises
+    ------
+    ValueError
+        If a layer is thicker than its axis, if `cells` names a periodic axis, or if speed or echo is out of range.
+
+    See Also
+    --------
+    sponge, stepper, elliptic_solver
+
+    Notes
+    -----
+    A rate s(x) grows with the cube of the depth: s = 2 c log(1 / echo) (depth / width)^3 / width. Lengths across the
+    layer are stretched by the complex number 1 + i s / omega for waves exp(-i omega t). So a wave decays in the layer
+    and is not reflected, whatever its direction. In time this is equivalent to Berenger's split field: each axis has
+    its own part of the pressure, damped at the rate of this axis.
+
+    Measured at ten cells a wavelength, the largest reflection of plane waves up to 60 degrees from the normal is 1.3e-4
+    for 8 cells and 9e-5 for 10 to 20 cells.
+
+    References
+    ----------
+    J.-P. Berenger, J. Comput. Phys. 114 (1994) 185-200; W. C. Chew, W. H. Weedon, Microw. Opt. Technol. Lett. 7 (1994)
+    599-604 (complex stretched coordinates).
+
+    Examples
+    --------
+    Waves of the frequency 0.6 from a point, on a line. Their amplitude does not change until they reach a layer:
+
+    >>> from sparsedp import Grid, dirichlet, divergence, elliptic_solver, gradient
+    >>> grid = Grid(60)
+    >>> in_cells, on_faces = matched_layer(grid, 10, speed=1.0).coefficients(0.6)
+    >>> solve = elliptic_solver(divergence(grid), gradient(grid, dirichlet))
+    >>> u = solve(on_faces, in_cells * np.eye(60)[30], -(0.6**2) * in_cells)
+    >>> np.abs(u[[12, 20, 40, 48]]).round(3)
+    array([0.874, 0.874, 0.874, 0.874])
+    """
+    rate = _rates("matched_layer", grid, cells, speed, echo, "1e-8", MATCHED_POWER)
+    axes = range(grid.dim)
+    in_cells = tuple(rate(axis, grid.centres()[axis]) for axis in axes)
+    on_faces = tuple(tuple(rate(axis, grid.face_centres(normal)[axis]) for axis in axes) for normal in axes)
+    return MatchedLayer(grid, in_cells, on_faces)
+
+
+class MatchedLayer(Value):
+    """Perfectly matched layers of a grid; see `matched_layer`.
+
+    Parameters
+    ----------
+    grid : Grid
+    in_cells : tuple of arrays of grid.shape
+        Rates [1 / time] of each axis in the cells.
+    on_faces : tuple of tuples of arrays
+        ``on_faces[normal][axis]``: the rates of an axis on the faces perpendicular to `normal`.
+    """
+
+    grid: Grid
+    in_cells: tuple[npt.NDArray, ...]
+    on_faces: tuple[tuple[npt.NDArray, ...], ...]
+
+    def __init__(self, grid: Grid, in_cells: tuple, on_faces: tuple) -> None:
+        super().__init__(grid=grid, in_cells=in_cells, on_faces=on_faces)
+
+    @property
+    def _key(self):
+        return self.grid, tuple(rates.tobytes() for rates in self.in_cells)
+
+    @property
+    def damping(self) -> tuple[tuple[npt.NDArray, ...], npt.NDArray]:
+        """The argument `damping` of ``stepper("leapfrog", ...)`` for the state ((p_x, p_y, ...), v).
+
+        The pressure is the sum of its parts, one for each axis: p_x changes with ``divergence(grid, axis="x")`` of v.
+        v is the velocity on the faces.
+        """
+        normal = (rates[axis] for axis, rates in enumerate(self.on_faces))
+        return self.in_cells, self.grid.join(*normal)
+
+    def coefficients(self, omega: Any) -> tuple[Any, Any]:
+        """Return the coefficients (in_cells, on_faces) of waves exp(-i omega t), complex fields on cells and faces.
+
+        In ``elliptic_solver(D, G)`` multiply k by `on_faces`, and shift and b by `in_cells`. A source in a layer has no
+        meaning.
+
+        Parameters
+        ----------
+        omega : number
+            Angular frequency [1 / time], not 0. Differentiable.
+
+        Returns
+        -------
+        in_cells : complex array of grid.shape
+            The product of the stretches of all axes.
+        on_faces : complex array of grid.faces.shape
+            The same on faces, divided by the square of the stretch across the face.
+        """
+        check_values(_check_frequency, omega)
+
+        def product(rates: Any) -> Any:
+            return reduce(multiply, [1 + 1j * rate / omega for rate in rates])
+
+        on_faces = [
+            product(rates) / (1 + 1j * rates[normal] / omega) ** 2 for normal, rates in enumerate(self.on_faces)
+        ]
+        return product(self.in_cells), self.grid.join(*on_faces)
+
+    def __repr__(self) -> str:
+        return f"<matched_layer on {self.grid}>"
+
+
+def _check_frequency(omega):
+    """Raise ValueError for a frequency that is not one finite number other than 0."""
+    if np.ndim(omega) or np.asarray(omega).dtype.kind not in "iufc" or not np.isfinite(omega) or omega == 0:
+        raise ValueError(f"omega of a matched layer must be one finite number, not 0, got {omega!r}")
+
+
+def _rates(name: str, grid: Grid, cells: Any, speed: float, echo: float, usual: str, power: int) -> Callable:
+    """Return the function ``rate(axis, x)`` of the damping rates of an axis at the coordinates x along it.
+
+    The rates grow with a power of the depth in the layer; `name` is the caller and `usual` its default echo.
+    """
+    check_grid(name, grid)
+    check_number(f"speed of {name}", speed, "> 0", "; give the speed of the fastest waves")
+    check_number(f"echo of {name}", echo, "between 0 and 1", f"; the default is {usual}")
+    bounded = [axis for axis, periodic in zip(grid.axes, grid.periodic, strict=True) if not periodic]
+    depths: dict[str, Any] = dict(cells) if isinstance(cells, dict) else dict.fromkeys(bounded, cells)
+    if set(depths) - set(bounded) or any(np.shape(deep) not in ((), (2,)) for deep in depths.values()):
+        raise ValueError(f"{name} needs a number of cells or a pair for axes of {bounded}, got {cells!r}")
+
+    def rate(axis: int, x: Any) -> Any:
+        total: Any = 0.0 * x
+        for is_upper, count in enumerate(np.broadcast_to(depths.get(grid.axes[axis], 0), 2)):
+            shape = _rate(name, grid, axis, is_upper, count, x, power)
+            total = total + shape * (power + 1) / 2 * speed * log(1 / echo)
+        return total
+
+    return rate
+
+
+def _rate(name: str, grid: Grid, axis: int, is_upper: int, count: Any, x: Any, power: int) -> np.ndarray:
+    """Return (depth / width)^power / width at the places x along an axis."""
     widths = grid.widths[axis]
     if not (is_whole(count, 0) and count <= widths.size):
-        raise ValueError(f"sponge on {AXES[axis]} needs 0 to {widths.size} cells, got {count}")
+        raise ValueError(f"{name} on {AXES[axis]} needs 0 to {widths.size} cells, got {count}")
     count = int(count)  # `is_whole` also accepts floats such as 2.0
     width = np.inf
     if count:
         width = np.sum(widths[-count:] if is_upper else widths[:count])
     wall = grid.origin[axis] + is_upper * np.sum(widths)
-    return np.maximum(1 - np.abs(x - wall) / width, 0.0) ** POWER / width
+    return np.maximum(1 - np.abs(x - wall) / width, 0.0) ** power / width

@@ -194,7 +194,7 @@ def stepper(
 
     See Also
     --------
-    implicit, matrix_exponential, conservation_law, sponge, rollout
+    implicit, matrix_exponential, conservation_law, sponge, matched_layer, rollout
 
     Notes
     -----

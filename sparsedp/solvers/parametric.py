@@ -232,7 +232,8 @@ def elliptic_solver(
     derivatives are projected, never refused.
 
     **Helmholtz.** The shift is negative, -(omega / c)^2. Its imaginary part damps waves, and absorbs them where it
-    grows towards the walls.
+    grows towards the walls. `matched_layer` returns coefficients that absorb waves of all directions; ``order=4`` of
+    `gradient` and `divergence` keeps the phase of waves of ten cells.
 
     **Tensors.** The discretisation is of order 2. Where G has no slope (a closed wall, an obstacle) the flux is 0, not
     the slope; see operators/tensor.py.

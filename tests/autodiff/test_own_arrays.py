@@ -262,7 +262,7 @@ def test_arrays_may_be_reused(name):
 
 def test_every_builder_is_here():
     """The others are built of no arrays (a LinearOperator and functions are used as they are), or build nothing."""
-    unbuilt = "brinkman equal "
+    unbuilt = "brinkman equal matched_layer "
     unbuilt += (
         "sponge identity divergence curl upwind component prolong harmonic_average from_functions from_linear_operator"
     )

@@ -26,7 +26,7 @@ animate average certified certify check component convergence curl diagonal diri
 face_laplacian flux face_lift free_slip from_blackbox from_functions from_linear_operator from_matrix grad
 continuation free_faces
 gradient harmonic_average hvp identity inflow interior jit jvp laplace laplacian lift mask matrix_exponential
-matrix_function matrix_power minimize neumann no_slip Operator outflow
+matched_layer matrix_function matrix_power minimize neumann no_slip Operator outflow
 patch physical_gradient plot projection prolong report restrict robin sample set_threads smoothness stress
 brinkman cut_cells distribute equal flatten gather interop total_variation update_direction upwind v_curve
 value_and_grad vjp work_precision eigenpairs from_image load save testing

@@ -347,6 +347,7 @@ NOTHING_TO_CALL = {
     "jvp",
     "hvp",
     "sponge",
+    "matched_layer",
     "steady",
     "continuation",
     "distribute",
