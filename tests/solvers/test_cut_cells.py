@@ -46,6 +46,7 @@ def test_planes_are_exact(dim):
         assert np.allclose(body.volumes * body.divergence(constant), body.areas * body.normals[axis], atol=1e-15)
 
 
+@pytest.mark.whole
 def test_volumes_of_a_wedge_and_of_a_ball():
     corner = dp.cut_cells(dp.Grid((3, 3, 3)), lambda x, y, z: x + y + z - 7.5)  # the corner of a cell: 1.5^3 / 6
     assert np.isclose(np.sum(corner.volumes), 1.5**3 / 6, rtol=1e-14)
@@ -60,7 +61,7 @@ def test_volumes_of_a_wedge_and_of_a_ball():
 
 
 @pytest.mark.parametrize("condition", CONDITIONS, ids=repr)
-@pytest.mark.parametrize("dim", [1, 2, 3])
+@pytest.mark.parametrize("dim", [1, 2, pytest.param(3, marks=pytest.mark.whole)])
 def test_linear_solutions_are_exact(dim, condition):
     grid = dp.Grid((6, 5, 4)[:dim], size=(1.1, 0.9, 0.8)[:dim], periodic=(False, True, True)[:dim])
     body = dp.cut_cells(grid, lambda x, *_: 0.47 - x, {"x": dp.dirichlet}, condition)
@@ -75,7 +76,7 @@ def test_linear_solutions_are_exact(dim, condition):
 
 
 @pytest.mark.parametrize("condition", CONDITIONS, ids=repr)
-@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("dim", [2, pytest.param(3, marks=pytest.mark.whole)])
 def test_slopes_of_linear_fields_are_exact_at_walls_of_any_direction(dim, condition):
     grid = dp.Grid((8, 9, 7)[:dim], size=(1.1, 0.9, 0.8)[:dim])
     level, normal, _ = plane(dim)
@@ -89,6 +90,7 @@ def test_slopes_of_linear_fields_are_exact_at_walls_of_any_direction(dim, condit
     assert np.all(errors[inside][body.areas[inside] > 0] < 1e-7)
 
 
+@pytest.mark.whole
 def test_limits_are_the_plain_solver():
     box = (abs(GRID.centres()[0] - 0.5) < 0.2) & (abs(GRID.centres()[1] - 0.45) < 0.2)
     x, y = (GRID.coordinates(axis, "nodes") for axis in (0, 1))
@@ -111,6 +113,7 @@ def test_limits_are_the_plain_solver():
     assert nothing.solve(np.ones((0, 2))).shape == (0, 2)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("condition", CONDITIONS, ids=repr)
 def test_tiny_cells_change_nothing(condition):
     """Slivers, and a pocket of fluid around one node."""
@@ -128,6 +131,7 @@ def test_tiny_cells_change_nothing(condition):
         assert np.allclose(body.solve(np.zeros(grid.shape), 0.7)[body.is_fluid], 0.7)
 
 
+@pytest.mark.whole
 def test_steps_are_not_limited_by_small_cells():
     body = dp.cut_cells(GRID, lambda x, y: hypot(x - 0.5, y - 0.45) - 0.2, dp.dirichlet, dp.robin(1.0, 0.3))
     assert np.min(body.fractions[body.is_fluid]) < 0.1
@@ -137,6 +141,7 @@ def test_steps_are_not_limited_by_small_cells():
     assert np.allclose(body.laplacian(u), body.diffusion(u), atol=1e-11)
 
 
+@pytest.mark.whole
 def test_periodic_sides_have_no_seam():
     grid = dp.Grid((8, 6), size=1.0, periodic=True)
     x, y = np.meshgrid(*(grid.coordinates(axis, "nodes") for axis in (0, 1)), indexing="ij")
@@ -147,6 +152,7 @@ def test_periodic_sides_have_no_seam():
     assert np.allclose(np.roll(u, 3, 0), shifted, rtol=1e-9)
 
 
+@pytest.mark.whole
 def test_dtypes_batches_and_coefficients():
     body = dp.cut_cells(GRID, lambda x, y: hypot(x - 0.5, y - 0.45) - 0.2, dp.dirichlet, dp.dirichlet)
     u = body.solve(ONES)
@@ -197,7 +203,7 @@ def test_derivatives_agree_with_differences():
     assert np.isclose((4 * differences[0] - differences[1]) / 3, exact, rtol=1e-7)
 
 
-@pytest.mark.whole
+@pytest.mark.slow
 @pytest.mark.parametrize("condition", CONDITIONS, ids=repr)
 @pytest.mark.parametrize("dim", [1, 2])
 def test_first_and_second_derivatives(dim, condition):
@@ -217,6 +223,7 @@ def test_derivatives_in_three_dimensions():
     assert np.allclose(value, (slope(q + h * direction) - slope(q - h * direction)) / (2 * h), rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.whole
 def test_the_level_on_a_grid_line_has_the_derivative_of_the_fluid_side():
     grid = dp.Grid(6, size=1.0)
 
@@ -338,6 +345,7 @@ def test_projection_around_a_body():
         dp.cut_cells(GRID, np.ones(GRID.nodes.shape), dp.dirichlet, dp.dirichlet).project(np.ones(GRID.faces.size))
 
 
+@pytest.mark.whole
 def test_explicit_transport_with_small_cells_is_stable_and_conservative():
     grid, body, entering, _ = stream(32)
     assert np.min(body.fractions[body.is_fluid]) < 0.02
@@ -358,6 +366,7 @@ def test_explicit_transport_with_small_cells_is_stable_and_conservative():
     assert np.isclose(np.sum(body.volumes * body.redistribute(rate)), np.sum(body.volumes * rate), atol=1e-14)
 
 
+@pytest.mark.whole
 def test_derivatives_of_flows_around_a_body():
     grid = dp.Grid((7, 6), size=(1.1, 0.9))
     u, w = np.random.default_rng(0).standard_normal((2, *grid.shape))
