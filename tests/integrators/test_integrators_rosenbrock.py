@@ -61,6 +61,7 @@ def angle(x, count=1, **options):
     return dp.rollout(step, ({"a": x[0], "s": 0.0}, x[3]), {"g": x[1], "T": x[2]}, count)[0]["a"]
 
 
+@pytest.mark.whole
 def test_order_five():
     """On a smooth problem that depends on the time; the continuous output has order 4 in a step."""
     exact = pendulum_by_scipy(*X)
@@ -142,6 +143,7 @@ def test_the_backward_pass_is_the_transpose(tolerance):
         assert slopes == pytest.approx(differences, rel=1e-8)
 
 
+@pytest.mark.whole
 def test_second_derivatives_in_everything():
     loss = lambda x: angle(x, 2)
     tangent = np.array([0.3, 0.5, -0.2, 0.1])
@@ -207,13 +209,14 @@ def mean_square(s):
     return anp.mean(s["u"] ** 2)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     "options",
     [
         {},
-        pytest.param({"jacobian": jacobian}, marks=pytest.mark.whole),
-        pytest.param({"sparsity": jacobian(START, PARAMS)}, marks=pytest.mark.whole),
-        pytest.param({"solver": "krylov"}, marks=pytest.mark.whole),
+        {"jacobian": jacobian},
+        {"sparsity": jacobian(START, PARAMS)},
+        {"solver": "krylov"},
     ],
 )
 def test_reactions_on_a_grid(options):
@@ -271,6 +274,7 @@ def test_floors_of_a_tree_after_a_rejected_step(method):
     assert np.array([end[name] for name in names]) == pytest.approx(other(np.array([1.0, 0, 0]), RATES), rel=1e-12)
 
 
+@pytest.mark.whole
 def test_other_jacobians_are_refused():
     wrong = dp.stepper("rodas5p", brusselator, 0.1, jacobian=lambda s, p: sp.eye_array(2 * L.shape[0]))
     with pytest.raises(DerivativeError, match=r"the jacobian given for stepper\(rodas5p\) differs from the derivative"):
