@@ -606,6 +606,8 @@ class FlowStep(Reconstructible):
         density = self._density(lambda: (s,), params, dtype)
         if np.shape(sample(density)) == ():
             return density
+        if not self.grid.cells.size:  # faces without cells have no density
+            return 1.0
         return self._to_faces(density)
 
     def _advance_scalars(self, state: dict[str, Any], params: Any, dt: Any) -> dict[str, Any]:

@@ -82,6 +82,8 @@ class WeightedProjection:
             )
         check_kind("the density of projection", dtype_of(value), "real numbers", "; write its .real")
         check_values(_check_density, value)
+        if not grid.cells.size:
+            return 1.0
         if shape == grid.cells.shape:
             value = self._to_faces(value)
         return cast(value, dtype)

@@ -22,7 +22,7 @@ import numpy as np
 from sparsedp._utils.pytree import mapped
 from sparsedp._utils.validation import check_finite, check_kind, check_number, check_on, place
 from sparsedp.autodiff.program_trace import check_values, sample
-from sparsedp.autodiff.tape import cast, dtype_of
+from sparsedp.autodiff.tape import cast, dtype_of, isbox
 from sparsedp.autodiff.tape_constants import frozen
 from sparsedp.flow.diffusion import check_stable, spectral_bound
 from sparsedp.flow.settings import takes_params_alone
@@ -96,6 +96,8 @@ class Coefficient:
 
     def __init__(self, name: str, given: Any, settings: FlowSettings, needs: str) -> None:
         self.name = name
+        if not callable(given):
+            given = _as_field(given)
         self._given = given
         self._cells = settings.grid.cells
         self._needs = needs
@@ -112,7 +114,7 @@ class Coefficient:
             ``fields()`` returns the first arguments of a function of fields.
         params : tree
         dtype : dtype
-            Dtype of the flow, which the result has if it is an array.
+            Dtype of the flow. A result that is an array has the same precision.
         """
         value = self._given
         if callable(value):
@@ -120,10 +122,11 @@ class Coefficient:
                 value = value(*mapped(frozen, fields()), params)
             else:
                 value = value(params)
+            value = _as_field(value)
             self._check(value)
         if np.shape(sample(value)) == ():
             return value
-        return cast(value, dtype)
+        return cast(value, np.empty(0, dtype).real.dtype)
 
     def _check(self, value: Any) -> None:
         if np.shape(sample(value)) != ():
@@ -142,6 +145,13 @@ class Coefficient:
         if np.any(bad):
             cell = place(int(np.argmax(bad)), np.shape(value))
             raise ValueError(f"{name} must be {self._needs}, got {value[cell]:.6g} in cell {cell}")
+
+
+def _as_field(value: Any) -> Any:
+    """Return a value that is neither traced nor a number as an array."""
+    if isbox(value) or np.ndim(value) == 0:
+        return value
+    return np.asarray(value)
 
 
 def is_constant(coefficient: Any, settings: FlowSettings) -> bool:
@@ -229,7 +239,7 @@ class VariableDiffusion:
                 laplacian_of_u = laplacian_of_u + part
             term = k * laplacian_of_u
         else:
-            at_sites = cast(self.form.at_sites(k), dtype_of(u))
+            at_sites = cast(self.form.at_sites(k), dtype_of(k))
             check_values(self._check_field, k, at_sites, dt, 1.0 if density is None else density)
             term = self.form.flux_divergence(at_sites, u, walls)
         if density is not None:

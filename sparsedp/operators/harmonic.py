@@ -94,7 +94,8 @@ def lower_share(grid: Grid, axis: int) -> NDArray:
     high = adjacent_cell(grid, axis, True).matrix @ grid.widths[axis]
     shape = [1] * grid.dim
     shape[axis] = -1
-    return (low / (low + high)).reshape(shape)
+    both = low + high
+    return np.divide(low, both, out=np.zeros_like(low), where=both > 0).reshape(shape)  # 0: an axis without cells
 
 
 def harmonic_pair(share: NDArray) -> Callable[[Any, Any], Any]:

@@ -146,3 +146,24 @@ def test_refused_densities(density, error, message):
     with pytest.raises(error) as caught:
         dp.projection(dp.Grid((4, 4)))(np.ones(40), density)
     assert str(caught.value) == message
+
+
+RANKS = {
+    "a viscosity that varies in flow_step": lambda: media(viscosity=lambda rate, p: 0.1 * rate),
+    "a diffusivity that varies in flow_step": lambda: media(scalars={"c": {"diffusivity": lambda s, p: 0.1 * s["c"]}}),
+    "density in flow_step": lambda: media(density=2.0),
+    "density in projection": lambda: dp.projection(dp.Grid((4, 4)))(np.ones(40), 2.0),
+}
+
+
+@pytest.mark.parametrize("name", RANKS)
+def test_what_is_refused_on_ranks(name, monkeypatch):
+    """These ask the backend of the grid, which refuses their names on ranks."""
+
+    def check(self, asked):
+        if asked == name:
+            raise TypeError(f"{asked} does not work on ranks yet")
+
+    monkeypatch.setattr(type(dp.Grid((4, 4)).backend), "check", check)
+    with pytest.raises(TypeError, match=name):
+        RANKS[name]()

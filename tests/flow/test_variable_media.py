@@ -251,6 +251,38 @@ def test_single_precision():
         assert end["v"].dtype == end["p"].dtype == end["s"]["c"].dtype == np.float32
 
 
+def test_lists_and_complex_velocities(rng):
+    """A list is an array; a complex velocity keeps its imaginary part."""
+    grid = dp.Grid((3, 3))
+    v = rng.standard_normal(grid.faces.size)
+    listed, array = (dp.flow_step(grid, 0.01, mu, convective=False) for mu in ([[0.1] * 3] * 3, np.full((3, 3), 0.1)))
+    plain = array(array.start(v))["v"]
+    np.testing.assert_array_equal(listed(listed.start(v))["v"], plain)
+    np.testing.assert_allclose(array(array.start(1j * v))["v"], 1j * plain, rtol=1e-14, atol=1e-15)
+
+
+@pytest.mark.parametrize("shape", [(0, 3), (1, 1)])
+def test_no_cells_and_one_cell(shape):
+    grid = dp.Grid(shape)
+    media = np.ones(shape)
+    step = dp.flow_step(grid, 0.1, media, density=media, implicit=True)
+    assert np.all(step(step.start(np.ones(grid.faces.size)))["v"] == 0)
+
+
+def test_large_ratios(rng):
+    """Viscosities and densities that differ by 12 and 8 orders of magnitude: no energy from nothing, no divergence."""
+    grid = dp.Grid((8, 8), size=1.0)
+    viscosity = 10.0 ** rng.uniform(-6, 6, grid.shape)
+    density = 10.0 ** rng.uniform(-4, 4, grid.shape)
+    step = dp.flow_step(grid, 0.01, viscosity, density=density, implicit=True, convective=False)
+    first = step.start(rng.standard_normal(grid.faces.size))
+    end = dp.rollout(step, first, None, 5)
+    assert np.max(np.abs(dp.divergence(grid)(end["v"]))) < 1e-8
+    assert np.max(np.abs(end["v"])) < 10 * np.max(np.abs(first["v"]))
+    plain = dp.flow_step(grid, 0.01, np.ones(grid.shape), density=np.full(grid.shape, 2.0**900), convective=False)
+    assert np.all(np.isfinite(plain(plain.start(first["v"]))["v"]))
+
+
 LAWS = {
     "field": {"viscosity": lambda p: p["mu"]},
     "all": {

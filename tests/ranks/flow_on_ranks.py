@@ -251,6 +251,11 @@ def errors_are_the_same_on_all_ranks():
     v[grid.faces.size // 4] = 20.0
     state = {"v": dp.identity(grid.faces)(v), "p": np.zeros(grid.shape), "a": 0.0 * v}
     refused(dp.errors.UnstableStepError, "waves grow by", lambda: step(state))
+    rest = dp.identity(grid.faces)(np.zeros(grid.faces.size))
+    words = "density in flow_step does not work on ranks yet"
+    refused(TypeError, words, lambda: dp.flow_step(grid, 0.1, density=2.0))
+    words = "a viscosity that varies in flow_step does not work on ranks yet"
+    refused(TypeError, words, lambda: dp.flow_step(grid, 0.1, lambda rate, params: rate).start(rest))
     v[0] = np.nan  # in a wall
     refused(dp.errors.NonFiniteError, "takes finite numbers, got 1 that", lambda: dp.projection(grid)(v))
 
