@@ -39,6 +39,20 @@ def test_conservation_laws():
     assert abs(float(re.search(r"on the left: (\S+)", printed)[1]) - 1) < 1e-4
 
 
+@example("dry_ground.py")
+def test_dry_ground():
+    """With 50 cells: errors beside exact solutions, a lake at rest, gravity found, blast waves that run."""
+    printed = run("dry_ground.py")
+    flood, bowl, gas = map(float, re.findall(r"mean error of the d\w+ (\S+)$", printed, re.MULTILINE))
+    assert flood < 0.008 and bowl < 0.004 and gas < 0.05
+    assert float(re.search(r"water lost (\S+)", printed)[1]) < 1e-13
+    assert float(re.search(r"moved by (\S+)", printed)[1]) < 1e-13
+    assert float(re.search(r"gravity: (\S+)", printed)[1]) == pytest.approx(5, abs=1e-3)
+    assert "without positive: in step" in printed
+    coarse, fine = map(float, re.search(r"density (\S+) with 50 cells, (\S+) with", printed).groups())
+    assert 4 < coarse < fine < 6.6
+
+
 @example("patterns.py")
 def test_patterns():
     """32^2 cells: a drop divides, and dies with more kill; mass, energy, wavelength, growth; the feed is found."""

@@ -43,6 +43,7 @@ SMALL = {
     "full_waveform.py": "24",
     "edges.py": "24",
     "conservation_laws.py": "100",
+    "dry_ground.py": "50",
     "conductivity_design.py": "200",
     "helmholtz.py": "64",
     "patterns.py": "32",
