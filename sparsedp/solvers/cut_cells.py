@@ -274,7 +274,8 @@ class CutCells(Reconstructible):
         -------
         array, a field on the cells; 0 in cells without fluid
         """
-        return self._outflow(self.apertures * v) / self._safe_volumes
+        outflow = self._outflow(self.apertures * self._field("v", v, self.grid.faces))
+        return _in_dtype_of(v, outflow / self._safe_volumes)
 
     @cached_property
     def _safe_volumes(self):
@@ -293,7 +294,7 @@ class CutCells(Reconstructible):
         -------
         array, a field on the cells; 0 in cells without wall
         """
-        return self._at_walls(self._slopes(self._field("u", u), self._wall_values(values)))
+        return _in_dtype_of(u, self._at_walls(self._slopes(self._field("u", u), self._wall_values(values))))
 
     def flux(self, u: Any, values: Any = 0.0, k: Any = 1.0, wall_k: Any = None) -> Any:
         """Return the integral of k du/dn over the wall in each cell; its sum is the flux into the body.
@@ -310,7 +311,7 @@ class CutCells(Reconstructible):
         array, a field on the cells
         """
         slopes = self._slopes(self._field("u", u), self._wall_values(values))
-        return self._at_walls(self._geometry.areas * self._wall_coefficient(k, wall_k) * slopes)
+        return _in_dtype_of(u, self._at_walls(self._geometry.areas * self._wall_coefficient(k, wall_k) * slopes))
 
     def diffusion(self, u: Any, values: Any = 0.0, walls: Any = None, k: Any = 1.0, wall_k: Any = None) -> Any:
         """Return div(k grad u), averaged over the fluid of each cell: the rate of an explicit or implicit time step.
@@ -326,7 +327,7 @@ class CutCells(Reconstructible):
         array, a field on the cells
         """
         total = self._outflow(self.apertures * k * self.gradient(u, walls)) + self.flux(u, values, k, wall_k)
-        return total / self._safe_volumes
+        return _in_dtype_of(u, total / self._safe_volumes)
 
     def _slopes(self, u, values):
         """Return the slopes at the wall for a field on the cells and given values on the cut cells."""
@@ -362,10 +363,12 @@ class CutCells(Reconstructible):
             raise ValueError(
                 f"project of cut_cells needs solid_boundary=dp.neumann, got {self._condition}; build another body"
             )
+        given = v
+        v = _in_double(self._field("v", v, self.grid.faces))
         pressure = self._solve(-self.divergence(v), nullspace="project")
         free = self._is_open * v - self.gradient(pressure)
         check_values(_check_balance, self._outflow(self.apertures * free), self._passing(self.apertures * abs(v)))
-        return free
+        return _in_dtype_of(given, free)
 
     @cached_property
     def _passing(self):
@@ -390,11 +393,14 @@ class CutCells(Reconstructible):
         array, a field on the cells
         """
         below, above, at_lower, at_upper = self._beside_faces
+        given = u
+        u = _in_double(self._field("u", u))
+        v = self._field("v", v, self.grid.faces)
         entering = self._field("inflow", inflow, self.grid.faces)
         from_below = anp.where(at_lower, entering, below(u))
         from_above = anp.where(at_upper, entering, above(u))
         flux = anp.maximum(v, 0.0) * from_below + anp.minimum(v, 0.0) * from_above
-        return -self.redistribute(self.divergence(flux))
+        return _in_dtype_of(given, -self.redistribute(self.divergence(flux)))
 
     def redistribute(self, rate: Any) -> Any:
         """Return a rate without the step limit of small cells: what a small cell cannot take goes to its neighbours.
@@ -416,11 +422,14 @@ class CutCells(Reconstructible):
         ----------
         I-L. Chern, P. Colella, UCRL-97200, Lawrence Livermore National Laboratory (1987).
         """
+        given = rate
+        rate = self._field("rate", rate)
         around = self._neighbourhood(self.volumes)
         around = anp.where(self.is_fluid, around, 1.0)
         mean = self._neighbourhood(self.volumes * rate) / around
         excess = anp.maximum(1.0 - 2.0 * self.fractions, 0.0) * (rate - mean)
-        return self.is_fluid * (rate - excess + self._neighbourhood(self.volumes * excess / around))
+        result = self.is_fluid * (rate - excess + self._neighbourhood(self.volumes * excess / around))
+        return _in_dtype_of(given, result)
 
     @cached_property
     def _neighbourhood(self):
@@ -525,9 +534,7 @@ class CutCells(Reconstructible):
             self._solvers[nullspace] = solver
         self.info = solver.info
         u = solver(entries, self.is_fluid * right)
-        if dtype_of(u).kind == "f":
-            return cast(u, np.result_type(dtype_of(b), np.float32))
-        return u
+        return _in_dtype_of(b, u)
 
     def _wall_terms(self, values, k, wall_k):
         """Return the part of the flux through the wall that does not depend on u, for each cut cell."""
@@ -698,6 +705,18 @@ def _checked_level(grid, level):
     check_kind("the level of cut_cells", values.dtype, "real numbers", "; write level.real")
     check_finite("the level of cut_cells", values)
     return cast(level if isbox(level) else values, np.dtype(float))
+
+
+def _in_double(field):
+    """Return a field in double precision."""
+    return cast(field, np.result_type(dtype_of(field), float))
+
+
+def _in_dtype_of(field, result):
+    """Return a real result in single precision if the field is in single precision."""
+    if dtype_of(result).kind != "f":
+        return result
+    return cast(result, np.result_type(dtype_of(field), np.float32))
 
 
 def _check_balance(outflow, size):

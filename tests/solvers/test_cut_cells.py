@@ -159,6 +159,22 @@ def test_dtypes_batches_and_coefficients():
     single = body.solve(ONES.astype(np.float32))
     assert single.dtype == np.float32 and np.allclose(single, u, rtol=1e-6)
     assert np.array_equal(body.solve(ONES.astype(int)), u)
+    plain = dp.cut_cells(GRID, lambda x, y: hypot(x - 0.5, y - 0.45) - 0.2)
+    wind = dp.interior(GRID)(np.ones(GRID.faces.size))
+    results = [
+        (plain.project, (wind,)),
+        (plain.advection, (u, plain.project(wind))),
+        (plain.divergence, (wind,)),
+        (plain.redistribute, (u,)),
+        (body.gradient, (u,)),
+        (body.slopes, (u,)),
+        (body.flux, (u,)),
+        (body.diffusion, (u,)),
+    ]
+    for function, arguments in results:
+        exact = function(*arguments)
+        single = function(*(argument.astype(np.float32) for argument in arguments))
+        assert single.dtype == np.float32 and np.allclose(single, exact, atol=1e-4 * np.max(abs(exact)))
     assert np.allclose(body.solve(np.stack([ONES, 3 * ONES]))[1], 3 * u, rtol=1e-12)
     assert np.allclose(body.solve(ONES * 1j), 1j * u, rtol=1e-12)
     assert np.allclose(body.solve(1e250 * ONES, k=1e200), 1e50 * u, rtol=1e-9)
@@ -411,6 +427,12 @@ def test_errors_name_the_argument():
         match=r"^values of cut_cells takes a number or a field on cells\(7, 6\), got an array of shape \(3,\)$",
     ):
         body.solve(ONES, np.ones(3))
+    with pytest.raises(ShapeError, match="v of cut_cells takes a number or a field on faces"):
+        body.project(np.ones(3))
+    with pytest.raises(ShapeError, match="u of cut_cells takes a number or a field on cells"):
+        body.advection(np.ones(3), np.ones(GRID.faces.size))
+    with pytest.raises(NonFiniteError, match="v of cut_cells must be finite"):
+        body.project(np.full(GRID.faces.size, np.nan))
     with pytest.raises(NonFiniteError, match="values of cut_cells must be finite"):
         body.solve(ONES, np.inf)
     with pytest.raises(ValueError, match=r"^k of cut_cells must be >= 0, got -2$"):
