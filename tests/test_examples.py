@@ -362,6 +362,8 @@ def test_helmholtz():
     printed = run("helmholtz.py")
     sponge, matched = map(float, re.findall(r"reflection .*: (\S+)$", printed, re.MULTILINE))
     assert sponge <= 1e-3 and matched <= 2e-6
+    second, fourth = map(float, re.findall(r"^order \d: (\S+)% off Hankel's function", printed, re.MULTILINE))
+    assert fourth <= 5.0 and second >= 3 * fourth
     assert int(re.search(r"GMRES .*: (\d+) iterations", printed)[1]) <= 40
     assert float(re.search(r"off Hankel's function: (\S+)%", printed)[1]) <= 5
     assert "gradient in 4096 speeds: agrees" in printed
