@@ -94,7 +94,7 @@ DIRECT_BELOW_STRUCTURED = {"many": {1: 10_000_000, 2: 16_384, 3: 4_096}, "few": 
 
 # From this number of unknowns on, "schur" is chosen for flows in 3-D. LU factors of a driven cavity of more than 20^3
 # cells do not fit into memory.
-SCHUR_FROM = 13_824
+SCHUR_FROM = 34_000
 
 # The same limits for matrices with complex entries, which multigrid cannot solve. Measured for the value and gradient
 # of a wave problem: at 2048^2 LU takes 96 s and 8.3 GB, and GMRES does not converge. At 32^3 LU takes 5 s and 0.6 GB,

@@ -201,8 +201,8 @@ def steady(residual: Callable[..., Any], guess: Any, *params: Any, **options: An
     Velocities on faces in walls need an equation too: ``inside(rate) + v - inside(v)``. Finite differences of steady
     states, as in `check.gradient`, contain the error of the solves: write rtol=1e-13.
 
-    **Flows in 3-D** of more than 13 824 unknowns are solved by method="schur": GMRES with a multigrid cycle for each
-    component of the velocity. The number of iterations does not depend on the grid, but grows with the Reynolds number;
+    **Flows in 3-D** of more than 34 000 unknowns are solved by method="schur": GMRES with a multigrid cycle for each
+    component of the velocity. The number of iterations depends little on the grid, but grows with the Reynolds number;
     follow large ones by `continuation`, or write method="direct" in 2-D.
 
     **Cost.** Sparse LU of the Jacobian. From 10 000 unknowns on, one factorisation is used for several Newton steps: it
