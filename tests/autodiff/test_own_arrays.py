@@ -145,6 +145,11 @@ BUILDERS = {
         lambda w, s, b, dt, nu: dp.flow_step(GRID, dt, nu, boundary=b, solid=s, walls=w),
         flow,
     ),
+    "flow_step, media": (
+        (np.abs(CELLS) + 0.01, np.abs(CELLS) + 1.0),
+        lambda mu, rho: dp.flow_step(GRID, 1e-6, mu, density=rho),
+        flow,
+    ),
     "flow_step, friction": (
         (np.abs(np.sin(K)),),
         lambda f: dp.flow_step(GRID, 0.01, friction=f),

@@ -284,6 +284,8 @@ def travellers():
     yield "face_lift", "", lift, lambda lift: bits(lift, numbers(lift.domain.size))
     yield "flow_step", "", dp.flow_step(GRID, 0.01, 0.1, push, solid=SOLID), of_flow
     yield "flow_step", "implicit", dp.flow_step(BOX, 0.01, 0.1, implicit=True, convective=False), of_flow
+    media = {"viscosity": 0.01 * numbers(GRID.shape) ** 2, "density": 1.0 + numbers(GRID.shape) ** 2}
+    yield "flow_step", "media", dp.flow_step(GRID, 0.001, **media), of_flow
     yield "flow_step", "friction", dp.flow_step(GRID, 0.01, friction=numbers(GRID.faces.size) ** 2), of_flow
     lid = dp.face_lift(GRID)
     lid = lid(lid.domain.join(0.0, 0.0, 0.0, 1.0))
