@@ -234,6 +234,23 @@ TABLE = [
         "the rate of a shallow_water must be finite, got 8 that are NaN or infinite, the first at (0, 0)",
     ),
     (
+        lambda: dp.shallow_water(LINE, boundary=dp.inflow, inflow=[-1.0, 0.0])(WATER),
+        UNSTABLE,
+        "the depth at the inflow of a shallow_water must be >= 0, got -1 in cell 0 and in 1 more; give a state without "
+        "such cells, or take smaller steps, dt <= law.time_step(u, params)",
+    ),
+    (
+        lambda: law(boundary=dp.inflow, inflow=-1.0, positive={"amount": lambda u, p: u})(np.ones(4)),
+        UNSTABLE,
+        "the amount at the inflow of a conservation_law must be > 0, got -1 in cell 0 and in 1 more; give a state "
+        "without such cells, or take smaller steps, dt <= law.time_step(u, params)",
+    ),
+    (
+        lambda: dp.shallow_water(LINE, "hill"),
+        TYPE,
+        "the bathymetry of a shallow_water must hold real numbers, got dtype <U4; write its .real",
+    ),
+    (
         lambda: law(positive=["density"]),
         TYPE,
         'positive of conservation_law must be a dict of functions, got list; write {"density": lambda u, params: u[0]}',

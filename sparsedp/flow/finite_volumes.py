@@ -329,14 +329,22 @@ class FiniteVolumes(Reconstructible):
     def _checked_rate(self, u: Any, params: Any) -> Any:
         """Return the rate of change of a state, after and before checks."""
         u = self._checked_state(u)
-        self._check_physical(u, params)
+        self._check_states(u, params)
         rate = self._rate(u, params)
         check_values(partial(check_finite, self._what("rate")), rate)
         return cast(rate, dtype_of(u))
 
+    def _check_states(self, u: Any, params: Any) -> None:
+        """Raise if a quantity of the state, or of the inflow, is not positive."""
+        self._check_physical(u, params)
+        for axis in self.axes:
+            for side, condition in enumerate(axis.sides):
+                if condition == inflow_side:
+                    self._check_physical(axis.ghost_values(u, params, side), params, " at the inflow")
+
     @abstractmethod
-    def _check_physical(self, u: Any, params: Any) -> None:
-        """Raise if a quantity of the state is not positive."""
+    def _check_physical(self, u: Any, params: Any, at: str = "") -> None:
+        """Raise if a quantity of the state is not positive; `at` is the part of the message that says where."""
 
     @abstractmethod
     def _rate(self, u: Any, params: Any) -> Any:
@@ -479,10 +487,13 @@ class ConservationLaw(FiniteVolumes):
         """
         return self._checked_rate(u, params)
 
-    def _check_physical(self, u: Any, params: Any) -> None:
-        """Raise if a quantity of the state is not positive."""
+    def _check_states(self, u: Any, params: Any) -> None:
+        if self.positive:
+            super()._check_states(u, params)
+
+    def _check_physical(self, u: Any, params: Any, at: str = "") -> None:
         for name, quantity in self.positive.items():
-            check_values(partial(check_positive, self._what(name)), self._quantity(name, quantity, u, params))
+            check_values(partial(check_positive, self._what(name + at)), self._quantity(name, quantity, u, params))
 
     def _equilibrium_state(self, u: Any, params: Any) -> Any:
         """Return the equilibrium for these params, or None."""

@@ -40,9 +40,9 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp._utils.calls import public
-from sparsedp._utils.validation import check_choice, check_finite, check_function, check_number
+from sparsedp._utils.validation import check_choice, check_finite, check_function, check_kind, check_number
 from sparsedp.autodiff.program_trace import check_values
-from sparsedp.autodiff.tape import plain
+from sparsedp.autodiff.tape import plain, sample
 from sparsedp.autodiff.tape_constants import constant
 from sparsedp.flow.finite_volumes import FiniteVolumes, check_positive, checked_result, sides_of
 from sparsedp.grid.boundary_conditions import outflow
@@ -259,6 +259,7 @@ class ShallowWater(FiniteVolumes):
         if callable(z):
             z = z(params)
         flat = np.zeros(self.grid.shape)
+        check_kind(self._what("bathymetry"), np.asarray(sample(z)).dtype, "real numbers", "; write its .real")
         if np.ndim(z) == 0:
             z = z + flat
         checked_result(self._what("bathymetry"), z, flat)
@@ -273,8 +274,8 @@ class ShallowWater(FiniteVolumes):
         check_values(_check_gravity, g)
         return g
 
-    def _check_physical(self, u: Any, params: Any) -> None:
-        check_values(partial(_check_depth, self._what("depth")), u[0])
+    def _check_physical(self, u: Any, params: Any, at: str = "") -> None:
+        check_values(partial(_check_depth, self._what("depth" + at)), u[0])
 
     def _rate(self, u: Any, params: Any) -> Any:
         g = self._pull(params)
