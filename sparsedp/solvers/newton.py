@@ -472,7 +472,8 @@ class Newton:
             self.near = solver.engine
 
     def _linearise(self):
-        self.J = None  # its memory is free while the next one is set up
+        if self.J is not None and self.J.solver.engine.method == "schur":
+            self.J = None  # two set-ups of a flow in 3-D do not fit into memory
         try:
             self.J = self.jacobians.evaluate(self.equation, self.x, self.leaves, self.near)
             self.is_stale = False
