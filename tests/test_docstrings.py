@@ -15,8 +15,7 @@ from sources import FUNCTION, modules
 import sparsedp
 from sparsedp.advection.transport import CHOICES
 from sparsedp.advection.transport import METHODS as SCHEMES
-from sparsedp.integrators.runge_kutta import IMPLICIT
-from sparsedp.integrators.stepper import UNUSED
+from sparsedp.integrators.stepper import UNUSED, WITH_OPTIONS
 from sparsedp.optimize.minimize import METHODS
 from sparsedp.solvers.choose_method import METHODS as ENGINES
 
@@ -206,7 +205,7 @@ def named_in(cell, methods):
     """Return the methods that a cell of a table stands for."""
     named = {method for method in methods if re.search(rf"\b{method}\b", cell)}
     if cell.startswith("all but "):
-        return set(methods) - {re.match(r"all but (\w+)", cell)[1]}
+        return set(methods) - set(re.match(r"all but (\w+(?:, \w+)*)", cell)[1].split(", "))
     return set(methods) if cell.startswith("all") else named
 
 
@@ -232,7 +231,7 @@ def test_arguments_of_stepper_are_those_of_its_table():
             wanted = ast.literal_eval(f"({defaults},)")
             assert [parameters[name].default for name in names] == list(wanted * len(names))[: len(names)], words
     assert set(takers) == set(parameters) - {"method", "rate", "dt"}
-    assert takers.pop("options") == set(IMPLICIT)
+    assert takers.pop("options") == set(WITH_OPTIONS)
     for name, methods in takers.items():
         assert methods == {method for method in UNUSED if name not in UNUSED[method]}, name
 

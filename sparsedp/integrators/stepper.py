@@ -207,7 +207,7 @@ def stepper(
     max_step, breaks, events            None         all but leapfrog; they need a tolerance
     floor                               None         all; it has an effect with a tolerance
     unstable                            "raise"      all; it has an effect on euler, heun, ssprk3, rk4, leapfrog
-    jacobian                            None         the implicit methods, radau, rodas5p; no effect on imex
+    jacobian                            None         all but euler, heun, ssprk3, rk4, etdrk4, leapfrog; unused by imex
     damping                             None         leapfrog
     solver                              "auto"       all; radau accepts only "auto" and "direct"
     rtol, maxiter                       1e-10, None  all; they have an effect on solves

@@ -66,7 +66,7 @@ def with_units(function: Callable, arguments: Sequence[Any], result: Any) -> Sce
 
     See Also
     --------
-    interop.to_xarray, check.gradient
+    interop.to_xarray
 
     Examples
     --------

@@ -62,7 +62,7 @@ def to_xarray(
 
     See Also
     --------
-    interop.from_xarray, save
+    interop.from_xarray, interop.with_units, save
 
     Examples
     --------
