@@ -1,10 +1,11 @@
-"""The scenes of benchmarks.physics with few cells: close to what is published, and their gradients right.
+"""Scenes of benchmarks with few cells: close to what is published, and their gradients right.
 
 Stiff systems are in test_integrators_radau.
 """
 
 import pytest
 
+from benchmarks import conservation_laws
 from benchmarks.physics import row
 
 CLOSE = {  # by how much a scene with few cells is off
@@ -30,3 +31,11 @@ def test_a_scene(name):
     _, off, _, verdict = row(name, quick=True)
     assert off < CLOSE[name]
     assert verdict == ("inconclusive" if "vortex" in name else "agrees")  # its least density is at a kink of limiters
+
+
+@pytest.mark.whole
+def test_a_row_of_laws_that_stay_positive():
+    _, depth, exact, error, _, _, verdict = conservation_laws.row("dry bed", quick=True)
+    assert abs(depth / exact - 1) < 0.1
+    assert error < 0.03
+    assert verdict == "agrees"
