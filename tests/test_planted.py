@@ -518,6 +518,36 @@ BUGS = {
         "a = a + (self._force(",
         "tests/flow/test_flow.py::test_a_force_on_walls_and_inflows_does_nothing",
     ),
+    "a stress without the transposed gradient": Bug(
+        "flow",
+        "self._velocity_slopes + self._transposed_slopes()",
+        "self._velocity_slopes",
+        "tests/flow/test_variable_media.py::test_stress_and_shear_rate_of_a_strain",
+    ),
+    "a shear rate without walls": Bug(
+        "flow",
+        "            slopes_of_v = slopes_of_v + self.wall_slopes(walls)\n",
+        "            pass\n",
+        "tests/flow/test_variable_media.py::test_shear_rate_beside_a_moving_wall",
+    ),
+    "an implicit viscosity without the wall velocities at the end of a step": Bug(
+        "flow",
+        "            sum_of_walls = walls + walls_after\n",
+        "            sum_of_walls = walls + walls\n",
+        "tests/flow/test_variable_media.py::test_oscillating_wall",
+    ),
+    "steps of different length that are extrapolated like equal ones": Bug(
+        "flow",
+        'half_ratio = 0.5 * dt / state["dt"]',
+        "half_ratio = 0.5",
+        "tests/flow/test_variable_media.py::test_step_length_of_params",
+    ),
+    "a gradient of the pressure that is not divided by the density": Bug(
+        "flow",
+        "            slope_of_p = slope_of_p / density\n",
+        "            pass\n",
+        "tests/flow/test_variable_media.py::test_two_layers_at_rest",
+    ),
     "the rate of a scalar that is not carried on": Bug(
         "flow",
         'self._half_step_ahead(rates[name], state["r"][name], state, dt)',
