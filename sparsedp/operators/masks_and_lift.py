@@ -77,8 +77,8 @@ def lift(grid: Grid, boundary: Any, order: int = 2) -> Operator:
     """
     parts: list[tuple[int, ...]] = []
     blocks = {}
-    sides = resolve(grid, boundary, patches=order == 2, name="lift with order=4")
     check_order("lift", grid, order)
+    sides = resolve(grid, boundary, patches=order == 2, name="lift with order=4")
     for axis, side, wall in walls_of(sides):
         if order == 2:
             terms = wall_slope_terms(grid, axis, side, wall)

@@ -9,6 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from sparsedp._utils.validation import check_type
 from sparsedp.grid.boundary_conditions import MixedWall
 from sparsedp.grid.grid import Grid
 from sparsedp.grid.space import Space
@@ -111,10 +112,11 @@ FIRST_CELL = (-23 / 24, 7 / 8, 1 / 8, -1 / 24)  # from the first four faces
 
 def check_order(name: str, grid: Grid, order: Any, solid: Any = None) -> None:
     """Raise an error if `order` is neither 2 nor 4, or if the function `name` has no stencil of order 4 on the grid."""
-    if isinstance(order, bool) or order not in (2, 4):
+    if not isinstance(order, (int, np.integer)) or isinstance(order, bool) or order not in (2, 4):
         raise ValueError(f"order of {name} must be 2 or 4, got {order!r}")
     if order == 2:
         return
+    check_type(name, grid, Grid, "a Grid", "dp.Grid((64, 64), size=1.0)")
     grid.backend.check(f"{name} with order=4")
     if solid is not None:
         raise ValueError(f"{name} with order=4 takes no solid cells; leave solid out or take order=2")

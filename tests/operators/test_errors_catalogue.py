@@ -251,6 +251,17 @@ TABLE = [
     (lambda: dp.laplacian(RING, order=3), VALUE, "order of laplacian must be 2 or 4, got 3"),
     (lambda: dp.gradient(RING, order=True), VALUE, "order of gradient must be 2 or 4, got True"),
     (lambda: dp.divergence(RING, order="4"), VALUE, "order of divergence must be 2 or 4, got '4'"),
+    (lambda: dp.gradient(RING, order=np.array([2, 4])), VALUE, "order of gradient must be 2 or 4, got array([2, 4])"),
+    (
+        lambda: dp.lift(dp.Grid((4, 4)), {"x": dp.patch((1, 3), dp.dirichlet)}, order=3),
+        VALUE,
+        "order of lift must be 2 or 4, got 3",
+    ),
+    (
+        lambda: dp.lift(5, dp.dirichlet, order=4),
+        TYPE,
+        "lift takes a Grid, got int; write dp.Grid((64, 64), size=1.0)",
+    ),
     (
         lambda: dp.gradient(dp.Grid(4), solid=np.zeros(4, bool), order=4),
         VALUE,
