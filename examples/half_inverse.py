@@ -136,11 +136,11 @@ def train(label, f, method, maxiter, every, budget=np.inf, published="", **setti
 
 # %%
 # Half-inverse steps on batches of 32; in an epoch each sample is used once. The published loss is a mean, so that its
-# rate 1 corresponds to 2 / 32 for our sum of squared residuals.
+# rate 1 corresponds to 2 / 32 for our sum of squared residuals. This is the default for batches of 32 samples.
 
 shuffled = rng.permuted(np.tile(np.arange(4096), (options.epochs, 1)), axis=1)
 batches = list(seen[shuffled].reshape(-1, 32, 4))
-settings = {"batches": batches, "rate": 2 / 32, "apart": True, "published": "5.4e-5 1.1e-5 3.2e-6 1.2e-6"}
+settings = {"batches": batches, "apart": True, "published": "5.4e-5 1.1e-5 3.2e-6 1.2e-6"}
 train("half-inverse", misses, "half_inverse", 128 * options.epochs, 128, **settings)
 
 # %%

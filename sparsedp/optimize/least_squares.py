@@ -18,7 +18,7 @@ from sparsedp.optimize.bounded_least_squares import BoundedLeastSquares
 from sparsedp.optimize.first_order import HALVINGS, admissible, backtracked
 from sparsedp.optimize.method import Method
 from sparsedp.optimize.result import Evaluation, NoStepFound, RoundingReached
-from sparsedp.optimize.update_direction import DirectionFamily, forms_jacobian
+from sparsedp.optimize.update_direction import Direction, DirectionFamily, forms_jacobian
 from sparsedp.solvers.scaling import largest
 
 if TYPE_CHECKING:
@@ -328,10 +328,11 @@ class HalfInverse(LeastSquaresMethod):
 
     Parameters
     ----------
-    rate : float
-        Factor of the step.
+    rate : float, optional
+        Factor of the step. Default: found by backtracking, and with batches given by the formula below.
     truncation : float
-        As for dp.update_direction.
+        As for dp.update_direction. Singular vectors of very small singular values are mostly noise, and their steps are
+        long, so that they limit the rate.
     power : float
         The exponent p in the formula below.
     rank : int, optional
@@ -345,7 +346,14 @@ class HalfInverse(LeastSquaresMethod):
 
     Notes
     -----
-    Each iteration sets x <- x - rate J^T (J J^T)^(-p) r. Steps are accepted without comparing losses.
+    Each iteration sets x <- x - rate J^T (J J^T)^(-p) r. With a given rate, losses are not compared.
+
+    Let s be the largest singular value of J. With the rate s^(2 p - 2), the step in its singular direction is that of
+    Gauss-Newton, and steps in other directions are shorter than those of Gauss-Newton. It does not depend on the units
+    of x and r. Backtracking begins with this rate in the first iteration, halves it until the loss decreases
+    sufficiently (Armijo condition), and doubles it for the next iteration. The losses of batches cannot be compared.
+    For a batch of m samples, which are the entries of r along axis 0, the rate is the smaller of s^(2 p - 2) and 2 / m:
+    the rate 1 for the mean of |r|^2 over the samples, as in the reference.
 
     References
     ----------
@@ -353,8 +361,8 @@ class HalfInverse(LeastSquaresMethod):
     """
 
     name: ClassVar[str] = "half_inverse"
-    rate: float = 1.0
-    truncation: float = 1e-10
+    rate: float | None = None
+    truncation: float = 1e-6
     power: float = 0.75
     rank: int | None = None
     apart: bool = False
@@ -362,22 +370,47 @@ class HalfInverse(LeastSquaresMethod):
     absolute_sigma: bool = False
 
     def __post_init__(self) -> None:
-        check_number("rate of half_inverse", self.rate, "> 0", "; the default is 1")
+        if self.rate is not None:
+            check_number("rate of half_inverse", self.rate, "> 0", "; leave it out and it is searched for")
         self.forms_jacobian = forms_jacobian(self.form)
         self._check_common_options()
         self._family = DirectionFamily(self.power, 0.0, self.truncation, self.rank)
 
     @property
     def compares_losses(self) -> bool:
-        """False: every step to a point with a finite loss is accepted."""
+        """False: batches can be used. Losses are compared only if neither a rate nor batches were given."""
         return False
 
     def advance(self, state: SquaresState, objective: Objective) -> SquaresState:
-        """Return the state after one iteration, on its batch. Raises NoStepFound if no admissible point is found."""
+        """Return the state after one iteration, on its batch. Raises NoStepFound if no point is accepted."""
         linearization = objective.linearization(state.current).restricted(objective.free(state.current))
-        # r and J were divided by s, which divides the direction by s^(2 - 2 power): undo this.
-        residual_scale: Any = objective.residual_scale
-        scale = residual_scale ** (2.0 - 2.0 * self._family.power)
-        step = -self.rate * scale * self._family(linearization, linearization.flat).step
+        direction = self._family(linearization, linearization.flat)
+        if self.rate is not None:
+            # r and J were divided by s, which divides the direction by s^(2 - 2 power): undo this.
+            residual_scale: Any = objective.residual_scale
+            scale = residual_scale ** (2.0 - 2.0 * self._family.power)
+            step = -self.rate * scale * direction.step
+        else:
+            step = self._scaled_step(direction)
+            if not objective.batches.varied:
+                step *= state.share
+                name = "the half-inverse step"
+                evaluation, share, _ = backtracked(state.current, step, objective, name)
+                return SquaresState(evaluation, share=2 * share * state.share)
+            step *= self._share_of_batch(direction, linearization, objective)
         evaluation, _, next_share = admissible(state.current.point, step, state.share, objective)
         return SquaresState(evaluation, share=next_share)
+
+    def _scaled_step(self, direction: Direction) -> NDArray[np.float64]:
+        """Return the step with the rate s^(2 p - 2), where s is the largest singular value of J."""
+        size = float(np.max(direction.spectrum, initial=0.0)) or 1.0
+        root_of_rate = size ** (self._family.power - 1.0)
+        return -(direction.step * root_of_rate) * root_of_rate  # the rate itself can leave the range of floats
+
+    def _share_of_batch(self, direction: Direction, linearization: Linearization, objective: Objective) -> float:
+        """Return min(1, 2 s^(2 - 2 p) / m), the rate for a batch of m samples divided by the rate s^(2 p - 2)."""
+        residual_scale: Any = objective.residual_scale
+        size = float(np.max(direction.spectrum, initial=0.0)) * residual_scale
+        with np.errstate(over="ignore"):
+            inverse_of_longest = np.float64(size) ** (2.0 - 2.0 * self._family.power)
+            return float(min(1.0, 2.0 * inverse_of_longest / max(1, len(linearization.value))))

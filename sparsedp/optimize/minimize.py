@@ -120,8 +120,8 @@ def minimize(
         Each of the two is a number, None (no bound), or a tree like start. In a tree, a number or None may replace a
         subtree and then applies to all of its entries; entries of dicts are matched by key. An array may replace a
         tuple or a list, with one bound for each entry. SciPy's sequence of one pair for each unknown is refused: write
-        ``tuple(map(np.array, zip(*pairs)))``. Points outside the bounds are clipped. half_inverse does not compare
-        losses, so with bounds it may converge to another point than the other methods.
+        ``tuple(map(np.array, zip(*pairs)))``. Points outside the bounds are clipped. half_inverse with a rate does not
+        compare losses, so with bounds it may converge to another point than the other methods.
     project : callable, optional
         ``project(x)``, a differentiable projection onto a linear or affine space, such as dp.projection(grid).
         loss(project(x)) is minimized, and the returned x is a projected one. At the start and at the result, test
@@ -170,9 +170,9 @@ def minimize(
         levenberg_marquardt  apart, dense    same          as for gauss_newton
         levenberg_marquardt  absolute_sigma  False         as for gauss_newton
         levenberg_marquardt  accuracy        1e-10         as for gauss_newton
-        half_inverse         rate            1.0           factor of the step
+        half_inverse         rate            None          factor of the step; None: found by backtracking, see below
         half_inverse         power           0.75          the exponent p in the step J^T (J J^T)^-p r
-        half_inverse         truncation      1e-10         see `update_direction`
+        half_inverse         truncation      1e-6          see `update_direction`
         half_inverse         rank            None          see `update_direction`
         half_inverse         apart           False         as for gauss_newton
         half_inverse         form            "auto"        "dense", "krylov"; "auto" forms the Jacobian if it is small
@@ -190,6 +190,9 @@ def minimize(
         apart=True computes the Jacobian faster if the residuals along axis 0 belong to independent samples. The loss
         must then accept every leaf of x with an additional leading axis, which holds one copy of x for each sample. The
         number of vector-Jacobian products is the number of residuals of one sample.
+        half_inverse without a rate begins with s^(2 p - 2), where s is the largest singular value of J: the length of a
+        Gauss-Newton step. With batches losses are not compared; the rate is then the smaller of s^(2 p - 2) and 2 / m
+        for a batch with m samples along axis 0 of the residuals.
         absolute_sigma=True states that the residuals were divided by their standard deviations. It selects the formula
         of `covariance`, as in scipy.optimize.curve_fit.
         weight is not multiplied by cell volumes. For a piecewise constant result on a uniform grid write

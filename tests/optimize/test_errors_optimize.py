@@ -155,7 +155,11 @@ WRONG = [
         ValueError,
         "accuracy of levenberg_marquardt must be from 0 to below 1, got -1; the default is 1e-10",
     ),
-    (run(method="half_inverse", rate=0), ValueError, "rate of half_inverse must be > 0, got 0; the default is 1"),
+    (
+        run(method="half_inverse", rate=0),
+        ValueError,
+        "rate of half_inverse must be > 0, got 0; leave it out and it is searched for",
+    ),
     (
         run(method="physical_gradient"),
         TypeError,

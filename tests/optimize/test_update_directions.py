@@ -8,6 +8,7 @@ import sparsedp as dp
 from sparsedp.autodiff import derivative
 from sparsedp.autodiff.tape import linear
 from sparsedp.errors import NonFiniteError
+from sparsedp.network import dense, dense_weights, tanh
 from sparsedp.optimize.linearization import left_singular
 
 SHAPES = [(12, 30), (30, 12), (9, 9), (1, 5), (5, 1)]
@@ -212,6 +213,59 @@ def test_half_inverse_balances_directions_of_different_scale():
     best = dp.minimize(lambda x: scales * (x - 1.0), np.zeros(2), "half_inverse", maxiter=60, tolerance=0)
     descent = dp.minimize(lambda x: anp.sum((scales * (x - 1.0)) ** 2), np.zeros(2), "gd", maxiter=60)
     assert abs(best.x[1] - 1) < 0.6 < 0.99 < abs(descent.x[1] - 1)
+
+
+def two_scales(rng, scale, samples):
+    """Return residuals of a network of seven neurons for (sin 6x, cos 9x), its weights, and its loss on other samples.
+
+    The second output is multiplied by `scale`: Schnell, Holl, Thuerey, Half-inverse gradients, 2022, and the chapter of
+    the book "Physics-based Deep Learning".
+    """
+    start = {"hidden": dense_weights(rng, 1, 7, gain=5 / 3), "last": dense_weights(rng, 7, 2)}
+
+    def residuals(weights, x):
+        outputs = dense(weights["last"], tanh(dense(weights["hidden"], x)))
+        return outputs * np.array([1.0, scale]) - np.hstack([np.sin(6 * x), np.cos(9 * x)])
+
+    x = rng.uniform(-1, 1, (samples, 1))
+    unseen = np.linspace(-1, 1, 401)[:, None]
+    loss = lambda weights: 0.5 * np.mean(np.sum(residuals(weights, unseen) ** 2, axis=1))
+    return residuals, start, x, loss
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("scale, published", [(1.0, 4.7e-4), (0.01, 2.9e-3)])
+def test_half_inverse_without_options_reaches_the_published_losses(scale, published):
+    """With the rate 1 of version 0.2 the losses are 0.2 to 0.9; with a truncation of 1e-10, 0.5 for the scale 0.01."""
+    losses = []
+    for seed in range(3):
+        residuals, start, x, loss = two_scales(np.random.default_rng(seed), scale, 64)
+        best = dp.minimize(lambda p: residuals(p, x), start, "half_inverse", 300, tolerance=0, apart=True)
+        values = [record.value for record in best.history]
+        assert values == sorted(values, reverse=True)
+        losses.append(loss(best.x))
+    assert np.median(losses) <= published
+
+
+@pytest.mark.parametrize("unit_of_residuals, unit_of_x", [(2.0**200, 1.0), (1.0, 2.0**-300), (2.0**-40, 2.0**60)])
+def test_half_inverse_without_a_rate_is_independent_of_units(unit_of_residuals, unit_of_x):
+    run = lambda residuals, start: dp.minimize(residuals, start, "half_inverse", maxiter=6, tolerance=0)
+    start = np.array([-1.2, 1.0])
+    plain = run(valley, start)
+    scaled = run(lambda x: unit_of_residuals * valley(x / unit_of_x), unit_of_x * start)
+    assert np.allclose(scaled.x / unit_of_x, plain.x, rtol=1e-9) and plain.value < 0.2 * plain.history[0].value
+    assert scaled.evaluations == plain.evaluations
+
+
+@pytest.mark.parametrize("size, rate", [(1.0, 2 / 8), (1e4, 1 / 1e2)])
+def test_the_rate_of_half_inverse_for_a_batch(rng, size, rate):
+    """2 / samples, at most the length of a Gauss-Newton step: 1 / sqrt(s) for the largest singular value s."""
+    matrix = size * np.linalg.qr(rng.standard_normal((8, 8)))[0]
+    batches = [rng.standard_normal(8)]
+    run = lambda **options: dp.minimize(
+        lambda x, b: matrix @ x - b, np.zeros(8), "half_inverse", 2, 0, batches=batches, **options
+    )
+    assert np.allclose(run().x, run(rate=rate).x, rtol=1e-12)
 
 
 def test_batches():
