@@ -164,6 +164,8 @@ class DerivativeAudit:
         The steps, tolerances, precision and names of all functionals.
     linear_gap : float
         Relative gap between the derivative of a linear combination of them and the combination of the derivatives.
+    is_repeatable : bool
+        Whether the derivative under test returns the same numbers for equal arguments.
     """
 
     def __init__(self, program: Program, options: Options, kind: str, both: bool = False, title: str = "") -> None:
@@ -184,6 +186,7 @@ class DerivativeAudit:
         self.base: NDArray[Any] = np.empty(0)
         self.pairs: list[tuple[NDArray[Any], NDArray[Any]]] = []
         self.linear_gap = 0.0
+        self.is_repeatable = True
         self.point = program.point  # `run` may replace it, for functions of NumPy arrays that use another library
         self.like = Evaluations(program.value, program.point, None)
         self._products: Any = None
@@ -541,7 +544,8 @@ class DerivativeAudit:
         gap = self.relative_gap(self.derivative(vector), [first], vector)
         allowed = self.allowed(REPEATED_SHARE)
         self.rows.append(Row(f"{self.kind} twice", gap, allowed, gap <= allowed))
-        if not gap <= allowed:
+        self.is_repeatable = gap <= allowed
+        if not self.is_repeatable:
             reason = f"two runs of {self.kind} at x differ by {gap:.1e}: it keeps a state of other runs, or is random"
             self.findings.insert(0, ("broken", reason))  # it explains why the VJP is not linear either
         again = self.program.value(self.point.fresh())

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sparsedp._utils.pytree import copied, leaves, mapped
+from sparsedp._utils.pytree import copied, leaves, mapped, norm
 from sparsedp._utils.validation import check_choice, check_function, check_number, check_whole
 from sparsedp.autodiff.backend import require_arrays
 from sparsedp.check.chain import Chain
@@ -638,7 +638,7 @@ def _result(audit: DerivativeAudit, title: str, seconds: float) -> DerivativeChe
         hessian=None,
         gaps=audit.gaps,
         result_gaps=audit.result_gaps,
-        value=float(np.linalg.norm(audit.base)),
+        value=norm(audit.base),
         evaluations=sum(audit.program.runs.values()),
         runs=dict(audit.program.runs),
         seconds=seconds,

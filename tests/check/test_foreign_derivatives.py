@@ -3,6 +3,7 @@
 import json
 import pickle
 import time
+import warnings
 
 import numpy as np
 import pytest
@@ -196,6 +197,22 @@ def test_names_of_leaves_stand_unchanged_in_reasons():
 def test_a_state_of_the_last_run():
     result = VJP(StatefulInSecret(), x=X)
     assert result.verdict == "disagrees" and "it keeps a state of other runs" in result.reason
+
+
+def test_a_random_vjp_has_no_rounding_errors():
+    """Its roughness in g looks like that of an ill-conditioned problem, which would give "inconclusive"."""
+    rng = np.random.default_rng(0)
+    result = VJP(lambda u: u**2, lambda u, g: 3 * u * g * (1 + 1e-3 * rng.random()), X)
+    assert result.verdict == "disagrees", result
+    assert result.reason.startswith("two runs of vjp at x differ by") and result.reason.endswith("or is random")
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e300])
+def test_the_norm_of_huge_and_tiny_values(scale):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        result = VJP(lambda u: scale * u, lambda u, g: scale * g, np.full(4, 2.0))
+    assert result.value == 4 * scale
 
 
 def test_derivatives_with_less_precision_than_the_function():
