@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from sparsedp.optimize.result import Evaluation, NoStepFound
 from sparsedp.solvers.scaling import largest
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from numpy.typing import NDArray
 
@@ -247,35 +247,45 @@ class Adam(Method):
 
     Parameters
     ----------
-    rate : float
-        Learning rate, the typical size of a step in every entry.
+    rate : float or callable
+        Learning rate, the typical size of a step in every entry. A schedule ``rate(step)`` returns the rate of a step;
+        the first step has the number 0, as in optax.
     betas : (float, float)
         Decay rates b1 and b2 of the running means of the gradient and of its square, each in [0, 1).
     epsilon : float
         Added to the root mean square of the gradient in the denominator. It is relative to the first gradient, so that
         the steps do not change when the loss is multiplied by a small number such as 1e-12.
+    max_norm : float, optional
+        A gradient whose Euclidean norm over all entries of x exceeds this number is scaled to this norm. Default: no
+        clipping.
 
     Notes
     -----
     Iteration k computes m <- b1 m + (1 - b1) g,  q <- b2 q + (1 - b2) g^2,  x <- x - rate m' / (sqrt(q') + epsilon)
     with m' = m / (1 - b1^k) and q' = q / (1 - b2^k). Here g is the gradient divided by a power of two near the largest
-    entry of the first gradient. If the loss cannot be evaluated at the new point, the step is halved.
+    entry of the first gradient, both after clipping. If the loss cannot be evaluated at the new point, the step is
+    halved.
 
     References
     ----------
-    D. P. Kingma, J. Ba, Adam: a method for stochastic optimization, ICLR 2015.
+    D. P. Kingma, J. Ba, Adam: a method for stochastic optimization, ICLR 2015; R. Pascanu, T. Mikolov, Y. Bengio, On
+    the difficulty of training recurrent neural networks, ICML 2013: clipping by the norm.
     """
 
     name: ClassVar[str] = "adam"
-    rate: float = 1e-3
+    rate: float | Callable[[int], Any] = 1e-3
     betas: tuple[float, float] = (0.9, 0.999)
     epsilon: float = 1e-8
+    max_norm: float | None = None
 
     def __post_init__(self) -> None:
-        check_number("rate of adam", self.rate, "> 0", "; the default is 1e-3")
+        if not callable(self.rate):
+            check_number("rate of adam", self.rate, "> 0", "; the default is 1e-3")
         if np.shape(self.betas) != (2,) or not all(is_number(beta) and 0 <= beta < 1 for beta in self.betas):
             raise ValueError(f"adam needs two betas from 0 to below 1, got {self.betas}; the default is (0.9, 0.999)")
         check_number("epsilon of adam", self.epsilon, "> 0", "; the default is 1e-8")
+        if self.max_norm is not None:
+            check_number("max_norm of adam", self.max_norm, "> 0", "; leave it out for no clipping")
 
     @property
     def compares_losses(self) -> bool:
@@ -285,17 +295,32 @@ class Adam(Method):
     def begin(self, first: Evaluation) -> AdamState:
         """Return the state at the start."""
         zero = np.zeros_like(first.point)
-        return AdamState(first, zero, zero, 0, power_of_two(largest(first.gradient)), 1.0)
+        return AdamState(first, zero, zero, 0, power_of_two(largest(self._clipped(first.gradient))), 1.0)
 
     def advance(self, state: AdamState, objective: Objective) -> AdamState:
         """Return the state after one iteration. Raises NoStepFound if no admissible point is found."""
         b1, b2 = self.betas
         count = state.steps + 1
-        gradient = state.current.gradient / state.gradient_unit
+        gradient = self._clipped(state.current.gradient) / state.gradient_unit
         mean = b1 * state.mean + (1 - b1) * gradient
         mean_square = b2 * state.mean_square + (1 - b2) * gradient**2
         unbiased_mean = mean / (1 - b1**count)
         root_mean_square = np.sqrt(mean_square / (1 - b2**count))
-        step = -self.rate * unbiased_mean / (root_mean_square + self.epsilon)
+        step = -self._rate_of(state.steps) * unbiased_mean / (root_mean_square + self.epsilon)
         evaluation, _, next_share = admissible(state.current.point, step, state.share, objective)
         return AdamState(evaluation, mean, mean_square, count, state.gradient_unit, next_share)
+
+    def _rate_of(self, step: int) -> float:
+        """Return the rate of a step, given its number from 0."""
+        if not callable(self.rate):
+            return self.rate
+        return check_number(f"rate({step}) of adam", self.rate(step), ">= 0", "; return the rate for the step")
+
+    def _clipped(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the gradient, scaled to the norm `max_norm` if it is longer."""
+        if self.max_norm is None:
+            return gradient
+        size = norm(gradient)
+        if not size > self.max_norm:
+            return gradient
+        return gradient / size * self.max_norm

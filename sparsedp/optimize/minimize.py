@@ -158,9 +158,10 @@ def minimize(
         gd                   rate            None          learning rate; None: found by backtracking
         gd                   momentum        0.0           factor of the previous step that is added, in [0, 1)
         gd                   line_search     None          "backtracking": halve the step until the loss decreases
-        adam                 rate            1e-3          learning rate: size of a step in every entry
+        adam                 rate            1e-3          size of a step in every entry, or a function, see below
         adam                 betas           (0.9, 0.999)  decay rates of the two running means
         adam                 epsilon         1e-8          added to the denominator, relative to the first gradient
+        adam                 max_norm        None          norm to which longer gradients are scaled, see below
         newton_cg            inner           200           maximum number of Hessian products in one iteration
         gauss_newton         apart           False         True: residuals along axis 0 are samples, see below
         gauss_newton         dense           None          True: form the Jacobian; None: form it if it is small
@@ -190,6 +191,8 @@ def minimize(
         apart=True computes the Jacobian faster if the residuals along axis 0 belong to independent samples. The loss
         must then accept every leaf of x with an additional leading axis, which holds one copy of x for each sample. The
         number of vector-Jacobian products is the number of residuals of one sample.
+        A function ``rate(step)`` is a schedule of adam: it returns the rate of step 0, 1, ... Schedules of optax can be
+        used. max_norm, as in optax.clip_by_global_norm, limits the Euclidean norm of the gradient over all leaves of x.
         half_inverse without a rate begins with s^(2 p - 2), where s is the largest singular value of J: the length of a
         Gauss-Newton step. With batches losses are not compared; the rate is then the smaller of s^(2 p - 2) and 2 / m
         for a batch with m samples along axis 0 of the residuals.

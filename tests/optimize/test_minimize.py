@@ -93,6 +93,43 @@ def test_first_step_of_gradient_descent_and_adam_against_the_formula():
     assert np.allclose(best.x, x + 0.1, rtol=1e-7)
 
 
+def adam_in_numpy(gradient, x, rate, max_norm, steps):
+    """Return the points of Adam with b1 = 0.9 and b2 = 0.999, written from its formula."""
+    mean = mean_square = 0.0
+    points = [x]
+    for step in range(steps):
+        g = gradient(x, step)
+        g = g * min(1.0, max_norm / np.sqrt(np.sum(g**2)))
+        mean = 0.9 * mean + 0.1 * g
+        mean_square = 0.999 * mean_square + 0.001 * g**2
+        scale = np.sqrt(1.0 - 0.999 ** (step + 1)) / (1.0 - 0.9 ** (step + 1))
+        x = x - rate(step) * scale * mean / np.sqrt(mean_square)
+        points.append(x)
+    return points
+
+
+@pytest.mark.parametrize("max_norm", [3.0, 1e-6, 1e6])
+def test_adam_with_a_schedule_and_clipping_against_the_formula(max_norm):
+    """The gradients have norms from 1 to 40, and are scaled over both leaves together. The first step is number 0."""
+    factors = [1.0, 10.0, 0.5]
+    schedule = lambda step: np.float32(0.5 ** (step + 2)) if step < 3 else 0.0
+    loss = lambda x, factor: factor * (anp.sum((x["a"] - 3.0) ** 2) + 2 * (x["b"] + 1.0) ** 2)
+    run = {"method": "adam", "maxiter": 5, "batches": factors, "tolerance": 0, "epsilon": 1e-14}
+    points = []
+    dp.minimize(
+        loss,
+        {"a": np.array([1.0, 2.5]), "b": 0.3},
+        rate=schedule,
+        max_norm=max_norm,
+        callback=lambda record, x: points.append([*x["a"], x["b"]]) or False,
+        **run,
+    )
+    gradient = lambda x, step: factors[step % 3] * np.array([2, 2, 4]) * (x - np.array([3.0, 3.0, -1.0]))
+    expected = adam_in_numpy(gradient, np.array([1.0, 2.5, 0.3]), schedule, max_norm, 5)
+    assert np.allclose(points, expected[-len(points) :], rtol=1e-9) and len(points) >= 5
+    assert np.array_equal(expected[4], expected[3]) and not np.allclose(expected[3], expected[2])
+
+
 @pytest.mark.parametrize("scale", [2.0**-660, 1e-12, 1e12, 2.0**660])
 @pytest.mark.parametrize("method, options", [("lbfgs", {}), ("gd", {}), ("adam", {"rate": 0.1})])
 def test_methods_are_invariant_to_the_scale_of_the_loss(scale, method, options):

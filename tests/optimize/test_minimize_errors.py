@@ -103,6 +103,12 @@ def test_ranges_of_options():
         dp.minimize(bowl, np.ones(2), "adam", rate=0)
     with pytest.raises(TypeError, match="rate of adam must be one real number, got None$"):
         dp.minimize(bowl, np.ones(2), "adam", rate=None)
+    with pytest.raises(ValueError, match="max_norm of adam must be > 0, got 0; leave it out for no clipping"):
+        dp.minimize(bowl, np.ones(2), "adam", max_norm=0)
+    with pytest.raises(ValueError, match=r"rate\(2\) of adam must be >= 0, got -1; return the rate for the step"):
+        dp.minimize(bowl, np.ones(2), "adam", rate=lambda step: 1.0 - step)
+    with pytest.raises(TypeError, match=r"rate\(0\) of adam must be one real number, got None$"):
+        dp.minimize(bowl, np.ones(2), "adam", rate=lambda step: None)
     with pytest.raises(ValueError, match="epsilon of adam must be > 0, got 0; the default is 1e-8"):
         dp.minimize(bowl, np.ones(2), "adam", epsilon=0)
     with pytest.raises(
