@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from math import inf, isfinite, log10
+from math import inf, isfinite, isnan, log10
 from typing import Any
 
 import numpy as np
@@ -56,8 +56,6 @@ REPEATED_EPS = 1e3  # two runs of f may differ by this multiple of machine epsil
 REPEATED_SHARE = 1e-6  # a larger relative difference of two equal calls is an error
 DUALITY_SHARE = 1e-6  # a larger gap between VJP and JVP is an error
 HIDDEN_EPS = 1e3  # a derivative that changes f(x) by less than this multiple of its rounding error is not examined
-LOSS_NAME = "f(x)"  # in sentences
-ARGUMENTS = {"vjp": "g", "jvp": "t"}
 ACCEPTED_SHARE = 1e-4  # an undecided direction is accepted if gap and error bar are below this share of the derivative
 MOST_HIDDEN_PARTS = 3
 SMALL_SHARE = 1e-6  # a gap below this share may be the rounding error of an ill-conditioned solve,
@@ -203,13 +201,13 @@ class DerivativeAudit:
             self.base = self.program.start()
             self.point = self.program.point
             if not self.point.size or not self.base.size:
-                empty = "f(x)" if self.point.size else "x"
+                empty = self.program.value_name if self.point.size else "x"
                 self.findings.append(("unsound", f"{empty} has no entries, so there is no derivative to check"))
             elif not np.all(np.isfinite(self.base)):
-                self.findings.append(("unsound", self._non_finite("f(x)", self.base)))
+                self.findings.append(("unsound", self._non_finite(self.program.value_name, self.base)))
             else:
                 self.like = Evaluations(self.program.value, self.point, None, self._steps())
-                self.like.loss_name = LOSS_NAME
+                self.like.loss_name = self.program.value_name
                 self.like.gradient_name = self.title
                 self.like.digits_needed = round(-log10(ACCEPTED_SHARE))
                 self.like.may_extend = not self.options.steps
@@ -320,7 +318,7 @@ class DerivativeAudit:
         for direction in directions.values():
             slope = self.program.push(tree, self.tangent(direction))
             if not np.all(np.isfinite(slope)):
-                self.findings.append(("broken", self._non_finite("jvp(x, t)", slope)))
+                self._note_non_finite_product(slope)
                 return None
             slopes.append(slope)
         return dict(zip(directions, slopes))
@@ -330,7 +328,11 @@ class DerivativeAudit:
         for name, values in zip(self.point.names, self.point.arrays(slope)):
             if not np.all(np.isfinite(values)):
                 where = first_non_finite(values)
-                self.findings.append(("broken", f"vjp(x, g) holds NaN or infinity in {name}{where}"))
+                self.findings.append(("broken", f"{self.program.vjp_name} holds NaN or infinity in {name}{where}"))
+
+    def _note_non_finite_product(self, product: NDArray[Any]) -> None:
+        """Add a finding about the first NaN or infinity of a JVP."""
+        self.findings.append(("broken", self._non_finite(self.program.jvp_name, product)))
 
     def tangent(self, direction: NDArray[Any]) -> NDArray[Any]:
         """Return a direction, rounded to the dtypes of x."""
@@ -410,6 +412,8 @@ class DerivativeAudit:
         slopes: Any = None
         if self.kind == "jvp":
             product = self.program.push(group.evaluations.point.fresh(), self.tangent(direction))
+            if not np.all(np.isfinite(product)):
+                self._note_non_finite_product(product)
             slopes = {name.partition(",")[0]: product}
         line = self._line(name, direction, group, slopes)
         line.sweep([factor * step for factor in SHORT_SWEEP])
@@ -469,8 +473,14 @@ class DerivativeAudit:
         """Return the derivative under test of a vector at x: J^T vector in units of x, or J vector."""
         tree = self.point.fresh()
         if self.kind == "vjp":
-            return self.program.pull(tree, vector) * self.point.units
-        return self.program.push(tree, vector)
+            slope = self.program.pull(tree, vector)
+            if not np.all(np.isfinite(slope)):
+                self._note_non_finite_cotangent(slope)
+            return slope * self.point.units
+        product = self.program.push(tree, vector)
+        if not np.all(np.isfinite(product)):
+            self._note_non_finite_product(product)
+        return product
 
     def difference_along(self, group: Group, evidence: DirectionEvidence, step: float) -> float:
         """Return the central difference quotient of a functional along a direction. The program runs anew."""
@@ -501,13 +511,18 @@ class DerivativeAudit:
         return [eps * norm(part) for part in self.program.result.split(self.base)]
 
     def relative_gap(self, found: NDArray[Any], terms: Sequence[NDArray[Any]], vector: NDArray[Any]) -> float:
-        """Return the largest relative gap between a result of `derivative` and a sum of others, over all leaves."""
+        """Return the largest relative gap between a result of `derivative` and a sum of others, over all leaves.
+
+        It is infinite if the result contains NaN.
+        """
         split = self.point.split if self.kind == "vjp" else self.program.result.split
         parts = zip(split(found), *(split(term) for term in terms))
         gap = 0.0
         for hidden, (value, *leaf_terms) in zip(self.hidden_sizes(vector), parts):
             size = sum(norm(term) for term in leaf_terms)
             difference = norm(value - sum(leaf_terms))
+            if isnan(difference):
+                return inf
             if difference > hidden:
                 gap = max(gap, difference / size if size else inf)
         return gap
@@ -531,8 +546,8 @@ class DerivativeAudit:
         found = self.derivative(combined)
         self.linear_gap = self.relative_gap(found, [a * results[0], b * results[1]], combined)
         allowed = self.allowed(REVIEW.linear_share)
-        argument = ARGUMENTS[self.kind]
-        self.rows.append(Row(f"linear in {argument}", self.linear_gap, allowed, self.linear_gap <= allowed))
+        name = f"linear in {self.program.argument_of(self.kind)}"
+        self.rows.append(Row(name, self.linear_gap, allowed, self.linear_gap <= allowed))
 
     def _test_repetition(self, weights: NDArray[Any], direction: NDArray[Any]) -> None:
         """Compare f(x) and its derivative with their first results, after runs at other points.
@@ -543,21 +558,22 @@ class DerivativeAudit:
         first = self.groups[0].evaluations.slopes * self.point.units if self.kind == "vjp" else self._first_product
         gap = self.relative_gap(self.derivative(vector), [first], vector)
         allowed = self.allowed(REPEATED_SHARE)
-        self.rows.append(Row(f"{self.kind} twice", gap, allowed, gap <= allowed))
+        self.rows.append(Row(f"{self.title} twice", gap, allowed, gap <= allowed))
         self.is_repeatable = gap <= allowed
         if not self.is_repeatable:
-            reason = f"two runs of {self.kind} at x differ by {gap:.1e}: it keeps a state of other runs, or is random"
+            reason = f"two runs of {self.title} at x differ by {gap:.1e}: it keeps a state of other runs, or is random"
             self.findings.insert(0, ("broken", reason))  # it explains why the VJP is not linear either
         again = self.program.value(self.point.fresh())
         size = norm(self.base)
         gap = norm(again - self.base) / (size or 1.0)
         allowed = REPEATED_EPS * self.program.result.eps
-        self.rows.append(Row("f(x) twice", gap, allowed, gap <= allowed))
+        self.rows.append(Row(f"{self.program.value_name} twice", gap, allowed, gap <= allowed))
         if not gap <= allowed:
-            self.findings.append(("unsound", f"two runs of f(x) differ by {gap:.1e}: it is random or keeps a state"))
+            reason = f"two runs of {self.program.value_name} differ by {gap:.1e}: it is random or keeps a state"
+            self.findings.append(("unsound", reason))
+        calls = {"f": self.program.value_name, "vjp": self.program.vjp_name, "jvp": self.program.jvp_name}
         for name, what in self.program.changed.items():
-            call = {"f": "f(x)", "vjp": "vjp(x, g)", "jvp": "jvp(x, t)"}[name]
-            self.findings.append(("broken", f"{call} changes {what} in place"))
+            self.findings.append(("broken", f"{calls[name]} changes {what} in place"))
 
     def _test_duality(self, weights: NDArray[Any], direction: NDArray[Any]) -> None:
         """Compare <w, J d> by the JVP with <J^T w, d> by the VJP."""
@@ -566,9 +582,15 @@ class DerivativeAudit:
         if self.kind == "vjp":
             slope = self.groups[0].evaluations.slopes
             product = self.program.push(tree, tangent)
+            if not np.all(np.isfinite(product)):
+                self._note_non_finite_product(product)
+                return
         else:
             slope = self.program.pull(tree, weights)
             product = self._first_product
+            if not np.all(np.isfinite(slope)):
+                self._note_non_finite_cotangent(slope)
+                return
 
         def difference() -> float:
             tree = self.point.fresh()
@@ -600,7 +622,7 @@ class DerivativeAudit:
         review(self)
         with_directions = [group for group in self.groups if group.directions]
         verdicts = [
-            overall_verdict(directions, self.findings, LOSS_NAME, self.title)
+            overall_verdict(directions, self.findings, self.program.value_name, self.title)
             for directions in [group.directions for group in with_directions] or [[]]
         ]
         for wanted in ("disagrees", "inconclusive", "agrees"):

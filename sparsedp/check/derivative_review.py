@@ -20,7 +20,6 @@ from sparsedp.check.thresholds import REVIEW
 __all__ = ["review", "rounds_in_single_precision"]
 
 ABSOLUTE = "absolute"  # name of directions with steps relative to a whole leaf, if there are relative ones too
-ARGUMENTS = {"vjp": "g", "jvp": "t"}
 SINGLE_EPS = float(np.finfo(np.float32).eps)
 
 
@@ -111,7 +110,7 @@ def _is_not_linear(audit: Any) -> bool:
     """Return whether a gap of linearity is explained without an inexact solve, and add a finding then."""
     gap = audit.linear_gap
     allowed = audit.allowed(REVIEW.linear_share)
-    argument = ARGUMENTS[audit.kind]
+    argument = audit.program.argument_of(audit.kind)
     vector, _ = audit.pairs[0]
     if norm(audit.derivative(0 * vector)):
         return _find_broken(audit, "is not linear: for a vector of zeros it does not return zeros")
@@ -120,10 +119,10 @@ def _is_not_linear(audit: Any) -> bool:
         return _find_broken(audit, f"is a staircase of {argument}: some of its numbers are rounded, maybe to integers")
     if roughness is None or roughness > REVIEW.rough_share:
         if gap > allowed:
-            reason = f"{audit.kind} has rounding errors of {gap:.1e}: the problem is too ill-conditioned to tell"
+            reason = f"{audit.title} has rounding errors of {gap:.1e}: the problem is too ill-conditioned to tell"
             audit.findings.append(("unsound", reason))
         else:
-            audit.findings.append(("note", f"{audit.kind} has the rounding errors of single precision, {gap:.0e}"))
+            audit.findings.append(("note", f"{audit.title} has the rounding errors of single precision, {gap:.0e}"))
         return True
     if gap > max(REVIEW.nonlinear_gap, allowed):
         return _find_broken(audit, f"is not linear in {argument}: it is off by {gap:.1e}")
@@ -151,21 +150,21 @@ def _review_inexact_derivative(audit: Any, suspects: Sequence[DirectionEvidence]
     for direction in suspects:
         direction.word = "noise"
         direction.note = (
-            f"off by {direction.share:.1e}, and {audit.kind} is linear only to {gap:.0e}: "
+            f"off by {direction.share:.1e}, and {audit.title} is linear only to {gap:.0e}: "
             "a solve in it may be inexact, tighten its tolerance"
         )
     if is_visible and not suspects:
-        audit.findings.append(("note", f"{audit.kind} is linear only to {gap:.0e}: a solve in it may be inexact"))
+        audit.findings.append(("note", f"{audit.title} is linear only to {gap:.0e}: a solve in it may be inexact"))
 
 
 def _linear_only(audit: Any) -> str:
     """Return a phrase with the gap of linearity."""
-    return f"is linear in {ARGUMENTS[audit.kind]} only to {audit.linear_gap:.0e}"
+    return f"is linear in {audit.program.argument_of(audit.kind)} only to {audit.linear_gap:.0e}"
 
 
 def _find_broken(audit: Any, words: str) -> bool:
     """Add the finding that the derivative is wrong. Return True."""
-    audit.findings.append(("broken", f"{audit.kind} {words}"))
+    audit.findings.append(("broken", f"{audit.title} {words}"))
     return True
 
 

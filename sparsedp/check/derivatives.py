@@ -273,6 +273,8 @@ def jacobian(
 
     program = Program(subject.function, subject.x, pull, push, "transpose")
     program.takes_arrays = True
+    program.vjp_name = "the product of the transposed Jacobian with g"
+    program.jvp_name = "the product of the Jacobian with t"
     return _audited(DerivativeAudit(program, options, "vjp", True, "the Jacobian"), "jacobian")
 
 
@@ -381,6 +383,8 @@ def hessian(
     _require_point("check.hessian", x)
     loss = Program(f, x, None, product, None)
     program = loss if gradient is None else Program(gradient, x, None, product, None)
+    if gradient is not None:
+        program.value_name = "gradient(x)"
     for of_vectors in (loss, program):
         of_vectors.takes_arrays = not has_products
         of_vectors.jvp_name = "H(x, v)"

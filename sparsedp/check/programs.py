@@ -157,8 +157,8 @@ class Program:
         Number of runs of "f", "vjp" and "jvp".
     changed : dict
         Name of an argument that a run changed in place, by name of the function that ran.
-    jvp_name : str
-        The call of the JVP, for messages.
+    value_name, vjp_name, jvp_name : str
+        The calls of the function, of the VJP and of the JVP, for messages.
     jvp_result : Packing or None
         The structure of the JVP if it is not that of f(x).
     takes_arrays : bool
@@ -186,6 +186,8 @@ class Program:
         self._jvp = jvp
         self.given_convention = convention
         self.convention = convention or self.library.convention
+        self.value_name = "f(x)"
+        self.vjp_name = "vjp(x, g)"
         self.jvp_name = "jvp(x, t)"
         self.jvp_result: Packing | None = None
         self.takes_arrays = False
@@ -208,8 +210,10 @@ class Program:
         for leaf in leaves(arrays):
             if np.asarray(leaf).dtype == object:
                 kind = "an array of objects" if isinstance(leaf, np.ndarray) else type(leaf).__name__
-                raise TypeError(f"f(x) must be an array or a tree of arrays, got {kind}; return arrays of numbers")
-        self.result = Packing(mapped(np.array, arrays), "f(x)")
+                raise TypeError(
+                    f"{self.value_name} must be an array or a tree of arrays, got {kind}; return arrays of numbers"
+                )
+        self.result = Packing(mapped(np.array, arrays), self.value_name)
         return joined(self.result.values)
 
     def _first_value(self) -> Any:
@@ -244,7 +248,7 @@ class Program:
 
     def value(self, tree: Any) -> NDArray[Any]:
         """Run f for a tree of NumPy arrays, and return its value as a vector."""
-        return joined(self._like_result(self.library.arrays(self._run(tree)), "f(x)"))
+        return joined(self._like_result(self.library.arrays(self._run(tree)), self.value_name))
 
     def _like_result(self, value: Any, name: str, result: Packing | None = None) -> list[NDArray[Any]]:
         """Return the leaves of a tree that must have the structure and the shapes of f(x), or of another result."""
@@ -278,6 +282,12 @@ class Program:
                 if _bytes_of(self.library.arrays(argument)) != bytes_before:
                     self.changed.setdefault(name, ("x", "its cotangent or tangent")[number])
         return value
+
+    def argument_of(self, kind: str) -> str:
+        """Return the name of the vector that the VJP or the JVP takes, for messages."""
+        if kind == "vjp":
+            return "g"
+        return "v" if self.jvp_name == "H(x, v)" else "t"
 
     def rounded(self, weights: NDArray[Any]) -> NDArray[Any]:
         """Return weights of the result, rounded to the dtypes of its leaves."""
@@ -316,14 +326,14 @@ class Program:
                 slopes = self._own("vjp", tree, g)
             else:
                 slopes = self.library.arrays(self._watched("vjp", self._vjp, tree, g))
-        slopes = self._like_x(slopes, "vjp(x, g)")
+        slopes = self._like_x(slopes, self.vjp_name)
         if (self.convention == "adjoint") != conjugate_result:
             slopes = mapped(_conjugated, slopes)
         try:
             self._check_leaves(slopes)
             return self.point.gradient(slopes)
         except (DerivativeError, ShapeError) as error:
-            raise WrongResult(str(error).replace("gradient", "vjp(x, g)", 1)) from error
+            raise WrongResult(str(error).replace("gradient", self.vjp_name, 1)) from error
 
     def _check_leaves(self, slopes: Any) -> None:
         """Raise an error for a complex cotangent of a real leaf of x, and note one that has less precision than x."""
@@ -334,7 +344,7 @@ class Program:
             if not np.iscomplexobj(values):
                 real_part(name, part)
             if part.dtype.kind in "fc" and np.finfo(part.dtype).eps > np.finfo(values.dtype).eps:
-                self.less_precise = f"vjp(x, g) returns {part.dtype}, but x has {values.dtype}"
+                self.less_precise = f"{self.vjp_name} returns {part.dtype}, but x has {values.dtype}"
 
     def push(self, tree: Any, tangent: NDArray[Any]) -> NDArray[Any]:
         """Return J tangent at a tree by the JVP under test.

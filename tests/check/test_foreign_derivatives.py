@@ -207,6 +207,43 @@ def test_a_random_vjp_has_no_rounding_errors():
     assert result.reason.startswith("two runs of vjp at x differ by") and result.reason.endswith("or is random")
 
 
+@pytest.mark.parametrize("check", [VJP, JVP])
+@pytest.mark.parametrize("number", [2, 3, 4, 5])
+def test_nan_in_a_later_run_of_a_derivative(check, number):
+    """A gap that is NaN is not below a limit."""
+    runs = []
+
+    def derivative(u, g):
+        runs.append(number)
+        return 2 * u * g if len(runs) < number else np.full(12, np.nan)
+
+    result = check(lambda u: u**2, derivative, X)
+    assert result.verdict == "disagrees" and ("NaN" in result.reason or "two runs" in result.reason), result
+
+
+def test_nan_in_the_other_derivative():
+    result = VJP(cube, cube_vjp, X, jvp=lambda u, t: np.nan * t)
+    assert result.verdict == "disagrees" and result.reason == "jvp(x, t) holds NaN or infinity, the first at 0"
+    result = JVP(cube, lambda u, t: 3 * u**2 * t, X, vjp=lambda u, g: np.nan * g)
+    assert result.verdict == "disagrees" and result.reason == "vjp(x, g) holds NaN or infinity in x, the first at 0"
+
+
+def test_hessians_and_jacobians_are_named_as_they_were_given():
+    loss = lambda u: np.sum(u**4)
+    slope = lambda u: 4 * u**3
+    wrong = dp.check.hessian(loss, lambda u, v: 12 * u * v, X, gradient=slope)
+    assert wrong.result_gaps[0].startswith("gradient(x)[")
+    assert [row.name for row in wrong.identities[:3]] == ["linear in v", "the Hessian twice", "gradient(x) twice"]
+    for gradient in (None, slope):
+        infinite = dp.check.hessian(loss, lambda u, v: np.inf * v, X, gradient=gradient)
+        assert infinite.verdict == "disagrees" and "holds NaN or infinity" in infinite.reason, infinite
+        assert "jvp" not in infinite.reason and "symmetric" not in infinite.reason
+    infinite = dp.check.hessian(loss, lambda u, v: v, X, gradient=lambda u: np.nan * u)
+    assert infinite.reason.startswith("gradient(x) is not the gradient of f, gradient(x) holds NaN or infinity in x")
+    infinite = dp.check.jacobian(cube, np.full((12, 12), np.nan), X)
+    assert infinite.reason.startswith("the product of the transposed Jacobian with g holds NaN or infinity in x")
+
+
 @pytest.mark.parametrize("scale", [1e-300, 1e300])
 def test_the_norm_of_huge_and_tiny_values(scale):
     with warnings.catch_warnings():
