@@ -82,6 +82,7 @@ EXAMPLES = {
     "dp.rollout": "dp.rollout(step, start, params, n), with params=None if the step has none",
     "dp.save": "dp.save('run.npz', grid, u=u)",
     "dp.stepper": "dp.stepper('rk4', rate, dt)",
+    "dp.testing.assert_gradient": "dp.testing.assert_gradient(f, x, vjp=vjp)",
 }
 
 

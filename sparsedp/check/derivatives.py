@@ -278,15 +278,29 @@ def jacobian(
     return _audited(DerivativeAudit(program, options, "vjp", True, "the Jacobian"), "jacobian")
 
 
-def gradient_as_vjp(f: Any, gradient: Any, x: Any, **options: Any) -> DerivativeCheck:
+def gradient_as_vjp(
+    f: Any,
+    gradient: Any,
+    x: Any,
+    *,
+    directions: int = 1,
+    steps: Sequence[float] | None = None,
+    rng: int | np.random.Generator | None = None,
+    grid: Any = None,
+    noise: float = 0.0,
+    convention: str | None = None,
+    beside: bool = True,
+    stages: Sequence[Any] | None = None,
+) -> DerivativeCheck:
     """Check the gradient of a loss of another library as its VJP, g * gradient(x)."""
 
     def pull(x: Any, g: Any) -> Any:
         slopes = gradient(x) if callable(gradient) else gradient
         return mapped(lambda slope: g * slope, slopes)
 
-    options = {"beside": callable(gradient), **options}
-    return _changed(vjp(f, pull, x, **options), kind="gradient")
+    options = _options("check.gradient", directions, steps, rng, grid, noise, beside and callable(gradient))
+    result = _checked_with_stages("vjp", f, {"vjp": pull}, x, options, convention, stages, "gradient(x)")
+    return _changed(result, kind="gradient")
 
 
 def transposed_products(op: Operator) -> DerivativeCheck:
@@ -441,20 +455,27 @@ def _checked_with_stages(
     options: Options,
     convention: str | None,
     stages: Sequence[Any] | None,
+    title: str = "",
 ) -> DerivativeCheck:
-    """Check the VJP or JVP of a program, and of its stages if the whole is wrong."""
+    """Check the VJP or JVP of a program, and of its stages if the whole is wrong. The title names a derivative."""
     if stages is None:
-        return _checked(kind, f, derivatives, x, options, convention)
+        return _checked(kind, f, derivatives, x, options, convention, title)
     chain = Chain(stages, kind)
     f, derivative = chain.completed(f, derivatives[kind])
-    result = _checked(kind, f, {**derivatives, kind: derivative}, x, options, convention)
+    result = _checked(kind, f, {**derivatives, kind: derivative}, x, options, convention, title)
     if result.verdict != "disagrees":
         return result
     return _with_stage(result, chain, x, options, convention)
 
 
 def _checked(
-    kind: str, f: Any, derivatives: dict[str, Any], x: Any, options: Options, convention: str | None
+    kind: str,
+    f: Any,
+    derivatives: dict[str, Any],
+    x: Any,
+    options: Options,
+    convention: str | None,
+    title: str = "",
 ) -> DerivativeCheck:
     """Check the VJP or JVP of a program. The given derivatives, by name, take the place of its own ones."""
     name = f"check.{kind}"
@@ -468,8 +489,10 @@ def _checked(
     program = Program(
         subject.function, subject.x, chosen.get("vjp"), chosen.get("jvp"), convention or subject.convention
     )
+    if title:
+        program.vjp_name = title
     both = all(word in chosen for word in DERIVATIVES)
-    return _audited(DerivativeAudit(program, options, kind, both), kind)
+    return _audited(DerivativeAudit(program, options, kind, both, title), kind)
 
 
 def _audited(audit: DerivativeAudit, title: str) -> DerivativeCheck:

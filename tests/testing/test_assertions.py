@@ -85,6 +85,10 @@ def test_losses_and_modules_of_torch():
     assert assert_gradient(lambda u: torch.sum(u**3), x, gradient=3 * x**2)
     with pytest.raises(AssertionError, match="^the gradient disagrees: "):
         assert_gradient(lambda u: torch.sum(u**3), x, gradient=lambda u: 3.01 * u**2)
+    with pytest.raises(AssertionError, match=r"^the gradient disagrees: gradient\(x\) holds NaN or infinity in x"):
+        assert_gradient(lambda u: torch.sum(u**3), x, gradient=lambda u: np.nan * u)
+    with pytest.raises(AssertionError, match=r"by differences, \S+ by gradient\(x\)"):
+        assert_gradient(lambda u: torch.sum(u**3), x, gradient=lambda u: 3 * u)
 
 
 WRONG = {

@@ -81,6 +81,12 @@ MESSAGES = [
         "max_cells of testing.grids must be a whole number >= 1, got 0; the default is 6",
     ),
     (
+        lambda: assert_gradient(total, lambda u, g: g, X),
+        TypeError,
+        "dp.testing.assert_gradient takes 2 arguments by position, got 3; "
+        "write dp.testing.assert_gradient(f, x, vjp=vjp)",
+    ),
+    (
         lambda: assert_gradient(total, X, gradient=2 * SLOPE),
         AssertionError,
         "the gradient disagrees: along ",
