@@ -128,7 +128,7 @@ WRONG = [
     (
         lambda: dp.inverse(dp.laplacian(GRID), method="cg"),
         ValueError,
-        "method must be one of auto, separable, direct, structured, multigrid, krylov, got 'cg'; write 'krylov'",
+        "method must be one of auto, separable, direct, structured, multigrid, krylov, schur, got 'cg'; write 'krylov'",
     ),
     (
         lambda: dp.inverse(dp.laplacian(GRID), tol=1e-3),

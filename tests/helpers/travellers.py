@@ -250,7 +250,7 @@ def travellers():
     yield "elliptic_solver", "", solve, lambda solve: bits(solve, k, b, 0.5)
     K = np.eye(GRID.dim).reshape(GRID.dim, GRID.dim, *[1] * GRID.dim) + 0.1 * np.ones(GRID.shape)
     body = dp.cut_cells(GRID, numbers(GRID.nodes.shape) + 1.0, dp.dirichlet, dp.robin(1.0, 0.5))
-    yield "cut_cells", "", body, lambda body: bits(body.solve, b, b, None, k)
+    yield "cut_cells", "", body, lambda body: bits(lambda b, values, k: body.solve(b, values, None, k), b, b, k)
     yield "elliptic_solver", "tensors", solve, lambda solve: bits(solve, K, b, 0.5)
     waves = dp.elliptic_solver(solve.D, solve.G, "krylov", preconditioner="shifted_laplace")
     yield "elliptic_solver", "waves", waves, lambda solve: bits(lambda k, b: anp.real(solve(k, b, -1 - 0.5j)), k, b)
@@ -352,6 +352,7 @@ NOTHING_TO_CALL = {
     "matched_layer",
     "steady",
     "continuation",
+    "free_faces",
     "distribute",
     "gather",
     "flatten",
