@@ -29,7 +29,7 @@ n = options.cells
 # The viscosity is :math:`\dot\gamma^{m - 1}` with the shear rate :math:`\dot\gamma`. A constant force pushes the fluid
 # between two walls at rest. Far from the start the stress is linear across the channel, and the speed is
 #
-# .. math:: u(y) = \frac{m}{m + 1} \left( 2^{-1 - 1/m} - |y - \tfrac12|^{1 + 1/m} \right) .
+# .. math:: u(y) = \frac{m}{m + 1} \left( 2^{-1 - 1/m} - |y - \tfrac{1}{2}|^{1 + 1/m} \right) .
 #
 # The small number in the law keeps the viscosity finite in the middle of the channel, where the shear rate is 0.
 

@@ -218,7 +218,7 @@ def elliptic_solver(
 
     See Also
     --------
-    cut_cells, eigenpairs, harmonic_average, inverse, matrix_solver
+    cut_cells, eigenpairs, harmonic_average, inverse, matched_layer, matrix_solver
 
     Notes
     -----
