@@ -88,8 +88,8 @@ TABLE = [
     (
         lambda: dp.inverse(L, U),
         ValueError,
-        "method must be one of auto, separable, direct, structured, multigrid, krylov, got an array of shape (4, 3); "
-        "write dp.inverse(op)(b) for a right-hand side b",
+        "method must be one of auto, separable, direct, structured, multigrid, krylov, schur, got an array "
+        "of shape (4, 3); write dp.inverse(op)(b) for a right-hand side b",
     ),
     (
         lambda: dp.projection(GRID, np.ones(GRID.faces.size)),
