@@ -5,6 +5,7 @@ from textwrap import dedent
 
 import autograd.numpy as anp
 import numpy as np
+import pytest
 from sources import ROOT
 
 import sparsedp as dp
@@ -12,6 +13,7 @@ from sparsedp.advection import transport
 from sparsedp.kernels import fluxes
 
 
+@pytest.mark.whole
 def test_example_of_contributing(monkeypatch):
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     scheme, order = [dedent(block) for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL)]

@@ -118,7 +118,8 @@ def loop_of(limiter):
     return fluxes.slope_loop("other", limiter, cache=False)
 
 
-@pytest.mark.parametrize("limiter", [minmod, pytest.param(parabola, marks=pytest.mark.whole)])
+@pytest.mark.whole
+@pytest.mark.parametrize("limiter", [minmod, parabola])
 @pytest.mark.parametrize("velocity, form", FORMS)
 def test_custom_limiters(limiter, velocity, form, monkeypatch):
     """A limiter function and an entry of SCHEMES give the loops, the tangent and the cotangents."""

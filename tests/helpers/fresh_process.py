@@ -68,9 +68,15 @@ def _run(program, is_script, arguments, folder, environment, output, errors):
     os.chdir(folder)
     sys.dont_write_bytecode = "PYTHONDONTWRITEBYTECODE" in environment
     first = [str(Path(program).parent) if is_script else str(folder), *environment["PYTHONPATH"].split(os.pathsep)]
-    sys.path[:] = [*first, *(path for path in sys.path if not Path(path).resolve().is_relative_to(ROOT))]
+    sys.path[:] = [*first, *(path for path in sys.path if not _is_of_this_checkout(path))]
     sys.argv = [program, *arguments]
     if is_script:
         runpy.run_path(program, run_name="__main__")
     else:
         runpy.run_module(program, run_name="__main__", alter_sys=True)
+
+
+def _is_of_this_checkout(path):
+    """Return whether a folder of sys.path has modules of this package or its tests; an environment in it has not."""
+    folder = Path(path).resolve()
+    return folder.is_relative_to(ROOT) and not folder.is_relative_to(Path(sys.prefix).resolve())

@@ -66,7 +66,7 @@ NEEDS = {
     "volume_to_point.py": ["nlopt"],
     "pylops_exchange.py": ["pylops"],
 }  # libraries that need not be there
-DEFAULT = {"heat_rod.py", "new_operator.py", "plan.py", "pressure_projection.py", "two_families.py"}
+DEFAULT = {"heat_rod.py", "new_operator.py"}
 
 
 def marks(name):

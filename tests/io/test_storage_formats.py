@@ -130,6 +130,7 @@ def test_a_folder_that_cannot_take_its_name_leaves_the_old_one_or_is_whole(kind,
         assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("suffix", [*SUFFIXES, ".vtr"])
 def test_no_room(suffix, tmp_path):
     """The process goes on: HDF5 ends it when it finds no room itself."""
