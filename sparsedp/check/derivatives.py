@@ -523,8 +523,16 @@ def _with_stage(
         name, reason = undecided[0]
         note = f"culprit: {name}, as all other stages agree: {reason}"
         return _changed(result, culprit=name, notes=(note, *_gap_notes(result.gaps, result.result_gaps)))
-    note = "culprit: no stage is wrong; the stages may be put together wrongly"
-    return _changed(result, culprit=None, notes=(note, *_gap_notes(result.gaps, result.result_gaps)))
+    if undecided:
+        names = ", ".join(name for name, _ in undecided)
+        note = f"culprit: one of {names}, which are inconclusive, as all other stages agree"
+        return _changed(result, culprit=None, notes=(note, *_gap_notes(result.gaps, result.result_gaps)))
+    culprit = "the composition of the stages"
+    note = (
+        f"culprit: {culprit}, as each stage agrees alone: f may have other stages, or their derivatives are taken in "
+        "another order or at other points"
+    )
+    return _changed(result, culprit=culprit, notes=(note, *_gap_notes(result.gaps, result.result_gaps)))
 
 
 def _changed(result: DerivativeCheck, **values: Any) -> DerivativeCheck:

@@ -548,7 +548,7 @@ def _with_a_significant_gap(evidence: DirectionEvidence) -> tuple[str, str]:
     if evidence.jitter < THRESHOLDS.rounding_noise or is_difference:
         return "disagrees", f"{off}, with error bars of {evidence.resolution:.1e}"
     loss = evidence.line.evaluations.loss_name
-    return "noise", f"{loss} is noisy or chaotic: differences see no derivative at all"
+    return "noise", f"{loss} is noisy, chaotic, or curved below the smallest step: differences see no derivative at all"
 
 
 def _with_a_small_gap(evidence: DirectionEvidence) -> tuple[str, str]:

@@ -379,7 +379,7 @@ def test_stages_that_are_right():
     assert VJP(None, x=FIELD, stages=stages).verdict == "agrees"
     assert JVP(None, x=FIELD, stages=[(cube, lambda u, t: 3 * u**2 * t), (np.sin, lambda u, t: np.cos(u) * t)])
     other = VJP(lambda u: 2 * np.sin(smooth(cube(u))), x=FIELD, stages=stages)
-    assert other.verdict == "disagrees" and other.culprit is None and "no stage is wrong" in str(other)
+    assert other.verdict == "disagrees" and other.culprit == "the composition of the stages"
 
 
 def test_stages_that_are_none():
