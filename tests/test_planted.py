@@ -3,6 +3,7 @@
 They are caught by what runs by default. All of it:  python -m pytest -m slow tests/test_planted.py
 """
 
+import itertools
 import os
 import shutil
 from typing import NamedTuple
@@ -12,6 +13,8 @@ from fresh_process import run_python
 from launch import MISSING
 from planted_on_ranks import BUGS_ON_RANKS
 from sources import ROOT
+
+TIMES = itertools.count(1_000_000_000)  # in seconds, for write_as_changed
 
 
 class Bug(NamedTuple):
@@ -1389,6 +1392,13 @@ def copied(tmp_path_factory):
     return folder
 
 
+def write_as_changed(path, text):
+    """Write a file with a time of its own: bytecode of a text of the same length and second would be taken for its."""
+    path.write_text(text, encoding="utf-8")
+    time = next(TIMES)
+    os.utime(path, (time, time))
+
+
 def failures(folder, tests, compiled=False):
     """Run tests in a copy; return (exit code, output). With the plain kernels nothing is compiled again."""
     environment = {**os.environ, "PYTHONPATH": str(folder), "SPARSEDP_NUMBA": str(int(compiled))}
@@ -1422,9 +1432,9 @@ def test_it_is_caught(copied, name):
         pytest.skip(f"not here: {', '.join(MISSING)}")
     path, text = planted(copied, bug)
     right = path.read_text(encoding="utf-8")
-    path.write_text(text, encoding="utf-8")
+    write_as_changed(path, text)
     try:
         code, printed = failures(copied, bug.tests, bug.compiled)
     finally:
-        path.write_text(right, encoding="utf-8")
+        write_as_changed(path, right)
     assert code == 1 and " failed" in printed, f"not caught:\n{printed[-2000:]}"
