@@ -332,7 +332,7 @@ class CutCells(Reconstructible):
     def _slopes(self, u, values):
         """Return the slopes at the wall for a field on the cells and given values on the cut cells."""
         if not self._condition.a:
-            return values
+            return values / self._condition.b
         slope = self._wall_slope
         terms = slope.coefficients * anp.reshape(u, (-1,))[slope.cells]
         return self._sum_of_pairs(terms) + slope.of_value * values
@@ -541,6 +541,8 @@ class CutCells(Reconstructible):
         given = self._wall_values(values)
         if self._condition.a:
             given = self._wall_slope.of_value * given
+        else:
+            given = given / self._condition.b
         return self._geometry.areas * self._wall_coefficient(k, wall_k) * given
 
     def _entries(self, k, wall_k, shift):
@@ -714,7 +716,7 @@ def _in_double(field):
 
 def _in_dtype_of(field, result):
     """Return a real result in single precision if the field is in single precision."""
-    if dtype_of(result).kind != "f":
+    if dtype_of(result).kind != "f" or dtype_of(field).kind not in "fc":
         return result
     return cast(result, np.result_type(dtype_of(field), np.float32))
 

@@ -1,6 +1,7 @@
 """cut_cells: geometry of planes, exact linear solutions, limits, orders around and inside of a disc, derivatives."""
 
 import autograd.numpy as np
+import numpy as onp
 import pytest
 
 import sparsedp as dp
@@ -451,3 +452,18 @@ def test_errors_name_the_argument():
         r"body.solve\(b\)$",
     ):
         dp.grad(lambda r: np.sum(dp.cut_cells(GRID, lambda x, y: x - r).laplacian(ONES)))(0.5)
+
+
+def test_a_robin_condition_without_u_divides_by_b(rng):
+    """robin(0, b) with the value b g is neumann with the value g, and the dtype of whole numbers is that of floats."""
+    grid = dp.Grid((8, 8), size=2.0, origin=-1.0)
+    bodies = [
+        dp.cut_cells(grid, lambda x, y: 0.7 - np.sqrt(x**2 + y**2), solid_boundary=wall)
+        for wall in (dp.robin(0.0, 2.0), dp.neumann)
+    ]
+    b = rng.standard_normal(grid.shape)
+    scaled, plain = (body.solve(b, values=value, shift=1.0) for body, value in zip(bodies, (2.0, 1.0), strict=True))
+    onp.testing.assert_allclose(scaled, plain, rtol=1e-12)
+    slopes = [body.slopes(b, value) for body, value in zip(bodies, (2.0, 1.0), strict=True)]
+    onp.testing.assert_allclose(*slopes, rtol=1e-14)
+    assert bodies[1].diffusion(onp.ones(grid.shape, onp.int8)).dtype == float
