@@ -89,6 +89,11 @@ class Unit(NamedTuple):
     base: Any
     exponents: dict[str, float]
 
+    @property
+    def is_one(self) -> bool:
+        """Whether a number without a unit is in this unit; one of degrees or per cent could be in radians or 1."""
+        return not self.exponents and self.size == 1
+
 
 class ScaledRun(NamedTuple):
     """The comparison of one entry of the result in two systems of units.
@@ -297,7 +302,7 @@ class SceneWithUnits(Reconstructible):
     def _magnitude(self, place: str, name: str | None, leaf: Any) -> Any:
         """Return a value in base units."""
         if not hasattr(leaf, "dimensionality"):
-            if name is None or leaf is None or not self._units[name].exponents:
+            if name is None or leaf is None or self._units[name].is_one:
                 return leaf
             raise TypeError(
                 f"{place} of {self.name} must be a Quantity with a unit like {name}, got {type(leaf).__name__}; write "

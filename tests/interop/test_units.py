@@ -108,3 +108,9 @@ def test_scenes_on_a_grid():
     scene = dp.interop.with_units(controlled, ({"t": "s", "k": "1/s", "u": "m"},), "m")
     report = scene.check({"t": Q(1.0, "s"), "k": Q(3.0, "1/s"), "u": Q(np.ones(2), "m")})
     assert {run.dimension for run in report.runs if run.deviation > 1e-6} == {"length"}
+
+
+def test_a_number_without_a_unit_is_not_taken_for_degrees():
+    scene = dp.interop.with_units(np.sin, ("degree",), "")
+    with pytest.raises(TypeError, match=r"^argument 0 of with_units\(sin\) must be a Quantity with a unit like degree"):
+        scene(90.0)
