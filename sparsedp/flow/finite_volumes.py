@@ -407,6 +407,7 @@ class FiniteVolumes(Reconstructible):
         check_number("cfl of time_step", cfl, "> 0", "; write cfl=0.4")
         u = plain(self._checked_state(u))
         params = mapped(plain, params)
+        self._check_states(u, params)
         rates = sum(self._fastest_waves(axis, u, params) / axis.widths for axis in self.axes)
         largest = np.max(rates, initial=0.0)
         if largest:

@@ -306,3 +306,14 @@ def test_small_and_empty_grids():
         assert law(u).shape == u.shape
     thin = np.array([[1e-14, 1e-300, 0.0, 0.0], [1.0, 1.0, 1.0, 0.0]])
     assert np.all(np.isfinite(dp.shallow_water(dp.Grid(4))(thin)))
+
+
+@pytest.mark.parametrize("wrong", [-1.0, np.nan])
+def test_a_step_length_of_an_invalid_state_is_refused_as_its_rate(wrong):
+    law = dp.shallow_water(dp.Grid(4), np.zeros(4))
+    u = np.array([[1.0, wrong, 1.0, 1.0], [0.0, 0.0, 0.0, 0.0]])
+    with pytest.raises(ValueError) as of_rate:
+        law(u)
+    with pytest.raises(ValueError) as of_step:
+        law.time_step(u)
+    assert str(of_step.value) == str(of_rate.value)
