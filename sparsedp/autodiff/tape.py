@@ -1362,6 +1362,13 @@ def dtype_of(value: Any) -> np.dtype:
     return np.asarray(value).dtype
 
 
+def real_dtype(dtype: np.dtype) -> np.dtype:
+    """Return the dtype of the real parts of numbers, float64 for integers and bools."""
+    if dtype.kind not in "fc":
+        return np.dtype(float)
+    return np.empty(0, dtype).real.dtype
+
+
 def cast(g: Any, dtype: DTypeLike) -> Any:
     """Convert an array, plain or traced, to another dtype; take the real part if the dtype is real."""
     if dtype_of(g).kind == "c" and np.dtype(dtype).kind == "f":

@@ -17,7 +17,7 @@ import scipy.sparse as sp
 
 from sparsedp._utils.validation import check_finite, check_kind
 from sparsedp.autodiff.program_trace import check_values
-from sparsedp.autodiff.tape import cast, dtype_of, isbox, sample
+from sparsedp.autodiff.tape import cast, dtype_of, isbox, real_dtype, sample
 from sparsedp.errors import ShapeError
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.operators.harmonic import lower_share
@@ -86,7 +86,7 @@ class WeightedProjection:
             return 1.0
         if shape == grid.cells.shape:
             value = self._to_faces(value)
-        return cast(value, dtype)
+        return cast(value, real_dtype(dtype))
 
     def split(self, v: Any, density: Any) -> tuple[Any, Any]:
         """Return the velocity without divergence, and the q of the module docstring."""

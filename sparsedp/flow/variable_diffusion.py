@@ -22,7 +22,7 @@ import numpy as np
 from sparsedp._utils.pytree import mapped
 from sparsedp._utils.validation import check_finite, check_kind, check_number, check_on, place
 from sparsedp.autodiff.program_trace import check_values, sample
-from sparsedp.autodiff.tape import cast, dtype_of, isbox
+from sparsedp.autodiff.tape import cast, dtype_of, isbox, real_dtype
 from sparsedp.autodiff.tape_constants import frozen
 from sparsedp.flow.diffusion import check_stable, spectral_bound
 from sparsedp.flow.settings import takes_params_alone
@@ -126,7 +126,7 @@ class Coefficient:
             self._check(value)
         if np.shape(sample(value)) == ():
             return value
-        return cast(value, np.empty(0, dtype).real.dtype)
+        return cast(value, real_dtype(dtype))
 
     def _check(self, value: Any) -> None:
         if np.shape(sample(value)) != ():

@@ -369,3 +369,18 @@ def test_derivatives_of_all_orders_and_modes(implicit, rng):
 
 def scaled(function, tree):
     return {key: function(leaf) for key, leaf in tree.items()}
+
+
+def test_whole_numbers_are_floats():
+    """Fields of integers give the results of their float64 copies: density and diffusivity are not rounded."""
+    grid = dp.Grid((2, 2))
+    density = np.array([[1.2, 1.9], [3.3, 4.0]])
+    project = dp.projection(grid)
+    v = np.arange(grid.faces.size)
+    np.testing.assert_array_equal(project(v, density), project(v * 1.0, density))
+    np.testing.assert_array_equal(project(v, 0.5), project(v * 1.0, 0.5))
+    step = dp.flow_step(grid, 0.01, scalars={"h": {"diffusivity": np.full(grid.shape, 0.9)}})
+    h = np.array([[0, 1], [2, 4]])
+    found = step(step.start(0.0 * v, None, {"h": h}), None)["s"]["h"]
+    np.testing.assert_allclose(found, step(step.start(0.0 * v, None, {"h": 1.0 * h}), None)["s"]["h"], rtol=1e-15)
+    assert np.any(found != h)
