@@ -75,7 +75,7 @@ def potential(cells, radius=WIRE):
 
 
 def potential_error(cells):
-    """The largest error of the potential in cells with their centre between the walls, and that of the charge."""
+    """The largest error of the potential in cells with their centre between the walls, and the error of the charge."""
     u, charge, body = potential(cells)
     r = distance(*body.grid.centres())
     between = (r > WIRE) & (r < PIPE)

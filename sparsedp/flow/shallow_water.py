@@ -14,7 +14,7 @@ depths are
 
     h_lower* = max(0, h_lower - max(0, z_upper - z_lower)),   h_upper* = max(0, h_upper - max(0, z_lower - z_upper)),
 
-and the numerical flux F (Harten, Lax and van Leer) is that of the states (h*, h* v). The cell below feels F, and the
+and F is the flux of Harten, Lax and van Leer for the states (h*, h* v). The cell below feels F, and the
 pressure g (h_lower^2 - h_lower*^2) / 2 of the step of the ground. Inside the cell the weight of the water on the slope
 is g h (z_upper_end - z_lower_end). Since the sum of the depths at both ends is 2 h, all terms that do not vanish at
 rest add up to
@@ -349,7 +349,7 @@ class ShallowWater(FiniteVolumes):
         carried = lower_share * lower_mass * lower_velocity + upper_share * upper_mass * upper_velocity
         carried = carried + diffusion * (upper_depth * upper_velocity - lower_depth * lower_velocity)
 
-        # The pressure without that of the side of the face in the cell: exactly 0 if the depths are equal.
+        # The difference of the pressures at both sides of the face: exactly 0 if the depths are equal.
         pressure_jump = 0.5 * g * (upper_depth - lower_depth) * (upper_depth + lower_depth)
         normal = (np.arange(len(u) - 1) == axis.number).reshape(-1, *[1] * self.grid.dim)
         for_cell_below = carried + normal * (upper_share * pressure_jump)

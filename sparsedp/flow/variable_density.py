@@ -35,7 +35,7 @@ __all__ = ["WeightedProjection", "density_on_faces"]
 
 
 def density_on_faces(grid: Grid) -> Operator:
-    """Return the Operator from a density in cells to that of the control volumes of faces.
+    """Return the Operator from a density in cells to the density of the control volumes of faces.
 
     Parameters
     ----------

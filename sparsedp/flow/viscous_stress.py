@@ -10,7 +10,7 @@ where C is the divergence over the control volumes. On edges mu is the harmonic 
 the stress between two layers of fluid is exact.
 
 T v affects only faces whose velocity is unknown. On the ends of an axis it is chosen so that C T v is the gradient of
-the divergence, which is 0: there dv_a/dx_c = 0, and dv_c/dx_c is that of the last cell. For a constant viscosity L(mu)
+the divergence, which is 0: there dv_a/dx_c = 0, and dv_c/dx_c is as in the last cell. For a constant viscosity L(mu)
 therefore equals mu times `face_laplacian`, at outflow boundaries too.
 """
 
@@ -218,7 +218,7 @@ class ViscousStress(DiffusionForm):
 
 
 def _between_ends(grid: Grid, axis: int, repeated: bool) -> Factor:
-    """Return the differences in cells, with a row for each end of a bounded axis: 0, or that of the last cell."""
+    """Return the differences in cells, and at each end of a bounded axis 0 or the difference in the last cell."""
     inner = differences(grid, axis).matrix
     if grid.periodic[axis]:
         return Factor(inner)
@@ -229,7 +229,7 @@ def _between_ends(grid: Grid, axis: int, repeated: bool) -> Factor:
 
 
 def _cells_with_ends(grid: Grid, axis: int) -> Factor:
-    """Return the values in cells; on a bounded axis followed and preceded by that of the nearest cell."""
+    """Return the values in cells; on a bounded axis, the first and the last value are repeated at the ends."""
     cells = np.arange(grid.shape[axis])
     if not grid.periodic[axis] and cells.size:
         cells = np.concatenate([cells[:1], cells, cells[-1:]])
