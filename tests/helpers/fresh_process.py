@@ -69,6 +69,9 @@ def _run(program, is_script, arguments, folder, environment, output, errors):
     sys.dont_write_bytecode = "PYTHONDONTWRITEBYTECODE" in environment
     first = [str(Path(program).parent) if is_script else str(folder), *environment["PYTHONPATH"].split(os.pathsep)]
     sys.path[:] = [*first, *(path for path in sys.path if not _is_of_this_checkout(path))]
+    for name, module in [*sys.modules.items()]:  # with ROOT, the tests of a copy would test this checkout
+        if _is_of_this_checkout(getattr(module, "__file__", None) or os.sep):
+            del sys.modules[name]
     sys.argv = [program, *arguments]
     if is_script:
         runpy.run_path(program, run_name="__main__")
@@ -77,6 +80,6 @@ def _run(program, is_script, arguments, folder, environment, output, errors):
 
 
 def _is_of_this_checkout(path):
-    """Return whether a folder of sys.path has modules of this package or its tests; an environment in it has not."""
-    folder = Path(path).resolve()
-    return folder.is_relative_to(ROOT) and not folder.is_relative_to(Path(sys.prefix).resolve())
+    """Return whether a path belongs to this package or its tests; an environment inside the checkout does not."""
+    path = Path(path).resolve()
+    return path.is_relative_to(ROOT) and not path.is_relative_to(Path(sys.prefix).resolve())
