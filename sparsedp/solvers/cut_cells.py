@@ -500,6 +500,12 @@ class CutCells(Reconstructible):
         Returns
         -------
         array of the shape and dtype of b; 0 in cells without fluid
+
+        Notes
+        -----
+        If no condition and no shift fixes the level of the solution (only neumann), the sum of ``volumes * u`` is 0 on
+        each connected part of the fluid, as for `inverse`. With nullspace="project" the mean over this part of the
+        fluid is subtracted from the right-hand side.
         """
         return self._solve(b, values, walls, k, shift, wall_k, self._arguments[-1].nullspace)
 
@@ -533,7 +539,7 @@ class CutCells(Reconstructible):
             solver.name = "cut_cells"
             self._solvers[nullspace] = solver
         self.info = solver.info
-        u = solver(entries, self.is_fluid * right)
+        u = solver.solve_with_weights(entries, self.is_fluid * right, self.volumes)
         return _in_dtype_of(b, u)
 
     def _wall_terms(self, values, k, wall_k):

@@ -30,7 +30,7 @@ from sparsedp.autodiff.backend import as_field, gathered
 from sparsedp.autodiff.derivative import of_argument
 from sparsedp.autodiff.fast_derivatives import in_dtype
 from sparsedp.autodiff.program_trace import check_values
-from sparsedp.autodiff.tape import cast, dtype_of, isbox, sample
+from sparsedp.autodiff.tape import Rule, cast, dtype_of, isbox, sample
 from sparsedp.errors import ConvergenceError, DerivativeError, ShapeError
 from sparsedp.grid.space import Space, fits
 from sparsedp.operators.given import from_matrix
@@ -822,6 +822,69 @@ class MatrixSolver(ParametricSolver):
         if not isbox(b):
             b = np.asarray(b)
         return self._solution(data, b, 0.0)
+
+    def solve_with_weights(self, data: Any, b: Any, weights: Any) -> Any:
+        """Solve A x = b, where the null vectors of A and of its transpose are constant on each singular component.
+
+        On each singular component, the sum of ``weights * x`` is 0, and a multiple of the weights is subtracted from b.
+        The null space of the unweighted call is that of equal weights.
+
+        Parameters
+        ----------
+        data, b
+            As for the call.
+        weights : array, a field on the domain, >= 0
+            Positive on each singular component. Differentiable.
+
+        Returns
+        -------
+        array of the shape of b
+        """
+        entries = self._entries(data)
+        check_values(self._check_range, entries, b)
+        total = self._component_sums(weights, entries)
+        total = anp.where(total == 0, 1.0, total)
+        x = self._solution(entries, b - weights * self._component_sums(b, entries) / total, 0.0)
+        return x - self._component_sums(weights * x, entries) / total
+
+    def _check_range(self, data, b):
+        """Raise IncompatibleError if a right-hand side is not in the range; see `Solver.check_range`."""
+        solver = self._inverse(data, 0.0).solver
+        for field in np.reshape(b, (-1, self.domain.size)):
+            for part in (field.real, field.imag) if np.iscomplexobj(field) else (field,):
+                solver.check_range(part.astype(float))
+
+    def _component_sums(self, x, data):
+        """Return for each unknown the sum of x over its singular component; 0 for unknowns in no such component.
+
+        A symmetric linear map of x: its VJP and JVP are the map itself. It does not depend on small changes of data.
+        """
+
+        def forward(x, data):
+            null_space = self._inverse(data, 0.0).solver.system.null_space
+            sums = np.zeros(np.shape(x), np.result_type(x, float))
+            if not null_space.count:
+                return sums
+            is_singular = null_space.right != 0
+            labels = 0 if null_space.labels is None else null_space.labels
+            rows = sums.reshape(-1, self.domain.size)
+            for row, field in zip(rows, np.reshape(x, rows.shape), strict=True):
+                row[:] = np.where(is_singular, null_space._sums(is_singular * field)[labels], 0.0)
+            return sums
+
+        def vjp(nums, ans, x, data):
+            def pull(g):
+                of_x = of_argument(self._component_sums(g, data), x)
+                return tuple(of_x if num == 0 else np.zeros(np.shape(sample(data))) for num in nums)
+
+            return pull
+
+        def jvp(nums, tangents, ans, x, data):
+            if nums[0] != 0:
+                return 0.0 * ans
+            return self._component_sums(tangents[0], data)
+
+        return Rule("sums over singular components", forward, vjp, jvp)(x, data)
 
     def of_coefficients(self, data: Any) -> tuple[ParametricSolver, tuple[Any, Any]]:
         """Return this solver, and (k, shift) of its operator for the argument `data` of a call."""

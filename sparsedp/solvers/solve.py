@@ -370,6 +370,12 @@ class Solver(Reconstructible):
         self.log.note(run.info(), adjoint)
         return x
 
+    def check_range(self, b: np.ndarray) -> None:
+        """Raise IncompatibleError if b, one flat field, is not in the range; nullspace="project" accepts every b."""
+        exponent = exponent_of(self.system.largest(b))
+        b = shifted(b, -exponent)
+        self._projected(b, self.system.size_of(b), Run(checked=True, rtol=self.system.rtol))
+
     def unroll(self, b: Any, start: Any, transposed: bool) -> Any:
         """Record the iterations of the engine on the tape; b and start are fields and may be traced.
 

@@ -315,6 +315,63 @@ def test_charge_of_a_coaxial_line():
     assert np.isclose(np.sum(charges), 0.0, atol=1e-9)
 
 
+# ------------------------------------------------------------ only neumann conditions
+
+
+def test_the_free_constant_is_that_of_inverse():
+    """The volume-weighted mean is 0, and right-hand sides are projected in the same inner product."""
+    grid = dp.Grid(6, spacing=[np.array([1.0, 1.0, 1.0, 1.0, 1.0, 5.0])])
+    b = np.cos(np.arange(6.0))
+    b = b - np.sum(grid.volumes * b) / 10.0
+    everywhere = dp.cut_cells(grid, np.ones(7))
+    expected = dp.inverse(-dp.laplacian(grid))(b)
+    assert np.allclose(everywhere.solve(b), expected, rtol=1e-12)
+    assert abs(np.sum(grid.volumes * everywhere.solve(b))) < 1e-14
+    assert np.allclose(dp.cut_cells(grid, np.ones(7), nullspace="project").solve(b + 3.0), expected, rtol=1e-12)
+    with pytest.raises(IncompatibleError, match="cut_cells is singular"):
+        everywhere.solve(b + 0.1)
+
+
+def test_the_free_constant_is_continuous_where_the_wall_passes_a_node(rng):
+    b = rng.standard_normal(GRID.shape)
+    node = GRID.coordinates(0, "nodes")[3]
+    solutions = []
+    for sliver in (0.0, 1e-12, 1e-8):
+        body = dp.cut_cells(GRID, lambda x, y, sliver=sliver: x - node + sliver, nullspace="project")
+        u = body.solve(b)
+        assert abs(np.sum(body.volumes * u)) < 1e-14
+        assert np.allclose(dp.inverse(-body.laplacian, nullspace="project")(b * body.is_fluid), u, atol=1e-12)
+        solutions.append(u[3:])
+    assert np.allclose(solutions, solutions[0], atol=1e-6)
+
+
+def test_components_have_a_constant_each(rng):
+    b = rng.standard_normal((2, *GRID.shape))
+    strip = dp.cut_cells(GRID, lambda x, y: abs(x - 0.5) - 0.11, nullspace="project")
+    u = strip.solve(b + 1j * b[::-1])
+    sums = strip.volumes * u
+    assert np.allclose([np.sum(sums[:, :4], (1, 2)), np.sum(sums[:, 4:], (1, 2))], 0.0, atol=1e-14)
+    assert np.allclose(u[0], strip.solve(b[0]) + 1j * strip.solve(b[1]), atol=1e-12)
+
+
+def test_derivatives_of_the_free_constant(rng):
+    grid = dp.Grid((5, 4), size=(1.1, 0.9))
+    b, weights = rng.standard_normal((2, *grid.shape))
+
+    def loss(q):
+        body = dp.cut_cells(grid, lambda x, y: 0.34 * q[0] - hypot(x - 0.52, y - 0.41), nullspace="project")
+        u = body.solve(q[1] * b, 0.3 * q[1], k=q[2])
+        return np.sum(weights * u * body.volumes) + np.sum(body.volumes * np.sin(3 * u))
+
+    q, direction = np.array([1.05, 0.9, 1.1]), np.array([1.0, -0.5, 0.7])
+    h = 1e-5
+    slope = np.dot(dp.grad(loss)(q), direction)
+    assert np.isclose(slope, (loss(q + h * direction) - loss(q - h * direction)) / (2 * h), rtol=1e-7)
+    assert np.isclose(dp.jvp(loss, q, direction)[1], slope, rtol=1e-9)
+    second = (dp.grad(loss)(q + h * direction) - dp.grad(loss)(q - h * direction)) / (2 * h)
+    assert np.allclose(dp.hvp(loss, q, direction), second, rtol=1e-6)
+
+
 # ------------------------------------------------------------ flows around a body
 
 
