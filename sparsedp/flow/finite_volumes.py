@@ -56,6 +56,7 @@ from sparsedp._utils.validation import (
     check_function,
     check_kind,
     check_number,
+    check_plain,
     check_shape,
     field_array,
     is_whole,
@@ -644,6 +645,7 @@ def _check_speeds(axis, slowest, fastest):
 
 def checked_result(what: str, value: Any, u: Any) -> Any:
     """Return the result of a user-supplied function; raise unless it is real and has the shape of u."""
+    check_plain(what, value)
     check_shape(what, value, np.shape(u))
     check_kind(what, dtype_of(value), "real numbers", "; write its .real")
     return value

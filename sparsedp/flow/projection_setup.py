@@ -186,7 +186,7 @@ class ProjectionSetup(Reconstructible):
         try:
             p = solver.solve(b, solve_transposed, checked=False)
         except NonFiniteError:
-            self._check_faces(x, transposed)
+            self.check_faces(x, transposed)
             raise
         if transposed and self.symmetric:
             self.info.adjoint = self.info.forward
@@ -199,7 +199,7 @@ class ProjectionSetup(Reconstructible):
         q = self.inverse.solver.solve(source, True, checked=False)
         self.passes[True].push(np.zeros(out.size), q, out)
 
-    def _check_faces(self, x: NDArray, transposed: bool) -> None:
+    def check_faces(self, x: NDArray, transposed: bool = False) -> None:
         """Raise NonFiniteError that names the first face with a velocity, or cotangent, that is not finite."""
         space = self.grid.faces
 

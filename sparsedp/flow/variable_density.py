@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp._utils.validation import check_finite, check_kind
+from sparsedp._utils.validation import check_finite, check_kind, check_plain
 from sparsedp.autodiff.program_trace import check_values
 from sparsedp.autodiff.tape import cast, dtype_of, isbox, real_dtype, sample
 from sparsedp.errors import ShapeError
@@ -61,6 +61,7 @@ class WeightedProjection:
 
     def __init__(self, setup: ProjectionSetup) -> None:
         grid = setup.grid
+        self._setup = setup
         self._to_faces = density_on_faces(grid)
         self._open = mask(grid.faces, setup.open)
         self._divergence = divergence(grid)
@@ -72,6 +73,7 @@ class WeightedProjection:
         grid = self._open.domain.grid
         grid.backend.check("density in projection")
         value = density
+        check_plain("the density of projection", density)
         if not isbox(density):
             value = np.asarray(density)
         shape = np.shape(sample(value))
@@ -90,6 +92,7 @@ class WeightedProjection:
 
     def split(self, v: Any, density: Any) -> tuple[Any, Any]:
         """Return the velocity without divergence, and the q of the module docstring."""
+        check_values(self._setup.check_faces, v)  # on walls too, where the values are not used
         v = self._open(v)
         q = self.solver(1.0 / density, self._divergence(v))
         return v + self._gradient(q) / density, q

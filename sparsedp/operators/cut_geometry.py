@@ -104,6 +104,8 @@ def _scaled_level(grid, level):
     largest = np.max(np.abs(np.asarray(sample(level))), initial=0.0)
     level = 2.0 ** -np.frexp(largest)[1] * level
     values = np.asarray(sample(level))
+    if not values.size:
+        return level
     largest = np.abs(values)
     for axis, is_periodic in enumerate(grid.periodic):
         if is_periodic:

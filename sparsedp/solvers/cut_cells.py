@@ -34,7 +34,7 @@ import scipy.sparse as sp
 
 from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.pytree import copied
-from sparsedp._utils.validation import check_finite, check_kind, check_native, check_on, check_plain
+from sparsedp._utils.validation import check_finite, check_kind, check_on, check_plain
 from sparsedp.autodiff.program_trace import check_values, recording_trace
 from sparsedp.autodiff.tape import cast, dtype_of, isbox, sample
 from sparsedp.errors import DerivativeError, IncompatibleError, JitError, ShapeError
@@ -707,7 +707,7 @@ def _checked_level(grid, level):
             "dp.jit cannot record the level of cut_cells, whose values decide which cells are cut; call the function "
             "without dp.jit"
         )
-    check_native("cut_cells", level)
+    check_plain("cut_cells", level)
     values = np.asarray(sample(level))
     check_on("the level of cut_cells", values, grid.nodes)
     check_kind("the level of cut_cells", values.dtype, "real numbers", "; write level.real")
