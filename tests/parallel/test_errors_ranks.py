@@ -242,6 +242,55 @@ def test_refusals(case):
     assert str(caught.value) == message
 
 
+X = 1.0 + np.arange(20.0).reshape(5, 4)
+
+
+def run_flow(scene, viscosity, scalars=None):
+    """One step of a flow at rest."""
+    step = dp.flow_step(scene.grid, 0.01, viscosity, scalars=scalars)
+    step(step.start(0.0 * scene.G(scene.u), None, {name: scene.u for name in scalars or ()}))
+
+
+NOT_ON_RANKS_YET = {
+    "cut_cells": lambda s: dp.cut_cells(s.grid, lambda x, y: x - 1.5),
+    "gradient with order=4": lambda s: dp.gradient(s.grid, dp.dirichlet, order=4),
+    "divergence with order=4": lambda s: dp.divergence(s.grid, order=4),
+    "laplacian with order=4": lambda s: dp.laplacian(s.grid, dp.dirichlet, order=4),
+    "matched_layer": lambda s: dp.matched_layer(s.grid, 2, 1.0),
+    "a viscosity that varies in flow_step": lambda s: run_flow(s, X),
+    "a diffusivity that varies in flow_step": lambda s: run_flow(s, 0.1, {"heat": {"diffusivity": X}}),
+    "density in flow_step": lambda s: dp.flow_step(s.grid, 0.01, 0.1, density=X),
+    "density in projection": lambda s: dp.projection(s.grid)(s.G(s.u), X),
+    "conservation_law": lambda s: dp.conservation_law(
+        s.grid, lambda u, p, axis: u, lambda u, p, axis: 1.0, positive={"u": lambda u, p: u}
+    ),
+    "shallow_water": lambda s: dp.shallow_water(s.grid),
+    "free_faces": lambda s: dp.free_faces(s.grid),
+}
+FIELDS_NOT_ON_RANKS = {
+    "stepper(rodas5p)": lambda s: dp.stepper("rodas5p", lambda u, p: -(u**3), 0.1)(s.u),
+    "continuation": lambda s: dp.continuation(lambda u, p: u - p, s.u, 0.0, 1.0),
+}
+
+
+@on_ranks
+@pytest.mark.parametrize("name", NOT_ON_RANKS_YET)
+def test_not_on_ranks_yet(name):
+    message = f"{name} does not work on ranks yet; give it the grid from before dp.distribute"
+    with pytest.raises(TypeError) as caught:
+        NOT_ON_RANKS_YET[name](Scene())
+    assert str(caught.value) == message
+
+
+@on_ranks
+@pytest.mark.parametrize("name", FIELDS_NOT_ON_RANKS)
+def test_fields_not_on_ranks(name):
+    message = f"{name} does not work on a field on ranks; write dp.gather(u) for the whole array"
+    with pytest.raises(TypeError) as caught:
+        FIELDS_NOT_ON_RANKS[name](Scene())
+    assert str(caught.value) == message
+
+
 @on_ranks
 def test_a_null_vector_that_nobody_tries():
     from mpi4py import MPI
