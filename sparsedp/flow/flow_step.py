@@ -202,6 +202,9 @@ def flow_step(
     Explicit viscosity is stable for dt nu / h^2 <= 1/8 in 2-D (Adams-Bashforth), and for <= 1/16 where it varies in
     space; a larger dt raises an error.
     At an outflow the normal viscous stress is 0, as if the velocity there did not change along the axis.
+    A viscosity, diffusivity or density in solid cells has no effect, is not checked and has the derivative 0: beside an
+    obstacle, stresses are computed from the harmonic average of the viscosity of fluid cells alone. In solid cells a
+    function of the shear rate gets that of the first fluid cell.
     A viscosity, diffusivity or density that varies in space is not available on ranks.
     Convection is explicit. A step raises an error if it would amplify waves by more than 2 %. Let the Courant number c
     be dt times the largest sum over the axes of |v| / h in a cell: without viscosity the limit is c = 0.53, and
@@ -606,8 +609,6 @@ class FlowStep(Reconstructible):
         density = self._density(lambda: (s,), params, dtype)
         if np.shape(sample(density)) == ():
             return density
-        if not self.grid.cells.size:  # faces without cells have no density
-            return 1.0
         return self._to_faces(density)
 
     def _advance_scalars(self, state: dict[str, Any], params: Any, dt: Any) -> dict[str, Any]:

@@ -72,7 +72,7 @@ def projection(
         records the solves.
         ``P(v, density)`` returns v + G(p) / density without divergence, for a fluid whose density varies: a number > 0,
         or one for each cell or each face. The density of a face is the mean of its two cells, weighted by their widths.
-        Differentiable in both, to every order.
+        The density of solid cells has no effect. Differentiable in both, to every order.
 
     Raises
     ------

@@ -5,11 +5,13 @@ With the mask K of open faces, the divergence D, the pressure gradient G and the
     w = K v + G q / rho,    -D (G q / rho) = D K v.
 
 The density of a face is that of its control volume: half of each adjacent cell. 1 / rho on faces is then the harmonic
-average of 1 / rho in the cells.
+average of 1 / rho in the cells. Both cells of a face through which fluid flows are fluid; the density of solid cells,
+and of faces that touch one, has no effect.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,9 +21,10 @@ from sparsedp._utils.validation import check_finite, check_kind, check_plain
 from sparsedp.autodiff.program_trace import check_values
 from sparsedp.autodiff.tape import cast, dtype_of, isbox, real_dtype, sample
 from sparsedp.errors import ShapeError
+from sparsedp.flow.fluid_cells import FluidPart
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.operators.harmonic import lower_share
-from sparsedp.operators.masks_and_lift import mask
+from sparsedp.operators.masks_and_lift import check_solid, mask, solid_faces
 from sparsedp.operators.operator import Operator
 from sparsedp.operators.stencils import adjacent_cell, to_faces
 from sparsedp.operators.structure.factor import Factor
@@ -64,6 +67,8 @@ class WeightedProjection:
         self._setup = setup
         self._to_faces = density_on_faces(grid)
         self._open = mask(grid.faces, setup.open)
+        self._fluid_cells = FluidPart.of_cells(grid, setup.solid)
+        self._fluid_faces = FluidPart(grid.faces, np.logical_or(*solid_faces(grid, check_solid(grid, setup.solid))))
         self._divergence = divergence(grid)
         self._gradient = gradient(grid, setup.pressure_conditions, setup.solid)
         self.solver = EllipticSolver(self._divergence, self._gradient, setup.settings)
@@ -83,12 +88,22 @@ class WeightedProjection:
                 f"of shape {shape}"
             )
         check_kind("the density of projection", dtype_of(value), "real numbers", "; write its .real")
-        check_values(_check_density, value)
-        if not grid.cells.size:
-            return 1.0
         if shape == grid.cells.shape:
-            value = self._to_faces(value)
+            value = self._fluid_values(self._fluid_cells, value)
+            if np.shape(sample(value)) != ():
+                value = self._to_faces(value)
+        elif shape == grid.faces.shape:
+            value = self._fluid_values(self._fluid_faces, value)
+        else:
+            check_values(_check_density, value)
         return cast(value, real_dtype(dtype))
+
+    def _fluid_values(self, fluid: FluidPart, density: Any) -> Any:
+        """Return a density with values outside of the fluid replaced; 1 where there is no fluid."""
+        check_values(partial(_check_density_of_fluid, fluid), density)
+        if fluid.empty:
+            return 1.0
+        return fluid.filled(density)
 
     def split(self, v: Any, density: Any) -> tuple[Any, Any]:
         """Return the velocity without divergence, and the q of the module docstring."""
@@ -103,3 +118,7 @@ def _check_density(density):
     check_finite("the density of projection", density)
     if np.any(density <= 0):
         raise ValueError(f"the density of projection must be > 0, got {np.min(density):.6g}")
+
+
+def _check_density_of_fluid(fluid, density):
+    _check_density(fluid.with_ones(density))

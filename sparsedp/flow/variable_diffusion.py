@@ -25,6 +25,7 @@ from sparsedp.autodiff.program_trace import check_values, sample
 from sparsedp.autodiff.tape import cast, dtype_of, isbox, real_dtype
 from sparsedp.autodiff.tape_constants import frozen
 from sparsedp.flow.diffusion import check_stable, spectral_bound
+from sparsedp.flow.fluid_cells import FluidPart
 from sparsedp.flow.settings import takes_params_alone
 from sparsedp.solvers.parametric import EllipticSolver, elliptic_solver
 
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from sparsedp.flow.settings import FlowSettings
     from sparsedp.operators.operator import Operator
 
-__all__ = ["Coefficient", "DiffusionForm", "VariableDiffusion", "is_constant"]
+__all__ = ["Coefficient", "DiffusionForm", "VariableDiffusion", "as_array", "is_constant"]
 
 
 class DiffusionForm:
@@ -90,20 +91,21 @@ class Coefficient:
 
     Attributes
     ----------
+    fluid : FluidPart
+        The cells whose values have an effect. Solid cells get the value of one of them.
     needs_fields : bool
         Whether it is a function of fields.
     """
 
     def __init__(self, name: str, given: Any, settings: FlowSettings, needs: str) -> None:
         self.name = name
-        if not callable(given):
-            given = _as_field(given)
-        self._given = given
         self._cells = settings.grid.cells
         self._needs = needs
+        self.fluid = FluidPart.of_cells(settings.grid, settings.solid)
         self.needs_fields = not takes_params_alone(given)
         if not callable(given):
-            self._check(given)
+            given = self._checked(given)
+        self._given = given
 
     def __call__(self, fields: Callable[[], tuple], params: Any, dtype: np.dtype) -> Any:
         """Return the coefficient, a number or one value for each cell.
@@ -122,17 +124,26 @@ class Coefficient:
                 value = value(*mapped(frozen, fields()), params)
             else:
                 value = value(params)
-            value = _as_field(value)
-            self._check(value)
+            value = self._checked(value)
         if np.shape(sample(value)) == ():
             return value
         return cast(value, real_dtype(dtype))
 
-    def _check(self, value: Any) -> None:
-        if np.shape(sample(value)) != ():
-            check_on(f"flow_step, as {self.name},", sample(value), self._cells, "; write one number for each cell")
-            check_kind(f"the {self.name} of flow_step", dtype_of(value), "real numbers", "; write its .real")
+    def _checked(self, value: Any) -> Any:
+        """Return a valid value, with the values of solid cells replaced; raise an error for other values.
+
+        Where there is no fluid, the value has no effect and is 1.
+        """
+        value = as_array(value)
+        if np.shape(sample(value)) == ():
+            check_values(self._check_range, value)
+            return value
+        check_on(f"flow_step, as {self.name},", sample(value), self._cells, "; write one number for each cell")
+        check_kind(f"the {self.name} of flow_step", dtype_of(value), "real numbers", "; write its .real")
         check_values(self._check_range, value)
+        if self.fluid.empty:
+            return 1.0
+        return self.fluid.filled(value)
 
     def _check_range(self, value: Any) -> None:
         """Raise an error for values that are not finite, or out of range."""
@@ -140,6 +151,7 @@ class Coefficient:
         if np.ndim(value) == 0:
             check_number(name, value, self._needs)
             return
+        value = self.fluid.with_ones(value)
         check_finite(name, value)
         bad = value < 0 if self._needs == ">= 0" else value <= 0
         if np.any(bad):
@@ -147,7 +159,7 @@ class Coefficient:
             raise ValueError(f"{name} must be {self._needs}, got {value[cell]:.6g} in cell {cell}")
 
 
-def _as_field(value: Any) -> Any:
+def as_array(value: Any) -> Any:
     """Return a value that is neither traced nor a number as an array."""
     if isbox(value) or np.ndim(value) == 0:
         return value

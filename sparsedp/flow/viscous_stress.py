@@ -7,7 +7,8 @@ corners of cells). With the slopes S v, the walls' contribution W and the transp
     L(mu) v = C (mu (S v + W walls + T v)),    shear rate = sqrt(2 D : D),    D = (grad v + grad v^T) / 2,
 
 where C is the divergence over the control volumes. On edges mu is the harmonic average of the four cells, with which
-the stress between two layers of fluid is exact.
+the stress between two layers of fluid is exact. Beside obstacles it is that of the three, two or one fluid cells, so
+that the values of mu in solid cells have no effect.
 
 T v affects only faces whose velocity is unknown. On the ends of an axis it is chosen so that C T v is the gradient of
 the divergence, which is 0: there dv_a/dx_c = 0, and dv_c/dx_c is as in the last cell. For a constant viscosity L(mu)
@@ -23,6 +24,7 @@ import autograd.numpy as anp
 import numpy as np
 import scipy.sparse as sp
 
+from sparsedp.flow.fluid_cells import CellsAround, FluidPart
 from sparsedp.flow.momentum import (
     MomentumFluxes,
     WallSide,
@@ -84,9 +86,17 @@ class ViscousStress(DiffusionForm):
         self.wall_slopes = self._slopes_at_walls(sides)
         self.slopes = self._velocity_slopes + self._transposed_slopes()
         self.divergence = free @ gain
+        self._fluid = FluidPart.of_cells(grid, settings.solid)
         self._cells = {sides: self._cells_beside(*sides) for sides in product((False, True), repeat=2)}
-        self._across_component = harmonic_pair(self._shares(0))
-        self._across_axis = harmonic_pair(self._shares(1))
+        share_along_component = self._shares(0)
+        share_along_axis = self._shares(1)
+        if settings.solid is not None:
+            solid = check_solid(grid, settings.solid)
+            around = CellsAround(self._cells, solid, (share_along_component, share_along_axis))
+            self._cells = around.cells
+            share_along_axis = around.share
+        self._across_component = harmonic_pair(share_along_component)
+        self._across_axis = harmonic_pair(share_along_axis)
         self._strain, self._to_cells = self._invariant()
         self.at_sites = self._harmonic_average
 
@@ -100,12 +110,13 @@ class ViscousStress(DiffusionForm):
     def shear_rate(self, v: Any, walls: Any = None) -> Any:
         """Return the shear rate in each cell, for a velocity on faces and the velocities of walls (None: 0).
 
-        Its derivative is 0 where the shear rate is 0.
+        Its derivative is 0 where the shear rate is 0. Solid cells have the value of a fluid cell, so that a viscosity
+        that is infinite at rest is finite there.
         """
         slopes_of_v = self._velocity_slopes(v)
         if walls is not None:
             slopes_of_v = slopes_of_v + self.wall_slopes(walls)
-        square = self._to_cells(self._strain(slopes_of_v) ** 2)
+        square = self._fluid.filled(self._to_cells(self._strain(slopes_of_v) ** 2))
         at_rest = square == 0
         return anp.where(at_rest, 0.0, anp.sqrt(anp.where(at_rest, 1.0, square)))
 
