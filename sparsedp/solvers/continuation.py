@@ -13,7 +13,9 @@ J^T and two with J, in an order that loses no digits where J is nearly singular 
 Jacobians, their pattern and the linear solvers are those of `implicit`.
 
 At a fold, the component of the tangent along p changes its sign. The fold is the zero of this component as a function
-of s, which is found by regula falsi.
+of s, which is found by regula falsi. Two folds may lie within one step. The cubic through both ends of a step with
+their slopes dp/ds shows where the slope is least between them. If it is small there, the point there is computed, and
+both parts are tested in the same way.
 
 References
 ----------
@@ -36,14 +38,22 @@ import numpy as np
 
 from sparsedp._utils.base_classes import Frozen
 from sparsedp._utils.pytree import leaves, mapped
-from sparsedp._utils.validation import check_choice, check_function, check_number, check_takes, check_whole
+from sparsedp._utils.validation import (
+    EPS,
+    check_choice,
+    check_function,
+    check_integer,
+    check_number,
+    check_takes,
+    check_whole,
+)
 from sparsedp.autodiff.backend import require_arrays
 from sparsedp.autodiff.derivative import push
-from sparsedp.autodiff.program_trace import recording_trace
+from sparsedp.autodiff.program_trace import opaque, recording_trace
 from sparsedp.autodiff.tape import isbox, plain
 from sparsedp.errors import ConvergenceError, DerivativeError, JitError, NonFiniteError, UnstableStepError
 from sparsedp.solvers.newton import Equation, Newton, Unknowns
-from sparsedp.solvers.roots import implicit
+from sparsedp.solvers.roots import Root, implicit
 from sparsedp.solvers.scaling import length
 from sparsedp.solvers.solve import Run
 
@@ -53,7 +63,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sparsedp.solvers.jacobian import Jacobians, Linearisation
-    from sparsedp.solvers.roots import Root
 
 __all__ = ["Branch", "Fold", "continuation"]
 
@@ -69,7 +78,12 @@ GROWTH = 2.0  # largest factor from one step to the next
 NUDGE = 1e-7  # arc length by which the point of a singular Jacobian is moved
 FOLD_TOLERANCE = 1e-8  # component along p of the unit tangent at a fold; the error of p is of the order of its square
 FOLD_STEPS = 40  # largest number of steps towards a fold
-FOLD_ACCURACY = 1e-3  # factor on the tolerance for points near a fold, whose parameter is that of the fold
+FOLD_ACCURACY = 1e-6  # factor on the tolerance for points near a fold, whose parameter is that of the fold
+SMALL_SLOPE = 0.25  # share of the larger slope at the ends of a step: a smaller slope between them is computed
+KNOWN_SLOPE = 0.5  # largest relative difference of a computed slope and its prediction if no further one is needed
+SLOPE_STEPS = 10  # largest depth of the search for two folds within a step
+SHORTEST_RANGE = 1e4 * EPS  # of the parameter, as a share of its values
+FOLD_MARGIN = 10.0  # in units of the square root of rtol: component along p below which a state has no derivative
 
 
 def continuation(
@@ -119,7 +133,7 @@ def continuation(
     TypeError
         If an argument has another type, or a field is distributed over ranks.
     ValueError
-        If `stop` equals `start`, or a setting is out of range.
+        If `stop` equals `start` up to rounding, or a setting is out of range.
     ConvergenceError
         If there is no steady state at `start` near the guess, or steps become too short. `error.best` is the last
         steady state that was found.
@@ -136,16 +150,18 @@ def continuation(
     -----
     **End.** The branch ends at p = `stop` (`branch.status` is "reached_stop"), or, after a fold, where it returns to
     p = `start` ("returned_to_start"), or after `maxsteps` steps ("max_steps"). The last point is exactly at `stop` or
-    `start` in the first two cases.
+    `start` in the first two cases. A fold whose parameter is `stop` or `start` within `rtol` of the range ends it too.
 
     **Steps.** The length of a step combines the changes of p, in units of the range, and of x, each field in units of
     its largest norm so far, or of its change over the range at the rate at `start` if that is larger. A step is
-    repeated with half its length if Newton's method fails or the tangent turns by more than half a radian. The next
-    one is up to twice as long if Newton's method was fast and the tangent turned little.
+    repeated with half its length if Newton's method fails, or if the tangents at its ends differ by more than half a
+    radian from each other or from the straight line between these points. The next one is up to twice as long if
+    Newton's method was fast and the tangent turned little.
 
-    **Folds.** A fold lies between two points at which p moves in opposite directions. It is located so that p is exact
-    up to rounding and `rtol`, and is inserted as a point of the branch. At a fold the Jacobian is singular: the steady
-    state there has no derivative in the parameters.
+    **Folds.** A fold lies between two points at which p moves in opposite directions. Where p nearly stops within a
+    step, further points are computed, so that two folds within one step are found as well. A fold is located so that p
+    is exact up to rounding and `rtol`, and is inserted as a point of the branch. At a fold the Jacobian is singular:
+    the steady state there has no derivative in the parameters.
 
     **Branch points.** The branch is continued straight on where another one crosses it, as at a pitchfork. To follow
     the other one, add a small multiple of the null vector of the Jacobian to a state, and start again.
@@ -183,13 +199,16 @@ def continuation(
     check_choice("method of continuation", method, METHODS)
     start = check_number("start", start)
     stop = check_number("stop", stop)
-    if start == stop:
-        raise ValueError(f"continuation needs a range of the parameter, got start = stop = {start:g}")
+    if abs(0.5 * stop - 0.5 * start) <= 0.5 * SHORTEST_RANGE * max(abs(start), abs(stop)):
+        raise ValueError(
+            "continuation needs a range of the parameter that is long beside rounding errors, "
+            f"got start = {start!r} and stop = {stop!r}"
+        )
     span = abs(stop - start)
     step = FIRST_STEP * span if step is None else check_number("step", step, "> 0")
     largest_step = LARGEST_STEP * span if largest_step is None else check_number("largest_step", largest_step, "> 0")
     maxsteps = check_whole("maxsteps", maxsteps, 1)
-    root = implicit(residual, **options)
+    root = BranchRoot(*implicit(residual, **options).recipe()[1])
     check_takes("continuation", residual, 2 + len(params), "lambda x, p: ...")
     curve = Curve(root, guess, params)
     steps = Steps(start, stop, min(step, largest_step) / span, largest_step / span, maxsteps)
@@ -235,6 +254,8 @@ class Branch(Frozen):
     seconds : float
     root : Root
         The function root(guess, p, *params) of `implicit`, with the sparsity pattern of the Jacobian.
+    params : int
+        Number of other parameters.
     """
 
     parameter: NDArray[Any]
@@ -245,7 +266,9 @@ class Branch(Frozen):
     iterations: int
     seconds: float
     root: Root
+    params: int
 
+    @opaque
     def solve(self, index: int, p: Any, *params: Any) -> Any:
         """Solve for the steady state at the parameter p, starting from point `index`.
 
@@ -265,9 +288,22 @@ class Branch(Frozen):
         Raises
         ------
         ConvergenceError
-            If Newton's method fails; also for a derivative at a fold, where the Jacobian is singular.
+            If Newton's method fails; also for a derivative at a fold up to the tolerance, where there is none.
+        IndexError
+            If there is no such point.
+        TypeError
+            If the index is not an integer, p not a number, or the number of parameters another one.
         """
-        return self.root(self.states[index], p, *params)
+        number = check_integer("index of branch.solve", index, -len(self))
+        if number >= len(self):
+            raise IndexError(f"index of branch.solve must be less than {len(self)}, the number of points, got {number}")
+        check_number("p of branch.solve", plain(p))
+        if len(params) != self.params:
+            raise TypeError(
+                f"branch.solve takes an index, p and {self.params} other parameters, as many as continuation got, "
+                f"got {len(params)}"
+            )
+        return self.root(self.states[number], p if isbox(p) else float(p), *params)
 
     def __len__(self) -> int:
         return len(self.states)
@@ -277,6 +313,52 @@ class Branch(Frozen):
             f"<branch of {len(self)} steady states, parameter {self.parameter[0]:g} to {self.parameter[-1]:g}, "
             f"{len(self.folds)} folds, {self.status}>"
         )
+
+
+class BranchRoot(Root):
+    """The function of `implicit` for points of a branch, which refuses derivatives at folds.
+
+    Attributes
+    ----------
+    units : array, shape (n + 1,), or None
+        Arc length of a unit of each unknown and of the parameter: those of `Curve`, once there is a branch.
+
+    Notes
+    -----
+    Up to the tolerance, p is known to rtol times its range. At the distance d from a fold, dx/dp varies by the share
+    rtol / (2 d) within this tolerance, and the component of the tangent along p has the size of sqrt(d).
+    """
+
+    units: NDArray[Any] | None = None
+
+    def recipe(self) -> tuple[type[Root], tuple[Any, ...]]:
+        """Return the call that reconstructs this object: see _utils/base_classes.py."""
+        return BranchRoot, super().recipe()[1]
+
+    def _vjp(self, nums, ans, equation, guess, *leaves):
+        self._check_slope(plain(ans), equation, leaves)
+        return super()._vjp(nums, ans, equation, guess, *leaves)
+
+    def _jvp(self, nums, tangents, ans, equation, guess, *leaves):
+        self._check_slope(plain(ans), equation, leaves)
+        return super()._jvp(nums, tangents, ans, equation, guess, *leaves)
+
+    def _check_slope(self, x, equation, leaves):
+        """Raise ConvergenceError if the branch is a fold up to the tolerance."""
+        if self.units is None:
+            return
+        p, *others = map(plain, leaves)
+
+        def of_parameter(p):
+            return equation(x, p, *others)
+
+        column = push(of_parameter, p, [1.0])[1]
+        rate = self._solve(False, True, column, equation, x, p, *others)
+        if self.units[-1] <= FOLD_MARGIN * np.sqrt(self.rtol) * length(self.units[:-1] * rate):
+            raise ConvergenceError(
+                f"the steady state at parameter {float(p):.8g} is a fold up to the tolerance, where it has no "
+                "derivative; differentiate at another parameter, or write a smaller rtol"
+            )
 
 
 # ---- the bordered system ---------------------------------------------------------------------------------------------
@@ -581,6 +663,15 @@ class Curve:
         """Return the cosine of the angle between two unit tangents."""
         return float((self.units * one) @ (self.units * other))
 
+    def turning(self, point: CurvePoint, following: CurvePoint) -> float:
+        """Return the largest angle between the tangents at two points and the straight line between them."""
+        chord = following.z - point.z
+        size = length(self.units * chord)
+        cosines = [self.cosine(point.tangent, following.tangent)]
+        if size > 0:
+            cosines += [self.cosine(chord / size, end.tangent) for end in (point, following)]
+        return float(np.arccos(np.clip(min(cosines), -1.0, 1.0)))
+
     def point(self, near: CurvePoint, prediction: NDArray[Any], row: NDArray[Any], accuracy: float = 1.0) -> CurvePoint:
         """Return the point with row . z = row . prediction, by Newton's method from the prediction.
 
@@ -635,7 +726,7 @@ class Follower:
         self.parameters: list[float] = []
         self.states: list[Any] = []
 
-    def follow(self, root: Root, guess: Any, params: Sequence[Any]) -> Branch:
+    def follow(self, root: BranchRoot, guess: Any, params: Sequence[Any]) -> Branch:
         """Return the branch."""
         start_time = perf_counter()
         steps = self.steps
@@ -648,11 +739,12 @@ class Follower:
             size = min(steps.first / self._speed(point), steps.largest)
         status = ""
         for _ in range(steps.most):
-            following, size = self._step(point, size)
-            status = self._add(point, following)
+            path, size = self._step(point, size)
+            status = self._add(point, path)
             if status:
                 break
-            point = self.curve.rescaled(following)
+            point = self.curve.rescaled(path[-1])
+        root.units = self.curve.units
         return Branch(
             parameter=np.array(self.parameters),
             states=self.states,
@@ -662,6 +754,7 @@ class Follower:
             iterations=self.iterations,
             seconds=perf_counter() - start_time,
             root=root,
+            params=len(params),
         )
 
     def _speed(self, point):
@@ -676,18 +769,24 @@ class Follower:
     # ------------------------------------------------------------ one step
 
     def _step(self, point, size):
-        """Return the next point, and the length of the step after it."""
+        """Return the next points, between which there is at most one fold, and the length of the step after them."""
         reason = ""
         while size >= SMALLEST_STEP * self.steps.largest:
             try:
                 following = self._point_at(point, size)
+                angle = self.curve.turning(point, following)
+                path = [following]
+                if angle <= LARGEST_ANGLE:
+                    path = self._path(point, following)
             except (ConvergenceError, NonFiniteError, UnstableStepError) as error:
                 reason = str(error)
             else:
-                angle = np.arccos(np.clip(self.curve.cosine(point.tangent, following.tangent), -1.0, 1.0))
-                if angle <= LARGEST_ANGLE:
-                    return following, min(size * _growth(following.iterations, angle), self.steps.largest)
-                reason = f"the branch turns by {angle:.2g} radians in a step of {size:.1e}"
+                if angle > LARGEST_ANGLE:
+                    reason = f"the branch turns by {angle:.2g} radians in a step of {size:.1e}"
+                elif self.is_natural and len(path) > 1:
+                    reason = f"there are two folds in a step of {size:.1e}"
+                else:
+                    return path, min(size * _growth(following.iterations, angle), self.steps.largest)
             self.rejected += 1
             size *= 0.5
         advice = "start from another guess or smooth kinks of the residual"
@@ -710,24 +809,77 @@ class Follower:
 
     # ------------------------------------------------------------ folds and ends
 
-    def _add(self, point, following):
-        """Add the next point, and the fold before it; return the status word if the branch ends."""
-        if point.tangent[-1] * following.tangent[-1] < 0 and not self.is_natural:
-            fold = self._fold(point, following)
-            status = self._end(point, fold)
+    def _add(self, point, path):
+        """Add the next points, and the folds before them; return the status word if the branch ends."""
+        for after in path:
+            status = self._add_part(point, after)
             if status:
                 return status
+            point = after
+        return ""
+
+    def _add_part(self, point, following):
+        """Do this for two points with at most one fold between them."""
+        if point.tangent[-1] * following.tangent[-1] < 0 and not self.is_natural:
+            fold = self._fold(point, following)
+            status = self._end_at(fold)
+            if not status:
+                status = self._end(point, fold)
+                if status:
+                    return status
             self._append(fold)
             null_vector = fold.tangent[:-1] / length(fold.tangent[:-1])
             unknowns = self.curve.unknowns
             self.folds.append(
                 Fold(len(self.states) - 1, self.parameters[-1], self.states[-1], unknowns.rounded(null_vector))
             )
+            if status:
+                return status
             point = fold
         status = self._end(point, following)
         if not status:
             self._append(following)
         return status
+
+    def _path(self, point, following, depth=0):
+        """Return the points after `point` up to `following`, such that at most one fold is between neighbours."""
+        slopes = self._slopes(point, following)
+        if slopes[1] * slopes[2] <= 0:
+            return [following]
+        share, least = _smallest_slope(*slopes)
+        if depth == SLOPE_STEPS or not 0 < share < 1 or least > SMALL_SLOPE * max(map(abs, slopes[1:])):
+            return [following]
+        row = self.curve.row_along(point.tangent)
+        prediction = point.z + share * (following.z - point.z)
+        middle = self.curve.point(point, prediction, row)
+        self.iterations += middle.iterations
+        middle = middle._replace(iterations=0)
+        slope = middle.tangent[-1] / (row @ middle.tangent) * np.sign(slopes[1])
+        if slope <= 0:
+            return [middle, following]
+        if abs(slope - least) <= KNOWN_SLOPE * slope or slope * self.curve.units[-1] <= FOLD_TOLERANCE:
+            return [following]
+        before = self._path(point, middle, depth + 1)
+        after = self._path(middle, following, depth + 1)
+        if len(before) == len(after) == 1:
+            return [following]
+        return [*before, *after]
+
+    def _slopes(self, point, following):
+        """Return the mean slope dp/ds between two points, and those at both; s is the way along the first tangent."""
+        row = self.curve.row_along(point.tangent)
+        change = following.z - point.z
+        return [t[-1] / (row @ t) for t in (change, point.tangent, following.tangent)]
+
+    def _end_at(self, fold):
+        """Return the status word if the parameter of a fold is an end of the range up to the tolerance."""
+        start, stop = self.steps.start, self.steps.stop
+        tolerance = self.curve.root.rtol * abs(stop - start)
+        for limit, status in ((stop, "reached_stop"), (start, "returned_to_start")):
+            if abs(fold.z[-1] - limit) <= tolerance:
+                fold.z[-1] = limit
+                return status
+        return ""
 
     def _end(self, point, following):
         """If the range ends between two points, add the point there, and return the status word."""
@@ -772,6 +924,24 @@ class Follower:
                 if slope * last_slope > 0:
                     high_slope *= 0.5
         return fold._replace(iterations=0)
+
+
+def _smallest_slope(mean, first, last):
+    """Return where the slope of a cubic on [0, 1] is smallest in magnitude, given its mean and those at both ends.
+
+    Returns
+    -------
+    share : float
+        The place; NaN if the slope has no extreme value.
+    slope : float
+        The slope there, positive if it has the sign of the first one.
+    """
+    bend = 3 * (first + last - 2 * mean)  # the slope is first + linear t + bend t^2
+    linear = 6 * mean - 4 * first - 2 * last
+    if not bend * first > 0:
+        return np.nan, np.nan
+    share = -0.5 * linear / bend
+    return share, (first + 0.5 * linear * share) * np.sign(first)
 
 
 def _growth(iterations, angle):

@@ -31,6 +31,76 @@ def test_folds_of_a_cubic_are_exact():
     assert repr(branch) == f"<branch of {len(branch)} steady states, parameter -4 to 4, 2 folds, reached_stop>"
 
 
+def inflected(x, p, a):
+    """p = x^3 - a x: two folds at p = -+2 (a / 3)^(3/2), which are close together for a small a; none for a <= 0."""
+    return p - x**3 + a * x
+
+
+@pytest.mark.parametrize(
+    ("a", "settings"),
+    [
+        (1e-3, {"largest_step": 2.0}),
+        pytest.param(1e-3, {}, marks=pytest.mark.whole),
+        pytest.param(1e-3, {"step": 0.013}, marks=pytest.mark.whole),
+        pytest.param(0.1, {"largest_step": 2.0}, marks=pytest.mark.whole),
+        pytest.param(1e-5, {"largest_step": 2.0}, marks=pytest.mark.whole),
+    ],
+)
+def test_two_folds_within_a_step_are_found(a, settings):
+    branch = dp.continuation(inflected, -1.0, -1.0, 1.0, a, **settings)
+    fold = 2 * (a / 3) ** 1.5
+    assert [point.parameter for point in branch.folds] == pytest.approx([fold, -fold], abs=1e-12)
+    assert [branch.parameter[point.index] for point in branch.folds] == [point.parameter for point in branch.folds]
+    assert np.all(np.diff(branch.states) > 0)
+
+
+@pytest.mark.whole
+def test_two_folds_within_a_step_are_found_by_natural_steps():
+    with pytest.raises(ConvergenceError, match=r"there are two folds in a step of \d\.\de-\d\d"):
+        dp.continuation(inflected, -1.0, -1.0, 1.0, 1e-6, method="natural")
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("a", [0.0, -1e-6, -1e-3])
+def test_an_inflection_is_no_fold(a):
+    for method in ("arclength", "natural"):
+        assert not dp.continuation(inflected, -1.0, -1.0, 1.0, a, method=method).folds
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("error", [0.0, 1e-15, -1e-15, 1e-11, -1e-11])
+def test_a_fold_at_the_end_of_the_range_ends_the_branch(error):
+    branch = dp.continuation(cubic, -3.0, -4.0, 2.0 + error)
+    assert branch.status == "reached_stop"
+    assert branch.parameter[-1] == 2.0 + error
+    assert [fold.index for fold in branch.folds] == [len(branch) - 1]
+    branch = dp.continuation(cubic, -2.5, -2.0 + error, 4.0)
+    assert branch.status == "returned_to_start"
+    assert branch.parameter[-1] == -2.0 + error
+    assert [fold.index for fold in branch.folds][1:] == [len(branch) - 1]
+
+
+def test_a_fold_has_no_derivative():
+    """The state moves by sqrt(d) at the distance d of the parameter from that of the fold."""
+    branch = dp.continuation(lambda x, p, s: s * cubic(x, p), np.array([-3.0]), -4.0, 4.0, 1.0)
+    fold = branch.folds[1]
+
+    def state(q):
+        return branch.solve(fold.index, *q)[0]
+
+    for derivative in (dp.grad(state), lambda q: dp.jvp(state, q, (1.0, 0.0))):
+        with pytest.raises(
+            ConvergenceError,
+            match=r"the steady state at parameter -2 is a fold up to the tolerance, where it has no derivative; "
+            "differentiate at another parameter, or write a smaller rtol",
+        ):
+            derivative((fold.parameter, 1.0))
+    p = fold.parameter + 1e-4
+    slope = dp.grad(lambda p: branch.solve(fold.index + 1, p, 1.0)[0])(p)
+    x = float(branch.solve(fold.index + 1, p, 1.0)[0])
+    assert slope == pytest.approx(1 / (3 * x**2 - 3), rel=1e-9)
+
+
 @pytest.mark.whole
 @pytest.mark.parametrize("unit", [2.0**-500, 2.0**500])
 def test_units_of_the_state_do_not_matter(unit):
@@ -212,8 +282,13 @@ def test_a_branch_that_ends_is_reported():
 
 
 def test_wrong_arguments_are_refused():
-    with pytest.raises(ValueError, match="continuation needs a range of the parameter, got start = stop = 1"):
-        dp.continuation(cubic, 1.0, 1.0, 1.0)
+    for stop in (1.0, 1.0 + 1e-15, 1.0 - 1e-13):
+        with pytest.raises(
+            ValueError,
+            match=r"continuation needs a range of the parameter that is long beside rounding errors, got start = 1\.0 "
+            "and stop = .*",
+        ):
+            dp.continuation(cubic, 1.0, 1.0, stop)
     with pytest.raises(ValueError, match="method of continuation must be one of arclength, natural, got 'arc'"):
         dp.continuation(cubic, 1.0, 0.0, 1.0, method="arc")
     with pytest.raises(TypeError, match="continuation takes a function, got float"):
@@ -234,3 +309,22 @@ def test_wrong_arguments_are_refused():
         JitError, match="dp.jit cannot record continuation, whose steps depend on values; call it without dp.jit"
     ):
         dp.jit(lambda s: dp.continuation(cubic, -3.0, -4.0, 4.0, s).states[-1])(1.0)
+
+
+def test_wrong_arguments_of_solve_are_refused():
+    branch = dp.continuation(cubic, -3.0, -4.0, -3.0, 1.0)
+    n = len(branch)
+    assert branch.solve(-n, -4.0, 1.0) == pytest.approx(branch.states[0])
+    with pytest.raises(IndexError, match=r"index of branch\.solve must be less than .*, the number of points, got .*"):
+        branch.solve(n, -4.0, 1.0)
+    with pytest.raises(ValueError, match=f"index of branch.solve must be an integer >= -{n}, got -{n + 1}"):
+        branch.solve(-n - 1, -4.0, 1.0)
+    with pytest.raises(TypeError, match=r"index of branch\.solve must be an integer, got 1\.0"):
+        branch.solve(1.0, -4.0, 1.0)
+    with pytest.raises(TypeError, match=r"p of branch\.solve must be one real number, got an array of shape \(1,\)"):
+        branch.solve(0, np.ones(1), 1.0)
+    with pytest.raises(
+        TypeError,
+        match=r"branch\.solve takes an index, p and 1 other parameters, as many as continuation got, got 0",
+    ):
+        branch.solve(0, -4.0)
