@@ -102,7 +102,9 @@ def _scaled_level(grid, level):
     The factor is a power of two. The derivatives of the small values are kept.
     """
     largest = np.max(np.abs(np.asarray(sample(level))), initial=0.0)
-    level = 2.0 ** -np.frexp(largest)[1] * level
+    exponent = int(np.frexp(largest)[1])
+    half = exponent // 2  # 2^-exponent alone overflows for the smallest numbers
+    level = 2.0**-half * level * 2.0 ** (half - exponent)
     values = np.asarray(sample(level))
     if not values.size:
         return level

@@ -493,6 +493,10 @@ def test_errors_name_the_argument():
         body.project(np.full(GRID.faces.size, np.nan))
     with pytest.raises(NonFiniteError, match="values of cut_cells must be finite"):
         body.solve(ONES, np.inf)
+    outside = np.where(body.is_fluid, 0.0, 1.0)
+    with pytest.raises(IncompatibleError, match="the right-hand side must be 0 where there is no unknown"):
+        dp.inverse(-body.laplacian)(ONES + outside)
+    assert np.all(dp.inverse(-body.laplacian)(ONES * body.is_fluid)[~body.is_fluid] == 0)
     with pytest.raises(ValueError, match=r"^k of cut_cells must be >= 0, got -2$"):
         body.solve(ONES, k=-2.0)
     with pytest.raises(IncompatibleError, match="cut_cells is singular"):

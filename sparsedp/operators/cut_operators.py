@@ -1,0 +1,496 @@
+"""Differences, fluxes and averages on the fluid cells around a body whose wall cuts the cells of the grid.
+
+Finite volumes on the fluid part of each cell. With the fluid volume V of a cell, the open areas A_f of its faces and
+the area A_w of the wall in it, the mean of div(k grad u) over the fluid of the cell is
+
+    (sum of A_f k_f du/dn over the faces + A_w k_w du/dn) / V,
+
+where n points out of the fluid. The slopes on faces are those of `gradient`, the slope at the wall is that of
+`wall_slope`. A field holds the value at the centre of each cell, in a cut cell too: if the centre lies in the body, it
+is the smooth continuation of the field.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any
+
+import autograd.numpy as anp
+import numpy as np
+import scipy.sparse as sp
+
+from sparsedp._utils.base_classes import Reconstructible
+from sparsedp._utils.validation import check_finite, check_kind, check_on, check_plain
+from sparsedp.autodiff.program_trace import check_values, recording_trace
+from sparsedp.autodiff.tape import cast, dtype_of, isbox, sample
+from sparsedp.errors import DerivativeError, JitError, ShapeError
+from sparsedp.grid.boundary_conditions import check_condition
+from sparsedp.operators.cut_geometry import cut_geometry, sum_at_places
+from sparsedp.operators.cut_wall_slope import wall_slope
+from sparsedp.operators.difference import divergence, gradient
+from sparsedp.operators.given import from_matrix
+from sparsedp.operators.masks_and_lift import lift
+from sparsedp.operators.stencils import adjacent_cell, to_faces
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from sparsedp.grid.grid import Grid
+    from sparsedp.operators.cut_wall_slope import WallSlope
+    from sparsedp.operators.operator import Operator
+
+__all__ = ["CutGrid", "CutOperators", "in_dtype_of"]
+
+
+class CutGrid(Reconstructible):
+    """The geometry of the fluid around a body with a curved wall, as fields on the grid.
+
+    Parameters
+    ----------
+    grid : Grid
+    level : array, shape `grid.nodes.shape`, or callable
+        As `cut_cells` takes it.
+
+    Attributes
+    ----------
+    fractions, volumes : arrays, shape `grid.shape`
+        Fluid fraction and fluid volume [length^dim] of each cell.
+    apertures : array, shape (faces.size,)
+        Fluid fraction of each face.
+    areas : array, shape `grid.shape`
+        Area of the wall in each cell [length^(dim - 1)].
+    is_fluid : bool array, shape `grid.shape`
+        Whether a cell holds fluid.
+    """
+
+    def __init__(self, grid: Grid, level: Any) -> None:
+        self.grid = grid
+        self._geometry = cut_geometry(grid, _checked_level(grid, level))
+        self.fractions = anp.reshape(self._geometry.fractions, grid.shape)
+        self.volumes = self.fractions * grid.volumes
+        self.apertures = self._geometry.apertures
+        self.is_fluid: NDArray[np.bool_] = np.asarray(sample(self.fractions)) > 0
+        self._is_open = np.asarray(sample(self.apertures)) > 0
+        self._at_walls = sum_at_places(self._geometry.cut, grid.cells)  # from cut cells to a field
+        self.areas = self._at_walls(self._geometry.areas)
+
+    @cached_property
+    def normals(self) -> tuple:
+        """Unit normal of the wall that points into the fluid: one cell field for each axis, 0 in cells without wall."""
+        return tuple(self._at_walls(normal) for normal in self._geometry.normals)
+
+    @cached_property
+    def centroids(self) -> tuple:
+        """Where `values` belong: coordinates of the centroid of the wall, and of the centre in cells without wall."""
+        cut = self._geometry.cut
+        pairs = zip(self.grid.centres(), self._geometry.centroids, strict=True)
+        return tuple(centre + self._at_walls(of_wall - centre.reshape(-1)[cut]) for centre, of_wall in pairs)
+
+    @cached_property
+    def _divisors(self):
+        """The fluid volumes, and 1 in cells without fluid."""
+        return anp.where(self.is_fluid, self.volumes, 1.0)
+
+    def _in_cut_cells(self, field):
+        """Return the values of a cell field, or of a batch of them, in the cut cells; shape (..., m)."""
+        return self._flat(field)[..., self._geometry.cut]
+
+    def _flat(self, field):
+        """Return a cell field, or a batch of them, with one axis for the cells."""
+        shape = np.shape(field)
+        return anp.reshape(field, (*shape[: len(shape) - self.grid.dim], self.grid.cells.size))
+
+
+class CutOperators(CutGrid):
+    """Operators on the fluid cells around a body with a curved wall.
+
+    All fields may have leading axes, which are a batch. Values in cells and on faces without fluid are not used, and
+    may be NaN; their derivatives are 0.
+
+    Parameters
+    ----------
+    grid, level, boundary, solid_boundary
+        As `cut_cells` takes them.
+    """
+
+    def __init__(self, grid: Grid, level: Any, boundary: Any, solid_boundary: Any) -> None:
+        check_condition("solid_boundary", solid_boundary)
+        self._gradient = gradient(grid, boundary)
+        self._boundary = boundary
+        self._condition = solid_boundary
+        super().__init__(grid, level)
+
+    # ------------------------------------------------------------ slopes and fluxes
+
+    def gradient(self, u: Any, walls: Any = None) -> Any:
+        """Return the slopes on the faces, 0 on faces without fluid.
+
+        Parameters
+        ----------
+        u : array, a field on the cells
+        walls : array, optional
+            Values on the walls of the grid, as `lift` takes them. Default: 0.
+
+        Returns
+        -------
+        array, a field on the faces
+        """
+        return in_dtype_of(u, self._slopes_on_faces(self._cell_field("u", u), walls))
+
+    def _slopes_on_faces(self, u, walls):
+        slopes = self._is_open * self._gradient(u)
+        if walls is not None:
+            slopes = slopes + self._slopes_of_walls(walls)
+        return slopes
+
+    def _slopes_of_walls(self, walls):
+        """Return the part of the slopes on the faces that values on the walls of the grid add."""
+        check_plain("walls of cut_cells", walls)
+        slopes = anp.where(self._is_open, self._lift(walls), 0.0)
+        check_values(partial(check_finite, "walls of cut_cells, on their faces,"), slopes)
+        return slopes
+
+    @cached_property
+    def _lift(self) -> Operator:
+        return lift(self.grid, self._boundary)
+
+    @cached_property
+    def _outflow(self) -> Operator:
+        """The operator from a face field to the outflow of each cell, through whole faces."""
+        matrix = sp.diags_array(self.grid.volumes.reshape(-1)) @ divergence(self.grid).matrix
+        return from_matrix(matrix, self.grid.faces, self.grid.cells, "outflow")
+
+    @cached_property
+    def _sum_over_faces(self) -> Operator:
+        """The operator that sums a face field, times the areas of the whole faces, over the faces of each cell."""
+        return from_matrix(abs(self._outflow.matrix), self.grid.faces, self.grid.cells, "sum over faces")
+
+    def divergence(self, v: Any) -> Any:
+        """Return the divergence of a face field: its outflow through the open faces of a cell, for each fluid volume.
+
+        Nothing flows through the wall. The sum of ``volumes * divergence(v)`` is the outflow through the walls of the
+        grid, up to rounding.
+
+        Parameters
+        ----------
+        v : array, a field on the faces
+
+        Returns
+        -------
+        array, a field on the cells; 0 in cells without fluid
+        """
+        return in_dtype_of(v, self._outflow(self.apertures * self._face_field("v", v)) / self._divisors)
+
+    def slopes(self, u: Any, values: Any = 0.0) -> Any:
+        """Return the slope du/dn at the wall, where n points out of the fluid into the body.
+
+        Parameters
+        ----------
+        u : array, a field on the cells
+        values : number, or array of the shape of the grid
+            Values of the condition at `centroids`: u for dirichlet, du/dn for neumann, a u + b du/dn for robin. Not
+            used in cells without wall.
+
+        Returns
+        -------
+        array, a field on the cells; 0 in cells without wall
+        """
+        slopes = self._slopes_at_walls(self._cell_field("u", u), self._wall_values(values))
+        return in_dtype_of(u, self._at_walls(slopes))
+
+    def flux(self, u: Any, values: Any = 0.0, k: Any = 1.0, wall_k: Any = None) -> Any:
+        """Return the integral of k du/dn over the wall in each cell; its sum is the flux into the body.
+
+        Parameters
+        ----------
+        u, values
+            As for `slopes`.
+        k : number or array, a field on the faces, >= 0
+        wall_k : number or array of the shape of the grid, >= 0, optional
+            k at the wall. Default: the mean of k over the open faces of the cell, weighted by their open areas.
+
+        Returns
+        -------
+        array, a field on the cells
+        """
+        return in_dtype_of(u, self._flux_into_walls(self._cell_field("u", u), values, k, wall_k))
+
+    def diffusion(self, u: Any, values: Any = 0.0, walls: Any = None, k: Any = 1.0, wall_k: Any = None) -> Any:
+        """Return div(k grad u), averaged over the fluid of each cell: the rate of an explicit or implicit time step.
+
+        Parameters
+        ----------
+        u, values, k, wall_k
+            As for `flux`.
+        walls : array, optional
+            As for `gradient`.
+
+        Returns
+        -------
+        array, a field on the cells
+        """
+        field = self._cell_field("u", u)
+        through_faces = self.apertures * self._coefficient(k) * self._slopes_on_faces(field, walls)
+        total = self._outflow(through_faces) + self._flux_into_walls(field, values, k, wall_k)
+        return in_dtype_of(u, total / self._divisors)
+
+    def _flux_into_walls(self, u, values, k, wall_k):
+        slopes = self._slopes_at_walls(u, self._wall_values(values))
+        return self._at_walls(self._geometry.areas * self._wall_coefficient(k, wall_k) * slopes)
+
+    def _slopes_at_walls(self, u, values):
+        """Return the slopes in the cut cells, for a checked field and given values in the cut cells."""
+        if not self._condition.a:
+            return values / self._condition.b + 0.0 * self._in_cut_cells(u)  # of the shape of a batch
+        slope = self._wall_slope
+        terms = slope.coefficients * self._flat(u)[..., slope.cells]
+        return self._sum_of_pairs(terms) + slope.of_value * values
+
+    @cached_property
+    def _wall_slope(self) -> WallSlope:
+        return wall_slope(self.grid, self._geometry, self._condition)
+
+    @cached_property
+    def _sum_of_pairs(self) -> Operator:
+        return sum_at_places(self._wall_slope.walls, self._geometry.cut.size)
+
+    # ------------------------------------------------------------ the matrix of diffusion
+
+    @property
+    def laplacian(self) -> Operator:
+        """The Operator of ``diffusion(u)`` with wall values 0, for `inverse`, `eigenpairs` and `stepper`.
+
+        Cells without fluid are not unknowns: ``inverse(-body.laplacian)(b)`` needs b = 0 there, as
+        ``b * body.is_fluid``, and returns 0 there.
+        """
+        if isbox(self.fractions):
+            raise DerivativeError(
+                "the laplacian of cut_cells needs a plain level, got a traced one; write body.diffusion(u) or "
+                "body.solve(b)"
+            )
+        return self._laplacian
+
+    @cached_property
+    def _laplacian(self):
+        rows, columns, values = self._entries(1.0, None, 0.0)
+        matrix = sp.coo_array((-values, (rows, columns)), shape=(self.grid.cells.size,) * 2).tocsr()
+        matrix = sp.diags_array(1.0 / self._divisors.reshape(-1)) @ matrix
+        return from_matrix(matrix, self.grid.cells, self.grid.cells, "laplacian of cut cells")
+
+    def _entries(self, k, wall_k, shift):
+        """Return rows, columns and values of the matrix of V (shift u - div(k grad u)); places may be repeated."""
+        size = self.grid.cells.size
+        rows, columns, faces, factors = self._entries_of_faces
+        all_rows = [rows, np.arange(size)]
+        all_columns = [columns, np.arange(size)]
+        coefficient = self.apertures * self._coefficient(k)
+        shifts = self.volumes * self._cell_field("shift", shift)
+        entries = [factors * coefficient[faces], anp.reshape(shifts, (-1,))]
+        if self._condition.a:
+            slope = self._wall_slope
+            weights = self._geometry.areas * self._wall_coefficient(k, wall_k)
+            all_rows.append(self._geometry.cut[slope.walls])
+            all_columns.append(slope.cells)
+            entries.append(-(weights[slope.walls] * slope.coefficients))
+        return np.concatenate(all_rows), np.concatenate(all_columns), anp.concatenate(entries)
+
+    @cached_property
+    def _entries_of_faces(self):
+        """Rows, columns, faces and factors of -(outflow @ diag(apertures k) @ gradient), for open faces."""
+        outflow = sp.csr_array(self._outflow.matrix)
+        slope = sp.csr_array(self._gradient.matrix)
+        lengths = np.diff(slope.indptr)[outflow.indices]
+        first = np.cumsum(lengths) - lengths
+        of_outflow = np.repeat(np.arange(lengths.size), lengths)
+        of_slope = np.arange(of_outflow.size) + (slope.indptr[outflow.indices] - first)[of_outflow]
+        faces = outflow.indices[of_outflow]
+        is_open = self._is_open[faces]
+        rows = np.repeat(np.arange(outflow.shape[0]), np.diff(outflow.indptr))[of_outflow]
+        factors = -outflow.data[of_outflow] * slope.data[of_slope]
+        return rows[is_open], slope.indices[of_slope][is_open], faces[is_open], factors[is_open]
+
+    def _terms_of_values(self, values, k, wall_k):
+        """Return the part of the flux through the wall that does not depend on u, for each cut cell."""
+        values = self._wall_values(values)
+        if self._condition.a:
+            slopes = self._wall_slope.of_value * values
+        else:
+            slopes = values / self._condition.b
+        return self._geometry.areas * self._wall_coefficient(k, wall_k) * slopes
+
+    # ------------------------------------------------------------ transport
+
+    def advection(self, u: Any, v: Any, inflow: Any = 0.0) -> Any:
+        """Return -div(v u) by upwind fluxes, redistributed: the rate of an explicit step.
+
+        The sum of ``volumes * advection(u, v)`` is the flux through the walls of the grid, up to rounding.
+
+        Parameters
+        ----------
+        u : array, a field on the cells
+        v : array, a field on the faces, real
+            For example of `project`: its apertures-weighted divergence should be 0.
+        inflow : number, or array, a field on the faces
+            The value of u that enters through the walls of the grid.
+
+        Returns
+        -------
+        array, a field on the cells
+        """
+        below, above, at_lower, at_upper = self._beside_faces
+        field = self._cell_field("u", u)
+        v = self._face_field("v", v, "real numbers", "; write v.real")
+        entering = self._face_field("inflow", inflow)
+        from_below = anp.where(at_lower, entering, below(field))
+        from_above = anp.where(at_upper, entering, above(field))
+        flux = anp.maximum(v, 0.0) * from_below + anp.minimum(v, 0.0) * from_above
+        return in_dtype_of(u, -self.redistribute(self.divergence(flux)))
+
+    def redistribute(self, rate: Any) -> Any:
+        """Return a rate without the step limit of small cells: what a small cell cannot take goes to its neighbours.
+
+        A cell with a fluid fraction f below 1/2 keeps the share 2 f of its rate; the rest becomes the mean over the
+        cell and those behind its open faces. The difference is given to all of these, so that the sum of
+        ``volumes * rate`` is kept up to rounding. Other cells keep their rate.
+
+        Parameters
+        ----------
+        rate : array, a field on the cells
+            An explicit rate, such as ``body.divergence(flux)``.
+
+        Returns
+        -------
+        array, a field on the cells
+
+        References
+        ----------
+        I-L. Chern, P. Colella, UCRL-97200, Lawrence Livermore National Laboratory (1987).
+        """
+        field = self._cell_field("rate", rate)
+        around = self._neighbourhood(self.volumes)
+        around = anp.where(self.is_fluid, around, 1.0)
+        mean = self._neighbourhood(self.volumes * field) / around
+        excess = anp.maximum(1.0 - 2.0 * self.fractions, 0.0) * (field - mean)
+        result = self.is_fluid * (field - excess + self._neighbourhood(self.volumes * excess / around))
+        return in_dtype_of(rate, result)
+
+    @cached_property
+    def _neighbourhood(self) -> Operator:
+        """The operator that sums a field over each cell and the cells behind its open faces."""
+        touching = abs(self._outflow.matrix) @ sp.diags_array(self._is_open.astype(float))
+        links = sp.csr_array((touching @ touching.T + sp.eye_array(touching.shape[0]) > 0).astype(float))
+        return from_matrix(links, self.grid.cells, self.grid.cells, "sum over neighbours")
+
+    @cached_property
+    def _beside_faces(self):
+        """Operators to the values below and above each face, and masks of the faces on lower and on upper walls."""
+        grid = self.grid
+        axes = range(grid.dim)
+        below = to_faces("cell below", grid, [adjacent_cell(grid, axis, False) for axis in axes])
+        above = to_faces("cell above", grid, [adjacent_cell(grid, axis, True) for axis in axes])
+        masks = []
+        for end in (0, -1):
+            parts = [np.zeros(shape, bool) for shape in grid.faces.parts]
+            for axis, part in enumerate(parts):
+                if not grid.periodic[axis]:
+                    np.moveaxis(part, axis, 0)[end] = True  # a view
+            masks.append(np.concatenate([part.reshape(-1) for part in parts]))
+        return below, above, *masks
+
+    # ------------------------------------------------------------ arguments
+
+    def _cell_field(self, name, value):
+        """Return an argument as a field on the cells, 0 without fluid; a number is repeated."""
+        return _checked_field(name, value, self.grid.cells, self.is_fluid)
+
+    def _face_field(self, name, value, kind="numbers", advice=""):
+        """Return an argument as a field on the faces, 0 on faces without fluid; a number is repeated."""
+        return _checked_field(name, value, self.grid.faces, self._is_open, kind, advice)
+
+    def _wall_values(self, values):
+        """Return the values of the condition in the cut cells."""
+        return self._in_cut_cells(_checked_field("values", values, self.grid.cells, self._is_cut))
+
+    @cached_property
+    def _is_cut(self):
+        is_cut = np.zeros(self.grid.cells.size, bool)
+        is_cut[self._geometry.cut] = True
+        return is_cut.reshape(self.grid.shape)
+
+    def _coefficient(self, k):
+        """Return k as a field on the faces."""
+        k = self._face_field("k", k)
+        check_values(partial(_check_not_negative, "k"), k)
+        return k
+
+    def _wall_coefficient(self, k, wall_k):
+        """Return k at the wall, in the cut cells."""
+        if wall_k is not None:
+            wall_k = _checked_field("wall_k", wall_k, self.grid.cells, self._is_cut)
+            check_values(partial(_check_not_negative, "wall_k"), wall_k)
+            return self._in_cut_cells(wall_k)
+        total = self._in_cut_cells(self._sum_over_faces(self.apertures * self._coefficient(k)))
+        area = self._in_cut_cells(self._sum_over_faces(self.apertures))
+        return total / anp.where(np.asarray(sample(area)) > 0, area, 1.0)
+
+
+def _checked_level(grid, level):
+    """Return the level at the nodes, traced or not, in double precision."""
+    if callable(level) and not isbox(level):
+        level = level(*np.meshgrid(*(grid.coordinates(a, "nodes") for a in range(grid.dim)), indexing="ij"))
+    if recording_trace([level]) is not None:
+        raise JitError(
+            "dp.jit cannot record the level of cut_cells, whose values decide which cells are cut; call the function "
+            "without dp.jit"
+        )
+    check_plain("cut_cells", level)
+    values = np.asarray(sample(level))
+    check_on("the level of cut_cells", values, grid.nodes)
+    check_kind("the level of cut_cells", values.dtype, "real numbers", "; write level.real")
+    check_finite("the level of cut_cells", values)
+    return cast(level if isbox(level) else values, np.dtype(float))
+
+
+def _checked_field(name, value, space, is_used, kind="numbers", advice=""):
+    """Return an argument as a field on a space in double precision, or as a batch of fields; a number is repeated.
+
+    Parameters
+    ----------
+    name : str
+    value : number, array or traced
+    space : Space
+    is_used : bool array
+        Where the field is used; elsewhere it may be NaN, and becomes 0.
+    kind, advice : str
+        As for `check_kind`.
+    """
+    check_plain(f"{name} of cut_cells", value)
+    if not isbox(value):
+        value = np.asarray(value)
+    shape = np.shape(value)
+    if shape != () and shape[max(len(shape) - len(space.shape), 0) :] != space.shape:
+        raise ShapeError(f"{name} of cut_cells takes a number or a field on {space}, got an array of shape {shape}")
+    check_kind(f"{name} of cut_cells", dtype_of(value), kind, advice)
+    if shape == ():
+        check_values(partial(check_finite, f"{name} of cut_cells"), value)
+    field = anp.where(is_used, _in_double(value), 0.0)
+    check_values(partial(check_finite, f"{name} of cut_cells"), field)
+    return field
+
+
+def _in_double(field):
+    """Return a field in double precision."""
+    return cast(field, np.result_type(dtype_of(field), float))
+
+
+def in_dtype_of(field: Any, result: Any) -> Any:
+    """Return a real result in single precision if the field is in single precision."""
+    if dtype_of(result).kind != "f" or dtype_of(field).kind not in "fc":
+        return result
+    return cast(result, np.result_type(dtype_of(field), np.float32))
+
+
+def _check_not_negative(name, k):
+    least = np.min(np.real(k), initial=0.0)
+    if least < 0:
+        raise ValueError(f"{name} of cut_cells must be >= 0, got {least:g}")

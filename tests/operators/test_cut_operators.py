@@ -1,0 +1,177 @@
+"""Operators of cut_cells: gaps, coefficients at the wall, batches, unused values, refused arguments."""
+
+import autograd.numpy as np
+import pytest
+
+import sparsedp as dp
+from sparsedp.errors import NonFiniteError, ShapeError
+
+GRID = dp.Grid((6, 5), size=(1.2, 0.9))
+
+
+def ring(x, y):
+    """The fluid around a disc."""
+    return np.sqrt((x - 0.62) ** 2 + (y - 0.43) ** 2) - 0.27
+
+
+@pytest.fixture
+def body():
+    return dp.cut_cells(GRID, ring, {"x": dp.dirichlet}, dp.robin(1.0, 0.3))
+
+
+# ------------------------------------------------------------ gaps
+
+
+@pytest.mark.parametrize(("half", "tolerance"), [(0.01, 1e-2), (0.3, 1e-4), (0.5, 1e-4), (0.8, 0.06), (1.0, 0.14)])
+def test_solutions_in_gaps_of_one_cell(half, tolerance):
+    """u'' = -1 between two walls: the integral over the gap is 2/3 half^3, and the flux through each wall is half."""
+    gap = dp.cut_cells(dp.Grid((4, 12)), lambda x, y: half - abs(y - 6.0), solid_boundary=dp.dirichlet)
+    u = gap.solve(np.ones((4, 12)))
+    assert np.isclose(np.sum(gap.volumes * u) / 4.0, 2.0 / 3.0 * half**3, rtol=tolerance)
+    assert np.max(u) < 0.51 * half**2
+    fluxes = gap.flux(u)[gap.areas > 0]
+    assert len(fluxes) == 8 and np.allclose(fluxes, -half, rtol=1e-3)
+    uniform = gap.solve(np.zeros((4, 12)), 0.7)
+    assert np.allclose(uniform[gap.is_fluid], 0.7, rtol=1e-9)
+
+
+def test_the_slope_in_a_gap_has_derivatives():
+    def size(half):
+        gap = dp.cut_cells(dp.Grid((2, 8)), lambda x, y: half - abs(y - 4.0), solid_boundary=dp.dirichlet)
+        return np.sum(gap.volumes * gap.solve(np.ones((2, 8))))
+
+    assert np.isclose(dp.grad(size)(0.4), 2 * 2 * 0.4**2, rtol=1e-3)
+    h = 1e-5
+    assert np.isclose(dp.grad(size)(0.7), (size(0.7 + h) - size(0.7 - h)) / (2 * h), rtol=1e-6)
+
+
+def test_plane_walls_are_no_gaps(rng):
+    """The slope at a plane wall is that of the fit, in each direction: exact for quadratic fields."""
+    grid = dp.Grid((14, 13), size=(1.1, 0.9))
+    for angle in rng.uniform(0, 2 * np.pi, 12):
+        normal = np.array([np.cos(angle), np.sin(angle)])
+        level = lambda x, y, normal=normal: normal[0] * (x - 0.53) + normal[1] * (y - 0.46)
+        wall = dp.cut_cells(grid, level, solid_boundary=dp.dirichlet)
+        u = 1.0 + level(*grid.centres())
+        slopes = wall.slopes(u, 1.0)[3:-3, 3:-3][wall.areas[3:-3, 3:-3] > 0]
+        assert np.allclose(slopes, -1.0, atol=1e-7)
+
+
+# ------------------------------------------------------------ coefficients at the wall
+
+
+def test_the_coefficient_at_the_wall_is_the_mean_over_the_open_area():
+    """A cell at a corner of the grid: faces on walls of the grid count like those between cells."""
+    grid = dp.Grid((2, 2))
+    corner = dp.cut_cells(grid, lambda x, y: 2.5 - x - y)
+    k = grid.join(np.array([[1.0, 9.0], [2.0, 3.0], [5.0, 6.0]]), np.array([[1.0, 4.0, 7.0], [8.0, 2.0, 3.0]]))
+    flux = corner.flux(np.zeros((2, 2)), 1.0, k)
+    # Cell (1, 0): its open faces are x-lower (2, whole), x-upper (5, half), y-lower (8, whole), y-upper (2, half).
+    assert np.isclose(flux[1, 0] / corner.areas[1, 0], (2.0 + 0.5 * 5.0 + 8.0 + 0.5 * 2.0) / 3.0, rtol=1e-12)
+
+
+def test_tiny_levels_have_the_geometry_of_large_ones():
+    nodes = np.meshgrid(*(GRID.coordinates(axis, "nodes") for axis in (0, 1)), indexing="ij")
+    level = ring(*nodes)
+    for factor, tolerance in ((1e-300, 1e-14), (1e-315, 1e-6), (1e300, 1e-14)):
+        scaled = dp.cut_cells(GRID, factor * level)
+        assert np.allclose(scaled.fractions, dp.cut_cells(GRID, level).fractions, atol=tolerance)
+
+
+# ------------------------------------------------------------ batches
+
+
+def test_leading_axes_are_a_batch(rng):
+    flow = dp.cut_cells(GRID, ring)
+    walled = dp.cut_cells(GRID, ring, {"x": dp.dirichlet}, dp.robin(1.0, 0.3))
+    u, rate, values, wall_k = rng.uniform(0.5, 1.5, (4, 2, 3, *GRID.shape))
+    v, k, inflow = rng.uniform(0.5, 1.5, (3, 2, 3, GRID.faces.size))
+    v = dp.interior(GRID)(v)
+    walls = rng.standard_normal((2, 3, dp.lift(GRID, {"x": dp.dirichlet}).domain.size))
+    calls = [
+        (walled.gradient, (u, walls)),
+        (walled.divergence, (v,)),
+        (walled.slopes, (u, values)),
+        (flow.slopes, (u, 0.5)),
+        (walled.flux, (u, values, k)),
+        (walled.flux, (u, values, k, wall_k)),
+        (walled.diffusion, (u, values, walls, k)),
+        (flow.advection, (u, v, inflow)),
+        (flow.redistribute, (rate,)),
+        (flow.project, (v,)),
+        (walled.solve, (u, values, walls)),
+    ]
+    for function, arguments in calls:
+        batch = function(*arguments)
+        assert batch.shape[:2] == (2, 3), function
+        single = function(*(x[1, 2] if np.ndim(x) else x for x in arguments))
+        assert np.allclose(batch[1, 2], single, rtol=1e-10, atol=1e-11), function
+    assert walled.solve(u[0, 0], values).shape == values.shape
+    weights = rng.standard_normal((3, *GRID.shape))
+    slope = dp.grad(lambda u: np.sum(weights * walled.diffusion(u, values[0], walls[0], k[0])))(u[0])
+    h = 1e-5
+    ends = [np.sum(weights * walled.diffusion(u[0] + s * rate[0], values[0], walls[0], k[0])) for s in (h, -h)]
+    assert np.isclose(np.sum(slope * rate[0]), (ends[0] - ends[1]) / (2 * h), rtol=1e-8)
+
+
+# ------------------------------------------------------------ arguments
+
+
+def test_values_where_there_is_no_fluid_are_not_used(body, rng):
+    assert not np.all(body.is_fluid)
+    flow = dp.cut_cells(GRID, ring)
+    u = rng.standard_normal(GRID.shape)
+    v = dp.interior(GRID)(rng.standard_normal(GRID.faces.size))
+    dead_u = np.where(body.is_fluid, u, np.nan)
+    dead_v = np.where(body.apertures > 0, v, np.nan)
+    dead_values = np.where(body.areas > 0, u, np.nan)
+    k = np.where(body.apertures > 0, 2.0, -np.inf)
+    pairs = [
+        (lambda u, v, values, k: body.solve(u, values, k=k), "solve"),
+        (lambda u, v, values, k: body.diffusion(u, values, k=k, wall_k=abs(values)), "diffusion"),
+        (lambda u, v, values, k: body.gradient(u), "gradient"),
+        (lambda u, v, values, k: body.divergence(v), "divergence"),
+        (lambda u, v, values, k: flow.project(v), "project"),
+        (lambda u, v, values, k: flow.advection(u, v), "advection"),
+        (lambda u, v, values, k: flow.redistribute(u), "redistribute"),
+    ]
+    for function, name in pairs:
+        expected = function(u, v, u, np.full(GRID.faces.size, 2.0))
+        assert np.array_equal(function(dead_u, dead_v, dead_values, k), expected), name
+    gradient = dp.grad(lambda b: np.sum(body.solve(b, dead_values) ** 2))(dead_u)
+    assert np.all(gradient[~body.is_fluid] == 0) and np.all(np.isfinite(gradient))
+    assert np.all(dp.grad(lambda u: np.sum(body.diffusion(u) ** 2))(dead_u)[~body.is_fluid] == 0)
+
+
+def test_refused_arguments(body):
+    u = np.ones(GRID.shape)
+    k = np.ones(GRID.faces.size)
+    for call in (body.diffusion, body.flux, body.solve):
+        with pytest.raises(ValueError, match="^k of cut_cells must be >= 0, got -2$"):
+            call(u, k=-2.0)
+        with pytest.raises(ValueError, match="^wall_k of cut_cells must be >= 0, got -1$"):
+            call(u, wall_k=-u)
+        with pytest.raises(NonFiniteError, match="k of cut_cells must be finite"):
+            call(u, k=np.nan * k)
+        with pytest.raises(NonFiniteError, match="wall_k of cut_cells must be finite"):
+            call(u, wall_k=np.nan)
+        with pytest.raises(ShapeError, match="k of cut_cells takes a number or a field on faces"):
+            call(u, k=np.ones(1))
+    for call in (body.diffusion, body.gradient, body.solve):
+        walls = np.full(dp.lift(GRID, {"x": dp.dirichlet}).domain.size, np.nan)
+        with pytest.raises(NonFiniteError, match="^walls of cut_cells, on their faces, must be finite, got 22 that"):
+            call(u, walls=walls)
+    with pytest.raises(NonFiniteError, match="u of cut_cells must be finite"):
+        body.gradient(np.nan * u)
+    with pytest.raises(TypeError, match="^v of cut_cells must hold real numbers, got dtype complex128; write v.real$"):
+        body.advection(u, 1j * k)
+    with pytest.raises(TypeError, match="u of cut_cells must hold numbers"):
+        body.slopes(np.full(GRID.shape, "a"))
+    with pytest.raises(
+        ShapeError,
+        match=r"^solve of cut_cells takes one k for all right-hand sides, got an array of shape \(2, 71\); call solve "
+        "once for each k$",
+    ):
+        body.solve(u, k=np.stack([k, k]))
+    with pytest.raises(ShapeError, match="^solve of cut_cells takes one shift for all right-hand sides"):
+        body.solve(u, shift=np.stack([u, u]))
