@@ -371,6 +371,9 @@ class Jacobians:
         cells = pattern.cells
         if cells is not None and unknowns.shapes[0] != cells.shape:
             cells = None  # a field of another shape with as many unknowns
+        if self._is_large_flow:  # so that the solver needs no second copy
+            matrix = matrix.copy()
+            matrix.eliminate_zeros()
         key = (cells, matrix.indptr, matrix.indices, matrix.data)
         op = None if self._is_large_flow else self._operators.find(key)
         if op is not None:

@@ -37,7 +37,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.operators.structure.base import rows_of
+from sparsedp.operators.structure.base import compact, rows_of
 from sparsedp.solvers.algebraic_multigrid import colour_graph
 
 if TYPE_CHECKING:
@@ -144,9 +144,7 @@ def _rows_reached(products, colours, rows, rng):
 
 def pattern_of(row: NDArray[Any], column: NDArray[Any], shape: tuple[int, int]) -> sp.csr_array:
     """Return a csr_array with a one at each of the places, which may be repeated."""
-    pattern = sp.csr_array((np.ones(row.size, np.int8), (row, column)), shape=shape)
-    pattern.sum_duplicates()
-    pattern.sort_indices()
+    pattern = compact(sp.coo_array((np.ones(row.size, np.int8), (row, column)), shape=shape))
     pattern.data = np.ones(pattern.nnz)
     return pattern
 

@@ -278,3 +278,17 @@ def test_divided_by_a_subnormal_number():
 def test_divided_by_what_is_no_number():
     op = dp.laplacian(dp.Grid(3))
     assert op.__truediv__("2") is op.__truediv__(op) is NotImplemented
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_magnitudes_of_large_matrices_are_computed_in_blocks_of_rows(monkeypatch, seed):
+    """Without a copy of the matrix; with empty rows, empty matrices and rows longer than a block."""
+    rng = np.random.default_rng(seed)
+    shape = (rng.integers(0, 12), rng.integers(1, 9))
+    dense = np.where(rng.random(shape) < rng.random(), rng.normal(size=shape), 0.0)
+    structure = dp.from_matrix(dense).structure
+    x = rng.random(shape[1])
+    expected = structure.magnitude()(x)
+    monkeypatch.setattr("sparsedp.operators.structure.base.MOST_MAGNITUDES", 3)
+    assert np.array_equal(structure.magnitude()(x), expected)
+    assert np.allclose(expected, np.abs(dense) @ x, rtol=1e-14)

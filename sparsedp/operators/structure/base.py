@@ -32,6 +32,7 @@ __all__ = [
 ]
 
 INT32_LIMIT = 2**31
+MOST_MAGNITUDES = 2**22  # magnitudes of entries that are stored; those of larger matrices are computed when needed
 PROBES = 3  # number of random vectors for estimating the magnitude of a map whose entries are unknown
 
 
@@ -127,6 +128,8 @@ class Structure(Uncached):
         """
         if self.has_entries:
             matrix = self.explicit()
+            if matrix.nnz > MOST_MAGNITUDES:
+                return partial(_product_with_magnitudes, matrix)
             magnitudes = (np.abs(matrix.data), matrix.indices, matrix.indptr)  # the indices are shared, not copied
             return sp.csr_array(magnitudes, shape=matrix.shape).dot
         # Estimate the row sums of abs(A) by the largest entry of A x over a few random vectors x of signs.
@@ -244,6 +247,19 @@ def result_dtype(structure: Any, dtype: np.dtype) -> np.dtype:
     if structure.dtype.kind == "c" and dtype.kind != "c":
         return np.dtype(np.complex64 if dtype.itemsize <= 4 else np.complex128)
     return dtype
+
+
+def _product_with_magnitudes(matrix: sp.csr_array, x: NDArray) -> NDArray:
+    """Return abs(A) x without a copy of A: the magnitudes of some rows at a time."""
+    result = np.empty(matrix.shape[0])
+    firsts = np.searchsorted(matrix.indptr, np.arange(0, matrix.nnz, MOST_MAGNITUDES))
+    bounds = np.unique([0, *firsts, matrix.shape[0]])
+    for start, stop in zip(bounds[:-1], bounds[1:], strict=True):
+        entries = slice(matrix.indptr[start], matrix.indptr[stop])
+        pointers = matrix.indptr[start : stop + 1] - matrix.indptr[start]
+        rows = (np.abs(matrix.data[entries]), matrix.indices[entries], pointers)
+        result[start:stop] = sp.csr_array(rows, shape=(stop - start, matrix.shape[1])) @ x
+    return result
 
 
 def compact(matrix: Any) -> sp.csr_array:
