@@ -248,7 +248,7 @@ X = 1.0 + np.arange(20.0).reshape(5, 4)
 def run_flow(scene, viscosity, scalars=None):
     """One step of a flow at rest."""
     step = dp.flow_step(scene.grid, 0.01, viscosity, scalars=scalars)
-    step(step.start(0.0 * scene.G(scene.u), None, {name: scene.u for name in scalars or ()}))
+    step(step.start(0.0 * scene.G(scene.u), None, dict.fromkeys(scalars or (), scene.u)))
 
 
 NOT_ON_RANKS_YET = {
