@@ -866,24 +866,24 @@ def name_of(subject: Any) -> Any:
 
 
 def entrywise(name: str, value: Callable, slopes: Callable) -> Rule:
-    """Return a rule for an elementwise function of two fields.
+    """Return a rule for an elementwise function of fields of one shape.
 
     Parameters
     ----------
     name : str
     value : callable
-        ``value(a, b)``.
+        ``value(*fields)``.
     slopes : callable
-        ``slopes(a, b)`` returns the derivatives with respect to `a` and `b`; it must accept traced values.
+        ``slopes(*fields)`` returns the derivatives with respect to each field; it must accept traced values.
     """
 
-    def vjp(nums, ans, a, b):
-        pair = slopes(a, b)
-        return lambda g: tuple(g * pair[num] for num in nums)
+    def vjp(nums, ans, *fields):
+        partials = slopes(*fields)
+        return lambda g: tuple(g * partials[num] for num in nums)
 
-    def jvp(nums, tangents, ans, a, b):
-        pair = slopes(a, b)
-        return sum(pair[num] * tangent for num, tangent in zip(nums, tangents, strict=True))
+    def jvp(nums, tangents, ans, *fields):
+        partials = slopes(*fields)
+        return sum(partials[num] * tangent for num, tangent in zip(nums, tangents, strict=True))
 
     return Rule(name, value, vjp, jvp)
 

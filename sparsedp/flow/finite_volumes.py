@@ -254,6 +254,11 @@ def _checked_quantities(positive: Any) -> dict[str, Callable]:
             'write {"density": lambda u, params: u[0]}'
         )
     for name, quantity in positive.items():
+        if not isinstance(name, str):
+            raise TypeError(
+                f"the names in positive of conservation_law must be str, got {type(name).__name__}; "
+                'write {"density": lambda u, params: u[0]}'
+            )
         check_function(f"conservation_law, as positive[{name!r}],", quantity, "lambda u, params: ...", 2)
     return dict(positive)
 
@@ -280,12 +285,15 @@ class FiniteVolumes(Reconstructible):
 
     Parameters
     ----------
-    grid, scheme, inflow, source
-        As `conservation_law` takes them.
+    grid : Grid
+    scheme : str
+        A key of `SCHEMES`.
     sides : tuple
         The conditions as `resolve` returns them.
     momentum : tuple of int or None
         For each axis, the index of the field that is the momentum along this axis.
+    inflow, source
+        As `conservation_law` takes them.
 
     Attributes
     ----------
@@ -341,11 +349,22 @@ class FiniteVolumes(Reconstructible):
         for axis in self.axes:
             for side, condition in enumerate(axis.sides):
                 if condition == inflow_side:
-                    self._check_physical(axis.ghost_values(u, params, side), params, " at the inflow")
+                    at = f" at the {('lower', 'upper')[side]} end of {AXES[axis.number]}"
+                    self._check_physical(axis.ghost_values(u, params, side), params, "inflow", at)
 
     @abstractmethod
-    def _check_physical(self, u: Any, params: Any, at: str = "") -> None:
-        """Raise if a quantity of the state is not positive; `at` is the part of the message that says where."""
+    def _check_physical(self, u: Any, params: Any, argument: str = "", at: str = "") -> None:
+        """Raise if a quantity of the state is not positive.
+
+        Parameters
+        ----------
+        u : array
+        params : tree
+        argument : str
+            The argument of the law that u comes from, if it is not the state in the cells.
+        at : str
+            Where it holds, the end of a message.
+        """
 
     @abstractmethod
     def _rate(self, u: Any, params: Any) -> Any:
@@ -361,8 +380,10 @@ class FiniteVolumes(Reconstructible):
             return np.zeros(u.shape)
         return checked_result(self._what("source"), self.source(u, params), u)
 
-    def _what(self, part: str) -> str:
-        """Return the subject of a message."""
+    def _what(self, part: str, argument: str = "") -> str:
+        """Return the subject of a message; for `argument` see `_check_physical`."""
+        if argument:
+            part = f"{part} of the {argument}"
         return f"the {part} of a {self.name}"
 
     def _checked_state(self, u: Any) -> Any:
@@ -377,12 +398,13 @@ class FiniteVolumes(Reconstructible):
         else:
             count = 1
         if self.momentum is not None and max(self.momentum) >= count:
-            raise ShapeError(
-                f"{self.name} needs a field for each number in momentum={self.momentum}, got u of shape "
-                f"{values.shape}; give a state that holds them all"
-            )
+            raise ShapeError(f"{self._required_fields()}, got u of shape {values.shape}")
         check_kind(f"u of {self.name}", values.dtype, "real numbers", "; write u.real")
         return frozen(u if isbox(u) else values)
+
+    def _required_fields(self) -> str:
+        """Return the beginning of the message for a state without a field for each momentum."""
+        return f"{self.name} needs a field for each number in momentum={self.momentum}"
 
     def _first_field(self, u: Any) -> Any:
         """Return the first field of a state, or the state if it is one field."""
@@ -424,17 +446,10 @@ class ConservationLaw(FiniteVolumes):
 
     Parameters
     ----------
-    grid, flux, speed, scheme, inflow, source, equilibrium, positive
+    flux, speed, equilibrium, positive
         As `conservation_law` takes them.
-    sides : tuple
-        The conditions as `resolve` returns them.
-    momentum : tuple of int or None
-        For each axis, the index of the field that is the momentum along this axis.
-
-    Attributes
-    ----------
-    domain : Space
-        The cells.
+    grid, scheme, sides, momentum, inflow, source
+        As `FiniteVolumes` takes them.
     """
 
     name = "conservation_law"
@@ -493,9 +508,10 @@ class ConservationLaw(FiniteVolumes):
         if self.positive:
             super()._check_states(u, params)
 
-    def _check_physical(self, u: Any, params: Any, at: str = "") -> None:
+    def _check_physical(self, u: Any, params: Any, argument: str = "", at: str = "") -> None:
         for name, quantity in self.positive.items():
-            check_values(partial(check_positive, self._what(name + at)), self._quantity(name, quantity, u, params))
+            check = partial(check_positive, self._what(name, argument) + at, argument=argument)
+            check_values(check, self._quantity(name, quantity, u, params))
 
     def _equilibrium_state(self, u: Any, params: Any) -> Any:
         """Return the equilibrium for these params, or None."""
@@ -516,7 +532,9 @@ class ConservationLaw(FiniteVolumes):
         e = self._equilibrium_state(u, params)
         if e is None:
             return self._rate_beside(u, None, params)
-        return self._rate_beside(u, e, params) - self._rate_beside(e, e, params, with_inflow=False)
+        self._check_physical(e, params, "equilibrium")
+        at_rest = self._rate_beside(e, e, params, with_inflow=False)
+        return self._rate_beside(u, e, params) - at_rest
 
     def _rate_beside(self, u: Any, equilibrium: Any, params: Any, with_inflow: bool = True) -> Any:
         """Return the rate of a state; `equilibrium` affects the slopes only.
@@ -526,7 +544,7 @@ class ConservationLaw(FiniteVolumes):
         total = self._source_term(u, params)
         for axis in self.axes:
             lower, upper = self._beside_faces(axis, u, equilibrium, params, with_inflow)
-            f = self._numerical_flux(axis, lower, upper, params)
+            f = self._numerical_flux(axis, lower, upper, params, "" if with_inflow else "equilibrium")
             total = total + (axis.part(f, 0, -1) - axis.part(f, 1)) / axis.widths
         return total
 
@@ -559,11 +577,14 @@ class ConservationLaw(FiniteVolumes):
             at_upper_end = anp.where(too_small, cells + theta * (at_upper_end - cells), at_upper_end)
         return at_lower_end, at_upper_end
 
-    def _numerical_flux(self, axis: AxisFluxes, lower: Any, upper: Any, params: Any) -> Any:
-        """Return the flux of Harten, Lax and van Leer for the values below and above each face."""
+    def _numerical_flux(self, axis: AxisFluxes, lower: Any, upper: Any, params: Any, argument: str) -> Any:
+        """Return the flux of Harten, Lax and van Leer for the values below and above each face.
+
+        For `argument` see `_check_physical`.
+        """
         both = frozen(anp.concatenate([lower, upper], axis.place))
         f_lower, f_upper = axis.halves(checked_result(self._what("flux"), self.flux(both, params, axis.number), both))
-        slowest, fastest = self._wave_speeds(axis.number, both, params)
+        slowest, fastest = self._wave_speeds(axis.number, both, params, argument)
         a = anp.minimum(anp.minimum(*axis.halves(slowest)), 0.0)
         b = anp.maximum(anp.maximum(*axis.halves(fastest)), 0.0)
         no_waves = a == b  # a = b = 0: the flux is the mean of both fluxes
@@ -571,16 +592,18 @@ class ConservationLaw(FiniteVolumes):
         share = (b + 0.5 * no_waves) / width
         return share * f_lower + (1.0 - share) * f_upper + a * b / width * (upper - lower)
 
-    def _wave_speeds(self, axis: int, u: Any, params: Any) -> tuple[Any, Any]:
+    def _wave_speeds(self, axis: int, u: Any, params: Any, argument: str = "") -> tuple[Any, Any]:
         """Return the speeds of the slowest and the fastest wave along an axis."""
         speeds = self.speed(u, params, axis)
-        if not isinstance(speeds, tuple):
-            speeds = (-speeds, speeds)
         first_field = self._first_field(u)
-        for speed in speeds:
-            checked_result(self._what("speed"), sample(speed), first_field)
-        check_values(partial(_check_speeds, axis), *speeds)
-        return speeds
+        if isinstance(speeds, tuple):
+            slowest, fastest = (checked_result(self._what("speed"), speed, first_field) for speed in speeds)
+        else:
+            fastest = checked_result(self._what("speed"), speeds, first_field)
+            slowest = -fastest
+        what = f"{self._what('speed', argument)} along {AXES[axis]}"
+        check_values(partial(_check_speeds, what, argument), slowest, fastest)
+        return slowest, fastest
 
     def _fastest_waves(self, axis: AxisFluxes, u: NDArray, params: Any) -> NDArray:
         """Return the speed of the fastest wave along an axis in each cell, including waves of the inflow."""
@@ -601,7 +624,7 @@ class ConservationLaw(FiniteVolumes):
         return speeds
 
 
-def check_positive(what: str, values: Any, slack: float | None = None) -> None:
+def check_positive(what: str, values: Any, slack: float | None = None, argument: str = "") -> None:
     """Raise an error that names the quantity and the cell where it is not positive.
 
     Parameters
@@ -611,6 +634,8 @@ def check_positive(what: str, values: Any, slack: float | None = None) -> None:
     values : array
     slack : float, optional
         If it is given, 0 is valid, and so are negative values of at most this size.
+    argument : str, optional
+        The argument of the law that the values come from, if they are not those of the state in the cells.
     """
     check_finite(what, values)
     if slack is None:
@@ -622,6 +647,8 @@ def check_positive(what: str, values: Any, slack: float | None = None) -> None:
     if np.any(wrong):
         first = int(np.argmax(wrong))
         count = np.count_nonzero(wrong)
+        if argument:
+            raise UnstableStepError(f"{what} must be {needs}, got {values.flat[first]:g}; change {argument}=")
         if count > 1:
             others = f" and in {count - 1} more"
         else:
@@ -632,10 +659,11 @@ def check_positive(what: str, values: Any, slack: float | None = None) -> None:
         )
 
 
-def _check_speeds(axis, slowest, fastest):
+def _check_speeds(what, argument, slowest, fastest):
     """Raise an error for wave speeds that are not finite or in the wrong order."""
+    advice = f"; change {argument}=" if argument else IF_NOT_FINITE
     for speed in (slowest, fastest):
-        check_finite(f"the speed of a conservation_law along {AXES[axis]}", speed, advice=IF_NOT_FINITE)
+        check_finite(what, speed, advice=advice)
     if np.any(slowest > fastest):  # the flux would not be upwind
         raise ValueError(
             "the speed of a conservation_law must be >= 0, or a pair, the slowest before the fastest; write abs(u) "
@@ -644,8 +672,10 @@ def _check_speeds(axis, slowest, fastest):
 
 
 def checked_result(what: str, value: Any, u: Any) -> Any:
-    """Return the result of a user-supplied function; raise unless it is real and has the shape of u."""
+    """Return the result of a user-supplied function as an array; raise unless it is real and has the shape of u."""
     check_plain(what, value)
+    if isinstance(value, (list, tuple)):
+        value = anp.array(value)
     check_shape(what, value, np.shape(u))
     check_kind(what, dtype_of(value), "real numbers", "; write its .real")
     return value
@@ -684,6 +714,10 @@ class AxisFluxes:
         repeated_lower = np.pad(cells, GHOSTS, PAD_MODES[sides[0]])
         repeated_upper = np.pad(cells, GHOSTS, PAD_MODES[sides[1]])
         self.ghosts = repeated_lower[:GHOSTS], repeated_upper[-GHOSTS:]  # indices of the repeated cells
+        indices = np.concatenate([self.ghosts[0], cells, self.ghosts[1]])
+        self.differs = np.diff(indices) != 0  # False between two copies of one cell
+        self.differs[:GHOSTS] |= sides[0] == inflow_side
+        self.differs[-GHOSTS:] |= sides[1] == inflow_side
         self.widths = self._along(widths)
         padded_widths = np.concatenate([widths[repeated_lower[:-GHOSTS]], widths[repeated_upper[-GHOSTS:]]])
         gaps = padded_widths[1:] + padded_widths[:-1]
@@ -697,6 +731,10 @@ class AxisFluxes:
         """Return the values along this axis in a shape that broadcasts to fields; a scalar if all are equal."""
         if np.all(line == line[0]):
             return line[0]
+        return self.along_fields(line)
+
+    def along_fields(self, line: NDArray) -> NDArray:
+        """Return the values along this axis in a shape that broadcasts to fields."""
         return line.reshape(-1, *[1] * (-1 - self.place))
 
     def part(self, x: Any, start: int, stop: int | None = None) -> Any:

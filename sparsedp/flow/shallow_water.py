@@ -41,6 +41,7 @@ import numpy as np
 
 from sparsedp._utils.calls import public
 from sparsedp._utils.validation import check_choice, check_finite, check_function, check_kind, check_number
+from sparsedp.autodiff.derivative import entrywise
 from sparsedp.autodiff.program_trace import check_values
 from sparsedp.autodiff.tape import plain, sample
 from sparsedp.autodiff.tape_constants import constant
@@ -59,6 +60,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ShallowWater", "shallow_water"]
 
+TINY = 1e-30  # a rise of the depth, without influence on the values of a limiter
 ROUNDING = 16  # a depth that is negative by this many roundings of the largest depth counts as 0
 
 
@@ -132,7 +134,8 @@ def shallow_water(
     Order: 2 where the solution is smooth and has no extremum, about 1.5 with a moving shore line.
 
     Derivatives: limiters, shocks, shore lines, and steps of the ground that change their sign have kinks, where
-    `check.gradient` returns "inconclusive". One is a flat ground with respect to the bathymetry.
+    `check.gradient` returns "inconclusive". One is a flat ground with respect to the bathymetry. The derivative in the
+    depth of a dry cell is one-sided, for a rising depth, unless this changes the sign of a step of the ground.
 
     References
     ----------
@@ -184,15 +187,10 @@ class ShallowWater(FiniteVolumes):
 
     Parameters
     ----------
-    grid, bathymetry, gravity, scheme, inflow, source, dry
+    bathymetry, gravity, dry
         As `shallow_water` takes them.
-    sides : tuple
-        The conditions as `resolve` returns them.
-
-    Attributes
-    ----------
-    domain : Space
-        The cells.
+    grid, scheme, sides, inflow, source
+        As `FiniteVolumes` takes them.
     """
 
     name = "shallow_water"
@@ -209,6 +207,8 @@ class ShallowWater(FiniteVolumes):
         dry: float,
     ) -> None:
         super().__init__(grid, scheme, sides, tuple(range(1, 1 + grid.dim)), inflow, source)
+        limiter = SCHEMES[scheme].limiter
+        self._limiters = [limiter and _limiter_with_shore(limiter, axis) for axis in self.axes]
         self.bathymetry = constant(bathymetry)
         self.gravity = constant(gravity)
         self.dry = dry
@@ -259,7 +259,11 @@ class ShallowWater(FiniteVolumes):
         if callable(z):
             z = z(params)
         flat = np.zeros(self.grid.shape)
-        check_kind(self._what("bathymetry"), np.asarray(sample(z)).dtype, "real numbers", "; write its .real")
+        if isinstance(z, (list, tuple)):
+            z = anp.array(z)
+        check_kind(
+            self._what("bathymetry"), np.asarray(sample(z)).dtype, "real numbers", "; write a number or an array"
+        )
         if np.ndim(z) == 0:
             z = z + flat
         checked_result(self._what("bathymetry"), z, flat)
@@ -274,8 +278,12 @@ class ShallowWater(FiniteVolumes):
         check_values(_check_gravity, g)
         return g
 
-    def _check_physical(self, u: Any, params: Any, at: str = "") -> None:
-        check_values(partial(_check_depth, self._what("depth" + at)), u[0])
+    def _check_physical(self, u: Any, params: Any, argument: str = "", at: str = "") -> None:
+        check_values(partial(_check_depth, self._what("depth", argument) + at, argument), u[0])
+
+    def _required_fields(self) -> str:
+        shape = ", ".join(map(str, (1 + self.grid.dim, *self.grid.shape)))
+        return f"shallow_water needs u of shape ({shape}), the depth and a discharge for each axis"
 
     def _rate(self, u: Any, params: Any) -> Any:
         g = self._pull(params)
@@ -295,15 +303,17 @@ class ShallowWater(FiniteVolumes):
     def _faces(self, axis: AxisFluxes, u: Any, g: Any, ground: Any, params: Any) -> tuple[Faces, Any]:
         """Return the water beside the faces along an axis, and the rise of the surface along each cell."""
         padded = axis.padded(u, params)
-        padded_depth = anp.maximum(padded[:1], 0.0)
+        padded_depth = _not_negative(padded[:1], padded[:1])
         padded_surface = padded_depth + axis.extended(ground)[None]
         padded_velocity = self._velocity(padded_depth, padded[1:])
         fields = anp.concatenate([padded_depth, padded_surface, padded_velocity])
         cells = axis.part(fields, 1, -1)
         depth = cells[:1]
         ground_in_cells = cells[1:2] - depth
-        if axis.limiters:
-            (slopes,) = axis.slopes(fields)
+        limiter = self._limiters[axis.number]
+        if limiter:
+            stencil = (axis.part(fields[:2], first, last) for first, last in ((0, -2), (1, -1), (2, None)))
+            slopes = anp.concatenate([limiter(*stencil), *axis.slopes(fields[2:])])
         else:
             slopes = np.zeros(cells.shape)
         depth_slope = slopes[:1]
@@ -319,8 +329,8 @@ class ShallowWater(FiniteVolumes):
         upper_velocity = axis.part(cells[2:] - slopes[2:] * (1.0 + share), 1)
 
         step = upper_ground - lower_ground
-        lower_depth = anp.maximum(lower_depth - anp.maximum(step, 0.0), 0.0)
-        upper_depth = anp.maximum(upper_depth - anp.maximum(-step, 0.0), 0.0)
+        lower_depth = _not_negative(lower_depth - anp.maximum(step, 0.0), lower_depth)
+        upper_depth = _not_negative(upper_depth - anp.maximum(-step, 0.0), upper_depth)
         # Of dry states too, waves have a positive speed here: sqrt has no derivative at 0.
         lower_wave = anp.sqrt(g * anp.maximum(lower_depth, self.dry))
         upper_wave = anp.sqrt(g * anp.maximum(upper_depth, self.dry))
@@ -354,7 +364,7 @@ class ShallowWater(FiniteVolumes):
         normal = (np.arange(len(u) - 1) == axis.number).reshape(-1, *[1] * self.grid.dim)
         for_cell_below = carried + normal * (upper_share * pressure_jump)
         for_cell_above = carried - normal * (lower_share * pressure_jump)
-        weight = normal * (g * anp.maximum(u[:1], 0.0) * rise)
+        weight = normal * (g * _not_negative(u[:1], u[:1]) * rise)
 
         depth_change = axis.part(mass, 0, -1) - axis.part(mass, 1)
         change = axis.part(for_cell_above, 0, -1) - axis.part(for_cell_below, 1) - weight
@@ -366,10 +376,47 @@ class ShallowWater(FiniteVolumes):
         return np.maximum(axis.part(at_faces, 0, -1), axis.part(at_faces, 1))
 
 
-def _check_depth(what, depth):
+def _not_negative(x, depth):
+    """Return max(x, 0); where x and the depth are 0, with the derivative for a rising depth, 1."""
+    return anp.where((x == 0.0) & (depth == 0.0), x, anp.maximum(x, 0.0))
+
+
+def _limiter_with_shore(limiter, axis):
+    """Return the rule of the limited slopes of depth and surface along an axis.
+
+    Its arguments are both fields in the cell below, in the cell, and in the cell above. A depth of 0 can only rise.
+    Where a difference to a neighbour is 0, the derivative in a depth of 0 is therefore the limit for a rising depth,
+    instead of the mean of both one-sided derivatives. Differences between copies of one cell remain 0.
+    """
+    changes = axis.along_fields(axis.differs)
+    a_changes = axis.part(changes, 0, -1)
+    b_changes = axis.part(changes, 1)
+
+    def partials(a, b, rise_of_a, rise_of_b):
+        a = anp.where(a == 0.0, a_changes * rise_of_a, a)
+        b = anp.where(b == 0.0, b_changes * rise_of_b, b)
+        in_a, in_b = limiter(a, b, *axis.distances)[2:4]
+        return a_changes * in_a, b_changes * in_b
+
+    def slope(below, cell, above):
+        return limiter(cell - below, above - cell, *axis.distances)[0]
+
+    def derivatives(below, cell, above):
+        a = cell - below
+        b = above - cell
+        rise_below, rise, rise_above = (TINY * (x[:1] <= 0.0) for x in (below, cell, above))
+        in_below, _ = partials(a, b, -rise_below, 0.0)
+        in_a, in_b = partials(a, b, rise, -rise)
+        _, in_above = partials(a, b, 0.0, rise_above)
+        return -in_below, in_a - in_b, in_above
+
+    return entrywise("limiter", slope, derivatives)
+
+
+def _check_depth(what, argument, depth):
     """Raise an error for a depth that is negative, and not only by rounding."""
     rounding = ROUNDING * np.finfo(depth.dtype).eps * np.max(np.abs(depth), initial=0.0)
-    check_positive(what, depth, rounding)
+    check_positive(what, depth, rounding, argument)
 
 
 def _check_gravity(g):

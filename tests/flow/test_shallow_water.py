@@ -262,6 +262,43 @@ def test_gradients_with_dry_cells_are_finite():
     assert np.any(waves[1])
 
 
+GROUNDS = {
+    "flat": np.zeros(7),
+    "beach": np.array([-1.0, -1.0, -0.5, 0.1, 0.7, 1.1, 1.6]),
+}
+
+
+@pytest.mark.parametrize("scheme", ["upwind", "van_leer"])
+@pytest.mark.parametrize("ground", GROUNDS.values(), ids=GROUNDS)
+@pytest.mark.parametrize("spacing", [None, [0.1, 0.2, 0.3, 0.15, 0.2, 0.2, 0.1]], ids=["even", "uneven"])
+def test_derivatives_in_dry_cells_are_one_sided(ground, scheme, spacing):
+    """A depth of 0 can only rise: against one-sided differences, in the rate and after three steps.
+
+    After a step depths rise together, and limited slopes are not additive in them: the derivative has an error of 2 %.
+    """
+    grid = dp.Grid(7, spacing=[spacing]) if spacing else dp.Grid(7)
+    law = dp.shallow_water(grid, ground, scheme=scheme, dry=1e-3)
+    step = dp.stepper("ssprk3", law, 0.01)
+    weights = np.cos(np.arange(14.0) ** 2).reshape(2, 7)
+    depth = np.array([1.0, 1.2, 0.9, 0.0, 0.0, 0.0, 0.0])
+    still = np.zeros(7)
+
+    def of_rate(h):
+        return anp.sum(weights * law(anp.stack([h, still])))
+
+    def of_steps(h):
+        return anp.sum(weights * dp.rollout(step, anp.stack([h, still]), None, 3))
+
+    for loss, rtol in ((of_rate, 1e-6), (of_steps, 0.02 if scheme == "van_leer" else 1e-4)):
+        slope = dp.grad(loss)(depth)
+        rise = 1e-8
+        differences = [(loss(depth + rise * unit) - loss(depth)) / rise for unit in np.eye(7)]
+        np.testing.assert_allclose(slope, differences, rtol=rtol, atol=3e-5)
+        along = [dp.jvp(loss, depth, unit)[1] for unit in np.eye(7)]
+        np.testing.assert_allclose(along, slope, rtol=1e-12, atol=1e-13)
+        assert np.all(np.isfinite(dp.hvp(loss, depth, weights[0])))
+
+
 def test_programs_floats_and_copies():
     grid, ground, lake = islands((12,))
     law = dp.shallow_water(grid, ground)
