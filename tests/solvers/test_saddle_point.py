@@ -160,15 +160,36 @@ def test_what_schur_does_not_solve():
         dp.inverse(line, "schur")
     with pytest.raises(ValueError, match="schur needs the entries, .* has only products; write method='krylov'"):
         dp.inverse(dp.from_functions(lambda x: x, lambda x: x, 3, 3), "schur")
-    without_constraint = np.diag([1.0, 1.0, 0.0])
-    without_constraint[2, 0] = 1.0
-    without_constraint[1, 2] = 1.0
-    with pytest.raises(
-        ConvergenceError,
-        match="schur cannot be set up: unknown 2 of .* is a multiplier without a constraint; "
-        "give it an equation or write method='direct'",
-    ):
-        dp.inverse(dp.from_matrix(without_constraint), "schur")
+
+
+def test_an_estimate_that_cancels_is_no_missing_constraint():
+    """D diag(A)^-1 G is 0, or nearly so, but D A^-1 G is not; without the entry 0.5 the first is singular."""
+    disjoint = np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 1.0], [1.0, 0.0, 0.0]])
+    opposite = np.array([[1.0, 0.5, 1.0], [0.0, 1.0, -1.0], [1.0, 1.0, 0.0]])
+    nearly = opposite + 1e-14 * np.outer([0.0, 1.0, 0.0], [0.0, 0.0, 1.0])
+    b = np.arange(1.0, 4.0)
+    for A in (disjoint, opposite, nearly):
+        inv = dp.inverse(dp.from_matrix(A), "schur")
+        np.testing.assert_allclose(inv(b), np.linalg.solve(A, b), rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(inv.T(b), np.linalg.solve(A.T, b), rtol=1e-9, atol=1e-9)
+    disjoint[0, 1] = 0.0
+    with pytest.raises(ConvergenceError, match="stagnated"):
+        dp.inverse(dp.from_matrix(disjoint), "schur")(b)
+
+
+@pytest.mark.whole
+def test_cells_of_many_diffusion_lengths():
+    """A cavity at up to 125 diffusion lengths a cell: the Schur complement is that of convection."""
+    cavity = Cavity((8, 8), size=1.0)
+    x = cavity.rest
+    for reynolds in (100.0, 1000.0):
+        x = dp.steady(cavity, x, reynolds, method="direct")
+    slopes = []
+    for method in ("direct", "schur"):
+        root = dp.implicit(cavity, method=method)
+        slopes.append(dp.grad(lambda re, root=root: cavity.energy(root(x, re)))(1000.0))
+    assert slopes[1] == pytest.approx(slopes[0], rel=1e-7)
+    assert root.info.adjoint.iterations <= 200
 
 
 def test_a_field_that_cannot_be_coarsened_is_refused(monkeypatch):
