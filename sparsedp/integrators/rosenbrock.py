@@ -51,6 +51,7 @@ from sparsedp.solvers.jacobian import Jacobians
 from sparsedp.solvers.newton import Equation
 from sparsedp.solvers.records import SolveLog
 from sparsedp.solvers.roots import negative_gradient, product_with
+from sparsedp.solvers.scaling import length
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -142,6 +143,7 @@ DENSE = np.array(
 EMBEDDED = 4  # order of the embedded formula
 # Factorisations of the last steps are kept for the backward pass, up to this number of bytes by an estimate.
 KEPT_BYTES = 2**29
+LARGEST_AMPLIFICATION = 1e2  # by (g h W)^-1 of a first stage; without growth it is at most 1 in a suitable norm
 BYTES = 320  # of the factors, for each entry of W: 12 in each of 20 to 30 entries on square grids
 
 
@@ -235,7 +237,24 @@ class Rosenbrock(Embedded):
         self._first_length(v, self.params, t, h)  # raise an error for a rate that is not finite
         with np.errstate(all="ignore"):
             stages = self.stages(v, self.params, t, h)
+            self._check_regular(stages[0], v, t, h)
         return [AcceptedStep(1.0, 0.0, v, np.array(stages), combined(v, B, stages))]
+
+    def _check_regular(self, stage, v, t, h):
+        """Raise ConvergenceError if W is nearly singular, for a step whose error is not estimated.
+
+        Each stage is divided by the distance of g h J from the eigenvalue 1; a step multiplies by its seventh power.
+        """
+        variables = self.equation.variables((h, self.params, t))
+        amplified = self._solved(False, stage / (GAMMA * h), self.equation, v, variables)
+        if not length(amplified) <= LARGEST_AMPLIFICATION * length(stage):
+            raise self._singular()
+
+    def _singular(self):
+        return ConvergenceError(
+            f"{self.name}: the matrix of a step is singular or nearly so, as the Jacobian of the rate has an "
+            "eigenvalue near 1 / (0.212 dt); take a smaller dt, or give stepper a tolerance"
+        )
 
     def _trial(
         self, v: Any, params: Any, t: Any, length: float, h: Any, inspector: RateInspector | None = None
@@ -306,10 +325,7 @@ class Rosenbrock(Embedded):
     def _solved(self, transposed: bool, b: Any, equation: Equation, v: Any, variables: Sequence) -> Any:
         linearisation = self._linearisation(equation, v, variables)
         if linearisation.singular:
-            raise ConvergenceError(
-                f"{self.name}: the matrix of a step is singular, as the Jacobian of the rate has the eigenvalue "
-                "1 / (0.212 dt); take a smaller dt, or give stepper a tolerance"
-            )
+            raise self._singular()
         x, info = linearisation.solve(b, transposed)
         if info is not None:
             self.info.note(info, transposed)

@@ -30,8 +30,8 @@ TABLE = [
     (
         lambda: dp.stepper("rodas5p", lambda u, p: u / 0.21193756319429014, 1.0)(np.ones(2)),
         dp.errors.ConvergenceError,
-        "stepper(rodas5p): the matrix of a step is singular, as the Jacobian of the rate has the eigenvalue "
-        "1 / (0.212 dt); take a smaller dt, or give stepper a tolerance",
+        "stepper(rodas5p): the matrix of a step is singular or nearly so, as the Jacobian of the rate has an "
+        "eigenvalue near 1 / (0.212 dt); take a smaller dt, or give stepper a tolerance",
     ),
     (lambda: dp.stepper("euler", L, 0.1, unstable="warn"), VALUE, "unstable must be one of raise, allow, got 'warn'"),
     (

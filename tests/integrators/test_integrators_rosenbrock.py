@@ -282,3 +282,25 @@ def test_other_jacobians_are_refused():
     narrow = dp.stepper("rodas5p", brusselator, 0.1, sparsity=sp.eye_array(2 * L.shape[0]))
     with pytest.raises(DerivativeError, match=r"the sparsity given for stepper\(rodas5p\) lacks entries in row"):
         narrow(START, PARAMS)
+
+
+@pytest.mark.parametrize("distance", [1e-15, 1e-12, -1e-8, 1e-4, -5e-3])
+def test_a_step_with_a_nearly_singular_matrix_is_refused(distance):
+    """Its growth has a pole of order 7 where g h J has the eigenvalue 1: 1e84 at a distance of 1e-12."""
+    rates = np.array([-1.0, (1 + distance) / rosenbrock.GAMMA])
+    step = dp.stepper("rodas5p", lambda u, p: p * u, 1.0)
+    with pytest.raises(dp.errors.ConvergenceError, match="the matrix of a step is singular or nearly so"):
+        step(np.ones(2), rates)
+    exact = np.exp(rates)
+    assert dp.stepper("rodas5p", lambda u, p: p * u, 1.0, tolerance=1e-6)(np.ones(2), rates) == pytest.approx(
+        exact, rel=1e-4
+    )
+
+
+def test_stiff_decay_and_equilibria_are_not_refused():
+    step = dp.stepper("rodas5p", lambda u, p: p * u, 1.0)
+    assert step(np.ones(3), np.array([-1.0, -1e12, 0.5])) == pytest.approx(np.exp([-1.0, -np.inf, 0.5]), abs=1e-3)
+    assert np.all(step(np.zeros(2), np.array([-1.0, 1.0])) == 0)
+    shear = np.array([[-1.0, 1e8], [0.0, -1.0]])
+    linear = dp.stepper("rodas5p", lambda u, p: p @ u, 1.0)
+    assert linear(np.array([0.0, 1.0]), shear) == pytest.approx(np.exp(-1.0) * np.array([1e8, 1.0]), rel=1e-3)
