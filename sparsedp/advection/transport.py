@@ -30,7 +30,7 @@ from sparsedp.grid.boundary_conditions import (
 )
 from sparsedp.grid.grid import check_grid
 from sparsedp.kernels.fluxes import SCHEMES
-from sparsedp.operators.masks_and_lift import check_solid
+from sparsedp.operators.masks_and_lift import check_solid, refuse_body
 from sparsedp.operators.operator import Operator
 from sparsedp.operators.structure.base import Matrix
 
@@ -181,6 +181,7 @@ def transport(
     array([0.  , 0.75, 0.25, 0.  ])
     """
     check_grid("transport", grid)
+    refuse_body("transport", solid, "u + dt * body.advection(u, v)")
     check_choice("scheme= of transport", scheme, METHODS)
     options = METHODS[scheme].options
     choices = dict(

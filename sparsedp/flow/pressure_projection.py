@@ -30,6 +30,7 @@ from sparsedp.flow.projection_setup import ProjectionSetup
 from sparsedp.flow.variable_density import WeightedProjection
 from sparsedp.grid.boundary_conditions import describe_patches, no_slip
 from sparsedp.grid.grid import check_grid
+from sparsedp.operators.masks_and_lift import refuse_body
 from sparsedp.operators.operator import Operator
 from sparsedp.solvers.choose_method import check_settings
 
@@ -117,6 +118,7 @@ def projection(
     array([1., 1., 1.])
     """
     check_grid("projection", grid)
+    refuse_body("projection", solid, "body.project(v)")
     if solid is not None and np.shape(solid) == grid.faces.shape != grid.shape:
         raise ShapeError(
             f"the second argument of projection is solid, a boolean array on {grid.cells}, got an array on "

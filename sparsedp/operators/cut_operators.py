@@ -19,13 +19,13 @@ import autograd.numpy as anp
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp._utils.base_classes import Reconstructible
-from sparsedp._utils.validation import check_finite, check_kind, check_on, check_plain
-from sparsedp.autodiff.program_trace import check_values, recording_trace
+from sparsedp._utils.validation import check_finite, check_kind, check_plain
+from sparsedp.autodiff.program_trace import check_values
 from sparsedp.autodiff.tape import cast, dtype_of, isbox, sample
-from sparsedp.errors import DerivativeError, JitError, ShapeError
+from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.grid.boundary_conditions import check_condition
-from sparsedp.operators.cut_geometry import cut_geometry, sum_at_places
+from sparsedp.operators.cut_geometry import sum_at_places
+from sparsedp.operators.cut_grid import CutGrid
 from sparsedp.operators.cut_wall_slope import wall_slope
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.operators.given import from_matrix
@@ -33,72 +33,11 @@ from sparsedp.operators.masks_and_lift import lift
 from sparsedp.operators.stencils import adjacent_cell, to_faces
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from sparsedp.grid.grid import Grid
     from sparsedp.operators.cut_wall_slope import WallSlope
     from sparsedp.operators.operator import Operator
 
-__all__ = ["CutGrid", "CutOperators", "in_dtype_of"]
-
-
-class CutGrid(Reconstructible):
-    """The geometry of the fluid around a body with a curved wall, as fields on the grid.
-
-    Parameters
-    ----------
-    grid : Grid
-    level : array, shape `grid.nodes.shape`, or callable
-        As `cut_cells` takes it.
-
-    Attributes
-    ----------
-    fractions, volumes : arrays, shape `grid.shape`
-        Fluid fraction and fluid volume [length^dim] of each cell.
-    apertures : array, shape (faces.size,)
-        Fluid fraction of each face.
-    areas : array, shape `grid.shape`
-        Area of the wall in each cell [length^(dim - 1)].
-    is_fluid : bool array, shape `grid.shape`
-        Whether a cell holds fluid.
-    """
-
-    def __init__(self, grid: Grid, level: Any) -> None:
-        self.grid = grid
-        self._geometry = cut_geometry(grid, _checked_level(grid, level))
-        self.fractions = anp.reshape(self._geometry.fractions, grid.shape)
-        self.volumes = self.fractions * grid.volumes
-        self.apertures = self._geometry.apertures
-        self.is_fluid: NDArray[np.bool_] = np.asarray(sample(self.fractions)) > 0
-        self._is_open = np.asarray(sample(self.apertures)) > 0
-        self._at_walls = sum_at_places(self._geometry.cut, grid.cells)  # from cut cells to a field
-        self.areas = self._at_walls(self._geometry.areas)
-
-    @cached_property
-    def normals(self) -> tuple:
-        """Unit normal of the wall that points into the fluid: one cell field for each axis, 0 in cells without wall."""
-        return tuple(self._at_walls(normal) for normal in self._geometry.normals)
-
-    @cached_property
-    def centroids(self) -> tuple:
-        """Where `values` belong: coordinates of the centroid of the wall, and of the centre in cells without wall."""
-        cut = self._geometry.cut
-        pairs = zip(self.grid.centres(), self._geometry.centroids, strict=True)
-        return tuple(centre + self._at_walls(of_wall - centre.reshape(-1)[cut]) for centre, of_wall in pairs)
-
-    @cached_property
-    def _divisors(self):
-        """The fluid volumes, and 1 in cells without fluid."""
-        return anp.where(self.is_fluid, self.volumes, 1.0)
-
-    def _in_cut_cells(self, field):
-        """Return the values of a cell field, or of a batch of them, in the cut cells; shape (..., m)."""
-        return self._flat(field)[..., self._geometry.cut]
-
-    def _flat(self, field):
-        """Return a cell field, or a batch of them, with one axis for the cells."""
-        shape = np.shape(field)
-        return anp.reshape(field, (*shape[: len(shape) - self.grid.dim], self.grid.cells.size))
+__all__ = ["CutOperators", "in_dtype_of"]
 
 
 class CutOperators(CutGrid):
@@ -111,13 +50,18 @@ class CutOperators(CutGrid):
     ----------
     grid, level, boundary, solid_boundary
         As `cut_cells` takes them.
+
+    Attributes
+    ----------
+    boundary, solid_boundary
+        The conditions on the walls of the grid and on the wall of the body.
     """
 
     def __init__(self, grid: Grid, level: Any, boundary: Any, solid_boundary: Any) -> None:
         check_condition("solid_boundary", solid_boundary)
         self._gradient = gradient(grid, boundary)
-        self._boundary = boundary
-        self._condition = solid_boundary
+        self.boundary = boundary
+        self.solid_boundary = solid_boundary
         super().__init__(grid, level)
 
     # ------------------------------------------------------------ slopes and fluxes
@@ -152,7 +96,7 @@ class CutOperators(CutGrid):
 
     @cached_property
     def _lift(self) -> Operator:
-        return lift(self.grid, self._boundary)
+        return lift(self.grid, self.boundary)
 
     @cached_property
     def _outflow(self) -> Operator:
@@ -240,15 +184,15 @@ class CutOperators(CutGrid):
 
     def _slopes_at_walls(self, u, values):
         """Return the slopes in the cut cells, for a checked field and given values in the cut cells."""
-        if not self._condition.a:
-            return values / self._condition.b + 0.0 * self._in_cut_cells(u)  # of the shape of a batch
+        if not self.solid_boundary.a:
+            return values / self.solid_boundary.b + 0.0 * self._in_cut_cells(u)  # of the shape of a batch
         slope = self._wall_slope
         terms = slope.coefficients * self._flat(u)[..., slope.cells]
         return self._sum_of_pairs(terms) + slope.of_value * values
 
     @cached_property
     def _wall_slope(self) -> WallSlope:
-        return wall_slope(self.grid, self._geometry, self._condition)
+        return wall_slope(self.grid, self._geometry, self.solid_boundary)
 
     @cached_property
     def _sum_of_pairs(self) -> Operator:
@@ -286,7 +230,7 @@ class CutOperators(CutGrid):
         coefficient = self.apertures * self._coefficient(k)
         shifts = self.volumes * self._cell_field("shift", shift)
         entries = [factors * coefficient[faces], anp.reshape(shifts, (-1,))]
-        if self._condition.a:
+        if self.solid_boundary.a:
             slope = self._wall_slope
             weights = self._geometry.areas * self._wall_coefficient(k, wall_k)
             all_rows.append(self._geometry.cut[slope.walls])
@@ -312,10 +256,10 @@ class CutOperators(CutGrid):
     def _terms_of_values(self, values, k, wall_k):
         """Return the part of the flux through the wall that does not depend on u, for each cut cell."""
         values = self._wall_values(values)
-        if self._condition.a:
+        if self.solid_boundary.a:
             slopes = self._wall_slope.of_value * values
         else:
-            slopes = values / self._condition.b
+            slopes = values / self.solid_boundary.b
         return self._geometry.areas * self._wall_coefficient(k, wall_k) * slopes
 
     # ------------------------------------------------------------ transport
@@ -432,23 +376,6 @@ class CutOperators(CutGrid):
         total = self._in_cut_cells(self._sum_over_faces(self.apertures * self._coefficient(k)))
         area = self._in_cut_cells(self._sum_over_faces(self.apertures))
         return total / anp.where(np.asarray(sample(area)) > 0, area, 1.0)
-
-
-def _checked_level(grid, level):
-    """Return the level at the nodes, traced or not, in double precision."""
-    if callable(level) and not isbox(level):
-        level = level(*np.meshgrid(*(grid.coordinates(a, "nodes") for a in range(grid.dim)), indexing="ij"))
-    if recording_trace([level]) is not None:
-        raise JitError(
-            "dp.jit cannot record the level of cut_cells, whose values decide which cells are cut; call the function "
-            "without dp.jit"
-        )
-    check_plain("cut_cells", level)
-    values = np.asarray(sample(level))
-    check_on("the level of cut_cells", values, grid.nodes)
-    check_kind("the level of cut_cells", values.dtype, "real numbers", "; write level.real")
-    check_finite("the level of cut_cells", values)
-    return cast(level if isbox(level) else values, np.dtype(float))
 
 
 def _checked_field(name, value, space, is_used, kind="numbers", advice=""):

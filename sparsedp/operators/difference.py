@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from sparsedp.grid.boundary_conditions import check_condition, describe_patches, neumann, resolve
 from sparsedp.grid.grid import Grid, check_grid
 from sparsedp.grid.space import Space
-from sparsedp.operators.masks_and_lift import check_solid, region_of, solid_faces
+from sparsedp.operators.masks_and_lift import Body, check_solid, refuse_body, region_of, solid_faces
 from sparsedp.operators.operator import Operator
 from sparsedp.operators.stencils import (
     along,
@@ -98,6 +98,7 @@ def gradient(
     array([2., 1., 2., 0.])
     """
     check_condition("solid_boundary", solid_boundary)
+    refuse_body("gradient", solid, "body.gradient(u), or dp.laplacian(grid, solid=body)")
     check_order("gradient", grid, order, solid)
     if order == 4:
         sides = resolve(grid, boundary, name="gradient with order=4")
@@ -229,7 +230,8 @@ def laplacian(
     ----------
     grid : Grid
     boundary, solid, solid_boundary, order
-        As for `gradient`. The divergence has the same order.
+        As for `gradient`. The divergence has the same order. `solid` can also be a body of `cut_cells` with the same
+        grid and conditions; the result is then its attribute `laplacian`.
 
     Returns
     -------
@@ -241,7 +243,7 @@ def laplacian(
     ShapeError
         If `solid` has another shape than the grid.
     ValueError
-        If the grid does not allow the order.
+        If the grid does not allow the order, or a body of `cut_cells` has another grid or other conditions.
 
     See Also
     --------
@@ -266,9 +268,24 @@ def laplacian(
     """
     check_grid("laplacian", grid)
     check_order("laplacian", grid, order, solid)
+    if isinstance(solid, Body):
+        return _laplacian_of_cut_cells(grid, boundary, solid, solid_boundary)
     G = gradient(grid, boundary, solid, solid_boundary, order)
     product = divergence(grid, order) @ G
     return Operator(product.structure, grid.cells, grid.cells, G.name.replace("gradient", "laplacian", 1))
+
+
+def _laplacian_of_cut_cells(grid, boundary, body, solid_boundary):
+    """Return the Laplacian of a body, whose grid and conditions must be those of the call."""
+    if grid != body.grid:
+        raise ValueError(f"laplacian takes a body of cut_cells on its grid {grid}, got one on {body.grid}")
+    same_sides = resolve(grid, boundary, patches=True) == resolve(grid, body.boundary, patches=True)
+    if not same_sides or solid_boundary != body.solid_boundary:
+        raise ValueError(
+            "laplacian needs the conditions of its body of cut_cells as boundary and solid_boundary, got others; write "
+            "body.laplacian"
+        )
+    return body.laplacian
 
 
 def curl(grid: Grid) -> Operator:

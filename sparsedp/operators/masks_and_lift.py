@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.validation import check_finite, check_kind, check_on, check_plain, check_type
 from sparsedp.autodiff.tape import isbox, sample
 from sparsedp.errors import DerivativeError, ShapeError
@@ -290,10 +291,34 @@ def _check_space(space, name):
     check_type(name, space, Space, "a Space", "grid.cells or grid.faces")
 
 
+class Body(Reconstructible):
+    """Base class of bodies with a wall that cuts the cells, which some functions accept in place of solid cells.
+
+    Attributes
+    ----------
+    grid : Grid
+    boundary, solid_boundary
+        The conditions on the walls of the grid and on the wall of the body.
+    laplacian : Operator
+    """
+
+    grid: Grid
+    boundary: Any
+    solid_boundary: Any
+    laplacian: Any
+
+
+def refuse_body(name: str, solid: Any, advice: str) -> None:
+    """Raise TypeError if the argument `solid` of a function is a body of `cut_cells`, which it does not take."""
+    if isinstance(solid, Body):
+        raise TypeError(f"{name} takes a boolean array as solid, got a body of cut_cells; write {advice}")
+
+
 def check_solid(grid: Grid, solid: ArrayLike | None) -> NDArray:
     """Return the argument `solid` as a boolean array of the shape of the grid; None means no solid cells."""
     if solid is None:
         return np.zeros(grid.shape, bool)
+    refuse_body("this function", solid, "solid=~body.is_fluid for a staircase, or use the methods of the body")
     return _boolean(solid, grid.cells, "solid")
 
 

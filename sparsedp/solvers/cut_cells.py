@@ -146,6 +146,8 @@ class CutCells(CutOperators):
         Area of the wall in each cell [length^(dim - 1)].
     is_fluid : bool array, shape `grid.shape`
         Whether a cell holds fluid.
+    boundary, solid_boundary
+        The conditions on the walls of the grid and on the wall of the body.
     info : SolveLog
         Records of the last solves.
     """
@@ -161,6 +163,11 @@ class CutCells(CutOperators):
     def recipe(self) -> tuple[type[CutCells], tuple[Any, ...]]:
         """Return the call that constructs an equal object, without its set-ups."""
         return CutCells, self._arguments
+
+    def with_settings(self, settings: SolveSettings) -> CutCells:
+        """Return the same body with other settings of its solves."""
+        grid, level, boundary, solid_boundary, _ = self._arguments
+        return CutCells(grid, level, boundary, solid_boundary, settings)
 
     def solve(
         self,
@@ -267,9 +274,9 @@ class CutCells(CutOperators):
         IncompatibleError
             If more enters a region through neumann walls than leaves it.
         """
-        if self._condition != neumann:
+        if self.solid_boundary != neumann:
             raise ValueError(
-                f"project of cut_cells needs solid_boundary=dp.neumann, got {self._condition}; build another body"
+                f"project of cut_cells needs solid_boundary=dp.neumann, got {self.solid_boundary}; build another body"
             )
         field = self._face_field("v", v)
         pressure = self._solve(-self.divergence(field), nullspace="project")
@@ -282,7 +289,7 @@ class CutCells(CutOperators):
 
     def __repr__(self) -> str:
         counts = f"{np.count_nonzero(self.is_fluid)} of {self.is_fluid.size} cells hold fluid"
-        return f"<cut_cells: {counts}, {self._geometry.cut.size} are cut, {self._condition} on the wall>"
+        return f"<cut_cells: {counts}, {self._geometry.cut.size} are cut, {self.solid_boundary} on the wall>"
 
 
 def _check_balance(dim, outflow, size):

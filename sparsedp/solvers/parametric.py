@@ -17,7 +17,7 @@ places of the pattern are visited.
 from __future__ import annotations
 
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import autograd.numpy as anp
 import numpy as np
@@ -33,8 +33,9 @@ from sparsedp.autodiff.program_trace import check_values
 from sparsedp.autodiff.tape import Rule, cast, dtype_of, isbox, sample
 from sparsedp.errors import ConvergenceError, DerivativeError, ShapeError
 from sparsedp.grid.space import Space, fits
+from sparsedp.operators.difference import divergence
 from sparsedp.operators.given import from_matrix
-from sparsedp.operators.masks_and_lift import identity
+from sparsedp.operators.masks_and_lift import Body, identity
 from sparsedp.operators.operator import Operator
 from sparsedp.operators.structure.base import Matrix, compact, rows_of
 from sparsedp.operators.structure.lazy import Chain, Diagonal, Sum
@@ -171,23 +172,44 @@ def _exponent_out_of_range(k, shift):
 # ---------------------------------------------------------------- a coefficient on the faces
 
 
+@overload
 def elliptic_solver(
     D: Operator,
     G: Operator,
+    method: str = ...,
+    rtol: float = ...,
+    maxiter: int | None = ...,
+    nullspace: str = ...,
+    **options: Any,
+) -> EllipticSolver: ...
+@overload
+def elliptic_solver(
+    D: Operator,
+    G: Body,
+    method: str = ...,
+    rtol: float = ...,
+    maxiter: int | None = ...,
+    nullspace: str = ...,
+    **options: Any,
+) -> CutEllipticSolver: ...
+def elliptic_solver(
+    D: Operator,
+    G: Operator | Body,
     method: str = "auto",
     rtol: float = 1e-10,
     maxiter: int | None = None,
     nullspace: str = "raise",
     **options: Any,
-) -> EllipticSolver:
+) -> EllipticSolver | CutEllipticSolver:
     """Return the function solve(k, b, shift=0.0) for x of (shift - D diag(k) G) x = b, with variable coefficients k.
 
     Parameters
     ----------
     D : Operator
         Divergence, from faces to cells.
-    G : Operator
-        Gradient, from cells to faces. Boundary conditions and obstacles are part of it.
+    G : Operator, or body of `cut_cells`
+        Gradient, from cells to faces. Boundary conditions and obstacles are part of it. With a body, D is
+        ``dp.divergence(grid)``, and the call is ``body.solve(b, k=k, shift=shift)`` with this method and tolerance.
     method, rtol, maxiter, nullspace, **options
         As in `inverse`; options go to the method.
 
@@ -250,6 +272,9 @@ def elliptic_solver(
     >>> value_and_grad(lambda k: solve(k, np.array([2.0, 2.0]))[0])(1.0)
     (1.0, -1.0)
     """
+    settings = check_settings(method, rtol, maxiter, nullspace, options)
+    if isinstance(G, Body):
+        return CutEllipticSolver(_checked_divergence(D, G), G, settings)
     for name, op in (("D", D), ("G", G)):
         check_type(f"elliptic_solver, as {name},", op, Operator, "an Operator", "dp.from_matrix(...) first")
     if not (fits(D.domain, G.codomain) and fits(D.codomain, G.domain)):
@@ -257,7 +282,52 @@ def elliptic_solver(
             f"elliptic_solver needs D @ G to be square: {D.name} maps {D.domain} to {D.codomain}, "
             f"{G.name} {G.domain} to {G.codomain}"
         )
-    return EllipticSolver(D, G, check_settings(method, rtol, maxiter, nullspace, options))
+    return EllipticSolver(D, G, settings)
+
+
+def _checked_divergence(D, body):
+    """Return D; raise unless it is the divergence on the grid of a body of cut_cells."""
+    check_type("elliptic_solver, as D,", D, Operator, "an Operator", "dp.divergence(grid)")
+    expected = divergence(body.grid)
+    if (D.domain, D.codomain) != (expected.domain, expected.codomain) or (D.matrix != expected.matrix).nnz:
+        raise ValueError(
+            f"elliptic_solver with a body of cut_cells takes the divergence of order 2 as D, got {D}; write "
+            "dp.elliptic_solver(dp.divergence(body.grid), body)"
+        )
+    return D
+
+
+class CutEllipticSolver(Reconstructible):
+    """The differentiable function solve(k, b, shift=0.0) that `elliptic_solver` returns for a body of `cut_cells`.
+
+    Parameters
+    ----------
+    D : Operator
+        The divergence.
+    body : CutCells
+    settings : SolveSettings
+
+    Attributes
+    ----------
+    info : SolveLog
+        Records of the last solves.
+    """
+
+    def __init__(self, D: Operator, body: Any, settings: SolveSettings) -> None:
+        self.constructor_call = (CutEllipticSolver, (D, body, settings))
+        self._body = body.with_settings(settings)
+
+    @property
+    def info(self) -> Any:
+        """Records of the last solves; None before the first one."""
+        return self._body.info
+
+    def __call__(self, k: Any, b: Any, shift: Any = 0.0) -> Any:
+        """Solve shift x - div(k grad x) = b in the fluid, with the value 0 on all walls; see `CutCells.solve`."""
+        return self._body.solve(b, k=k, shift=shift)
+
+    def __repr__(self) -> str:
+        return f"<elliptic_solver: {self._body}>"
 
 
 class EllipticSolver(ParametricSolver):

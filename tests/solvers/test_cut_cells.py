@@ -191,6 +191,68 @@ def test_dtypes_batches_and_coefficients():
     assert repr(body) == "<cut_cells: 42 of 42 cells hold fluid, 12 are cut, dirichlet on the wall>"
 
 
+# ------------------------------------------------------------ the body as an argument of other functions
+
+
+def test_a_body_as_an_argument(rng):
+    body = dp.cut_cells(GRID, lambda x, y: hypot(x - 0.5, y - 0.45) - 0.2, dp.dirichlet, dp.robin(1.0, 0.3))
+    conditions = {"boundary": dp.dirichlet, "solid_boundary": dp.robin(1.0, 0.3)}
+    assert dp.laplacian(GRID, solid=body, **conditions) is body.laplacian
+    solve = dp.elliptic_solver(dp.divergence(GRID), body, rtol=1e-12)
+    b = rng.standard_normal((2, *GRID.shape))
+    k = rng.uniform(1.0, 2.0, GRID.faces.size)
+    assert np.array_equal(solve(k, b, 0.5), body.solve(b, k=k, shift=0.5))
+    assert solve.info.forward.status == "converged" and body.solve(b) is not None
+    assert repr(solve) == f"<elliptic_solver: {body}>"
+
+    def loss(radius, k):
+        disc = dp.cut_cells(GRID, lambda x, y: hypot(x - 0.5, y - 0.45) - radius, dp.dirichlet, dp.dirichlet)
+        return np.sum(disc.volumes * dp.elliptic_solver(dp.divergence(GRID), disc)(k, b[0]))
+
+    h = 1e-6
+    slope = dp.grad(loss)(0.21, k)
+    assert np.isclose(slope, (loss(0.21 + h, k) - loss(0.21 - h, k)) / (2 * h), rtol=1e-6)
+
+
+def test_functions_without_a_body_name_its_method():
+    body = dp.cut_cells(GRID, lambda x, y: x - 0.5, dp.dirichlet)
+    with pytest.raises(
+        TypeError,
+        match="^gradient takes a boolean array as solid, got a body of cut_cells; write "
+        r"body.gradient\(u\), or dp.laplacian\(grid, solid=body\)$",
+    ):
+        dp.gradient(GRID, solid=body)
+    with pytest.raises(
+        TypeError, match=r"^transport takes a boolean array as solid.*; write u \+ dt \* body.advection"
+    ):
+        dp.transport(GRID, solid=body)
+    with pytest.raises(TypeError, match=r"^projection takes a boolean array as solid.*; write body.project\(v\)$"):
+        dp.projection(GRID, solid=body)
+    with pytest.raises(
+        TypeError, match="^this function takes a boolean array.*; write solid=~body.is_fluid for a stair"
+    ):
+        dp.interior(GRID, solid=body)
+    with pytest.raises(
+        ValueError,
+        match="^laplacian needs the conditions of its body of cut_cells as boundary and solid_boundary, got others; "
+        "write body.laplacian$",
+    ):
+        dp.laplacian(GRID, solid=body)
+    with pytest.raises(
+        ValueError,
+        match=r"^laplacian takes a body of cut_cells on its grid Grid\(7 x 6 cells, size 7 x 6\), got one on Grid\(7 ",
+    ):
+        dp.laplacian(dp.Grid((7, 6)), dp.dirichlet, solid=body)
+    with pytest.raises(
+        ValueError,
+        match="^elliptic_solver with a body of cut_cells takes the divergence of order 2 as D, got .*; write "
+        r"dp.elliptic_solver\(dp.divergence\(body.grid\), body\)$",
+    ):
+        dp.elliptic_solver(2.0 * dp.divergence(GRID), body)
+    with pytest.raises(TypeError, match="elliptic_solver, as D,"):
+        dp.elliptic_solver(GRID, body)
+
+
 # ------------------------------------------------------------ derivatives
 
 
