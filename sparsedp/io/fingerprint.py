@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-import hashlib
 from typing import Any
 
 import numpy as np
 
 from sparsedp._utils.pytree import flatten
 from sparsedp.autodiff.backend import gathered
+from sparsedp.io.digest import array_description, digest
 
-__all__ = ["digest", "fingerprint"]
+__all__ = ["fingerprint"]
 
 
 def fingerprint(tree: Any) -> str:
-    """Return a hash of the structure of a tree, and of the type and content of its leaves; functions count by name."""
+    """Return a hash of the structure of a tree, and of the type and content of its leaves.
+
+    Functions count by their code, defaults and closure, and other objects by their attributes, as
+    `sparsedp.io.description` describes them.
+    """
     entries, rebuild = flatten(tree)
     structure = repr(rebuild(range(len(entries))))
     return digest("\n".join([structure, *map(_description, entries)]).encode())
-
-
-def digest(content: bytes) -> str:
-    """Return the SHA-256 hash of bytes."""
-    return hashlib.sha256(content).hexdigest()
 
 
 def _description(leaf: Any) -> str:
@@ -30,9 +29,9 @@ def _description(leaf: Any) -> str:
     leaf = gathered(leaf)
     kind = type(leaf).__qualname__
     if isinstance(leaf, (np.ndarray, np.generic)) and leaf.dtype != object:
-        return f"{kind} {leaf.dtype} {leaf.shape} {digest(leaf.tobytes())}"
-    if callable(leaf):
-        return f"{getattr(leaf, '__module__', '')} {getattr(leaf, '__qualname__', kind)}"
-    if " at 0x" in repr(leaf):  # a memory address, which differs between processes
-        return kind
+        return array_description(leaf)
+    if callable(leaf) or " at 0x" in repr(leaf):  # a memory address, which differs between processes
+        from sparsedp.io.description import Description
+
+        return "\n".join(Description(leaf, with_attributes=True).texts)
     return f"{kind} {leaf!r}"

@@ -11,7 +11,8 @@ import numpy as np
 from sparsedp._utils.pytree import flatten, leaves, norm
 from sparsedp.autodiff.backend import process_count
 from sparsedp.io.atomic_files import UNFINISHED, load_tree, path_errors, save_tree
-from sparsedp.io.fingerprint import digest, fingerprint
+from sparsedp.io.digest import digest
+from sparsedp.io.fingerprint import fingerprint
 from sparsedp.optimize.checkpoint_upgrade import FORMAT_0_2, upgraded
 from sparsedp.optimize.result import Evaluation, Failure, Record
 

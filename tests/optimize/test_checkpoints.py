@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 
 import autograd.numpy as anp
 import numpy as np
@@ -12,6 +13,7 @@ from checkpoints_0_2 import CHECKPOINTS, write_checkpoint_0_2
 
 import sparsedp as dp
 from sparsedp._utils.pytree import leaves
+from sparsedp.io.fingerprint import fingerprint
 
 
 def valley(x):
@@ -300,6 +302,7 @@ import sys
 import autograd.numpy as anp, numpy as np, time
 import sparsedp as dp
 from sparsedp._utils.pytree import leaves
+from sparsedp.io.fingerprint import fingerprint
 import sparsedp.optimize.checkpoint as checkpoint
 checkpoint.SHARE = np.inf
 def valley(x):
@@ -436,3 +439,110 @@ def test_interrupted_in_the_callback():
 
     best = dp.minimize(valley, START, callback=callback)
     assert best.message == "interrupted" and len(best.history) == 5 and str(best).endswith("interrupted")
+
+
+def decay(start, factor):
+    return lambda step: start * factor**step
+
+
+def halved(step, start=0.1, every=5):
+    return start * 0.5 ** (step // every)
+
+
+class Cosine:
+    """A schedule as an object with attributes, as flax, equinox or a user writes it."""
+
+    def __init__(self, start, steps):
+        self.start = start
+        self.steps = np.array(steps)
+
+    def __call__(self, step):
+        return self.start * (1.0 + np.cos(np.pi * min(1.0, step / self.steps))) / 2
+
+
+class Slotted:
+    __slots__ = ("start",)
+
+    def __init__(self, start):
+        self.start = start
+
+    def __call__(self, step):
+        return self.start
+
+
+class OfLibrary:
+    """A function that another library compiles, or an array of another library."""
+
+    def __init__(self, start):
+        self.__wrapped__ = lambda step: start
+        self.__call__ = self.__wrapped__
+
+    def __call__(self, step):
+        return self.__wrapped__(step)
+
+
+class Number:
+    def __init__(self, value):
+        self.value = value
+
+    def __array__(self, dtype=None, copy=None):
+        return np.array(self.value, dtype)
+
+    def __repr__(self):
+        return "Number"
+
+
+def of_number(value):
+    number = Number(value)
+    return lambda step: float(np.asarray(number))
+
+
+def joined(*schedules, boundary=3):
+    """Return schedules one after the other, as optax.join_schedules builds them."""
+
+    def schedule(step):
+        return schedules[step >= boundary](step)
+
+    return schedule
+
+
+def scaled(factor):
+    return eval("lambda step: 0.1 * factor", {"factor": factor})  # a global variable of the function
+
+
+SCHEDULES = [  # a schedule, and others that must not continue its run
+    (lambda: decay(0.1, 0.9), [lambda: decay(0.1, 0.8), lambda: decay(0.2, 0.9)]),
+    (lambda: partial(halved, every=5), [lambda: partial(halved, every=4), lambda: partial(halved, start=0.2)]),
+    (lambda: Cosine(0.1, 20), [lambda: Cosine(0.2, 20), lambda: Cosine(0.1, 10)]),
+    (lambda: Slotted(0.1), [lambda: Slotted(0.2)]),
+    (lambda: Cosine(0.1, 20).__call__, [lambda: Cosine(0.1, 21).__call__]),
+    (lambda: OfLibrary(0.1), [lambda: OfLibrary(0.2)]),
+    (lambda: of_number(0.1), [lambda: of_number(0.2)]),
+    (
+        lambda: joined(decay(0.1, 0.9), Slotted(0.1)),
+        [lambda: joined(decay(0.1, 0.9), Slotted(0.2)), lambda: joined(decay(0.1, 0.9), Slotted(0.1), boundary=4)],
+    ),
+    (lambda: scaled(1.0), [lambda: scaled(2.0)]),
+]
+
+
+@pytest.mark.parametrize("schedule, others", SCHEDULES)
+def test_a_schedule_continues_its_own_run_only(tmp_path, schedule, others):
+    """A function created again continues; one with other code, closure, defaults, arguments or attributes does not."""
+    run = {"method": "adam", "tolerance": 0}
+    whole = dp.minimize(valley, START, maxiter=8, rate=schedule(), **run)
+    dp.minimize(valley, START, maxiter=4, rate=schedule(), checkpoint=tmp_path, **run)
+    for other in others:
+        with pytest.raises(ValueError, match="holds a run with another set of options"):
+            dp.minimize(valley, START, maxiter=8, rate=other(), checkpoint=tmp_path, **run)
+    again = dp.minimize(valley, START, maxiter=8, rate=schedule(), checkpoint=tmp_path, **run)
+    assert same(again, whole) and again.resumed.startswith("resumed from iteration 4")
+
+
+def test_functions_with_other_code_or_defaults_are_distinguished():
+    first, second, third = (eval(text) for text in ("lambda s: 0.1", "lambda s: 0.2", "lambda s, a=0.1: a"))
+    fourth = eval("lambda s, a=0.2: a")
+    fifth = eval("lambda s, *, a=0.2: a")
+    marks = {fingerprint(function) for function in (first, second, third, fourth, fifth, max, np.cos, np.sin)}
+    assert len(marks) == 8
+    assert fingerprint(first) == fingerprint(eval("lambda s: 0.1"))
