@@ -9,13 +9,12 @@ A scene takes a number of cells and returns (end, p, exact): end(p) is the densi
 differentiable in p; exact is the field to compare with, or None for a reference with four times the cells.
 """
 
-import argparse
-import inspect
 from time import perf_counter
 
 import autograd.numpy as np
 
 import sparsedp as dp
+from benchmarks.tables import lines, print_rows
 
 GAMMA = 1.4
 GRAVITY = 9.81
@@ -142,12 +141,6 @@ CASES = {
 }
 
 
-def lines(scene):
-    """Return the number of lines of code of a scene."""
-    body = inspect.getsource(scene).splitlines()[1:]
-    return sum(bool(line.strip()) and '"""' not in line for line in body)
-
-
 def coarsened(field, n):
     """Return the means over blocks of cells, n along each axis."""
     for axis in range(field.ndim):
@@ -181,19 +174,14 @@ def row(name, quick=False):
     return n, figure(ours), wanted, errors[1], np.log2(errors[0] / errors[1]), seconds, verdict
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("names", nargs="*")
-    parser.add_argument("--quick", action="store_true")
-    given = parser.parse_args()
-    print("| case | cells | figure | ours | wanted | mean error | order | seconds | gradient | lines |")
-    print("|---|---|---|---|---|---|---|---|---|---|")
-    for name, (scene, watched, *_) in CASES.items():
-        if not given.names or any(part.lower() in name.lower() for part in given.names):
-            n, ours, wanted, error, order, seconds, verdict = row(name, given.quick)
-            figures = f"{ours:.4f} | {wanted:.4f} | {error:.1e} | {order:.1f} | {seconds:.1f}"
-            print(f"| {name} | {n} | {watched} | {figures} | {verdict} | {lines(scene)} |", flush=True)
+def cells(name, quick):
+    """Return the cells of a row of the table."""
+    n, ours, wanted, error, order, seconds, verdict = row(name, quick)
+    scene, watched, *_ = CASES[name]
+    figures = f"{ours:.4f} | {wanted:.4f} | {error:.1e} | {order:.1f} | {seconds:.1f}"
+    return f"{n} | {watched} | {figures} | {verdict} | {lines(scene)}"
 
 
 if __name__ == "__main__":
-    main()
+    columns = "case | cells | figure | ours | wanted | mean error | order | seconds | gradient | lines"
+    print_rows(__doc__, columns, CASES, cells)

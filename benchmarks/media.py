@@ -8,7 +8,6 @@ many cells; seconds of the scene; the verdict of `check.gradient` on the same sc
 A scene takes a number of cells and returns (f, p): f(p) is the number that is compared, differentiable in p.
 """
 
-import argparse
 from time import perf_counter
 
 import autograd.numpy as np
@@ -16,7 +15,7 @@ from autograd import elementwise_grad
 from scipy.integrate import quad
 
 import sparsedp as dp
-from benchmarks.physics import lines
+from benchmarks.tables import lines, print_rows
 
 
 def channel(n):
@@ -195,20 +194,14 @@ def row(name, quick):
     return ours, error, order, seconds, verdict
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("names", nargs="*")
-    parser.add_argument("--quick", action="store_true")
-    given = parser.parse_args()
-    print("| case | number | ours | exact | error | order | seconds | gradient | lines |")
-    print("|---|---|---|---|---|---|---|---|---|")
-    for name in CASES:
-        if not given.names or any(part.lower() in name.lower() for part in given.names):
-            ours, error, order, seconds, verdict = row(name, given.quick)
-            scene, compared, exact, *_ = CASES[name]
-            figures = f"{ours:.6g} | {exact:.6g} | {error:.1e} | {order:.1f} | {seconds:.2f}"
-            print(f"| {name} | {compared} | {figures} | {verdict} | {lines(scene)} |", flush=True)
+def cells(name, quick):
+    """Return the cells of a row of the table."""
+    ours, error, order, seconds, verdict = row(name, quick)
+    scene, compared, exact, *_ = CASES[name]
+    figures = f"{ours:.6g} | {exact:.6g} | {error:.1e} | {order:.1f} | {seconds:.2f}"
+    return f"{compared} | {figures} | {verdict} | {lines(scene)}"
 
 
 if __name__ == "__main__":
-    main()
+    columns = "case | number | ours | exact | error | order | seconds | gradient | lines"
+    print_rows(__doc__, columns, CASES, cells)

@@ -8,14 +8,13 @@ that a user writes for it, without comments and the rates of benchmarks.stiff. `
 A scene takes a number of cells and returns (f, p): f(p) is the number that is looked at, differentiable in p.
 """
 
-import argparse
-import inspect
 from time import perf_counter
 
 import autograd.numpy as np
 
 import sparsedp as dp
 from benchmarks import helmholtz, stiff
+from benchmarks.tables import lines, print_rows
 
 
 def hires(tolerance):
@@ -263,12 +262,6 @@ CASES = {  # name: scene, number that is looked at, what is published or exact, 
 }
 
 
-def lines(scene):
-    """Lines of code of a scene."""
-    body = inspect.getsource(scene).replace(f'"""{scene.__doc__}"""', "").splitlines()[1:]
-    return sum(bool(line.strip()) for line in body)
-
-
 def row(name, quick):
     """Return our number, its error, the seconds, and the verdict on its gradient."""
     scene, _, published, n, few = CASES[name]
@@ -280,19 +273,12 @@ def row(name, quick):
     return ours, abs(ours / published - 1), perf_counter() - clock, verdict
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("names", nargs="*")
-    parser.add_argument("--quick", action="store_true")
-    given = parser.parse_args()
-    print("| case | figure | ours | published | off | seconds | gradient | lines |\n|---|---|---|---|---|---|---|---|")
-    for name in CASES:
-        if not given.names or any(part.lower() in name.lower() for part in given.names):
-            ours, off, seconds, verdict = row(name, given.quick)
-            scene, watched, published, *_ = CASES[name]
-            figures = f"{ours:.6g} | {published:.6g} | {off:.1e} | {seconds:.2f}"
-            print(f"| {name} | {watched} | {figures} | {verdict} | {lines(scene)} |", flush=True)
+def cells(name, quick):
+    """Return the cells of a row of the table."""
+    ours, off, seconds, verdict = row(name, quick)
+    scene, watched, published, *_ = CASES[name]
+    return f"{watched} | {ours:.6g} | {published:.6g} | {off:.1e} | {seconds:.2f} | {verdict} | {lines(scene)}"
 
 
 if __name__ == "__main__":
-    main()
+    print_rows(__doc__, "case | figure | ours | published | off | seconds | gradient | lines", CASES, cells)

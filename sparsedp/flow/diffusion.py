@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sparsedp._utils.validation import number_beside, rounded_down
+from sparsedp.autodiff.tape import dtype_of
 from sparsedp.errors import UnstableStepError
 from sparsedp.operators.masks_and_lift import identity
 from sparsedp.solvers.inverse import inverse
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from sparsedp.flow.settings import FlowSettings
     from sparsedp.operators.operator import Operator
 
-__all__ = ["Diffusion", "check_stable", "spectral_bound", "wave_growth"]
+__all__ = ["Diffusion", "check_stable", "spectral_bound", "trapezoidal_step", "wave_growth"]
 
 ROUNDING = 1e-12  # tolerance: a step exactly at the stability limit may exceed it by a rounding error
 
@@ -80,6 +81,11 @@ class Diffusion:
         else:
             check_stable(name, coefficient, settings.dt, coefficient * spectral_bound(self.op), settings)
 
+    @property
+    def implicit(self) -> bool:
+        """Whether the term is implicit and not 0."""
+        return self.solve is not None
+
     def add_explicit(self, rate: Any, u: Any, wall_part: Callable[[], Any]) -> Any:
         """Return the rate plus this term if the term is explicit; return the rate itself if it is implicit.
 
@@ -106,12 +112,29 @@ class Diffusion:
             Contribution of walls to L u at the beginning of the step, plus their contribution at its end.
         """
         half_step = 0.5 * self.settings.dt * self.coefficient
-        return self.solve(explicit + half_step * self._laplacian(u, wall_part))
+        return trapezoidal_step(explicit, self._laplacian(u, wall_part), half_step, self.solve)
 
     def _laplacian(self, u: Any, wall_part: Any) -> Any:
         if wall_part is None:
             return self.op(u)
         return self.op(u) + wall_part
+
+
+def trapezoidal_step(explicit: Any, rate: Any, half_step: Any, solve: Callable[[Any], Any]) -> Any:
+    """Return the field w at the end of a step with a linear implicit term A: w = explicit + half_step (A u + A w).
+
+    Parameters
+    ----------
+    explicit : array
+        The field after the step with all other terms.
+    rate : array
+        A u, for the field u at the beginning of the step, with the contributions of walls at the beginning and at the
+        end of the step.
+    half_step : number or array
+    solve : callable
+        ``solve(b)`` returns the solution of w - half_step A w = b.
+    """
+    return solve(explicit + half_step * rate)
 
 
 def spectral_bound(op: Operator) -> float:
@@ -122,7 +145,8 @@ def spectral_bound(op: Operator) -> float:
 
 def check_stable(name: str, coefficient: float, dt: float, rate: float, settings: FlowSettings) -> None:
     """Raise UnstableStepError if an explicit term with eigenvalues up to `rate` is unstable, unless that is allowed."""
-    if not settings.strict or not dt * rate > 1 + ROUNDING:
+    tolerance = max(ROUNDING, 2 * float(np.finfo(dtype_of(dt)).eps))
+    if not settings.strict or not float(dt) * rate > 1 + tolerance:
         return
     largest = rounded_down(1 / rate)
     if settings.may_be_implicit:

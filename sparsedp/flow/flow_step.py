@@ -54,18 +54,18 @@ from sparsedp._utils.validation import (
     rounded_down,
 )
 from sparsedp.autodiff.program_trace import check_values
-from sparsedp.autodiff.tape import cast, dtype_of, isbox, sample
+from sparsedp.autodiff.tape import cast, dtype_of, isbox, real_dtype, sample
 from sparsedp.autodiff.tape_constants import frozen
 from sparsedp.errors import DerivativeError, ShapeError, UnstableStepError
 from sparsedp.flow.diffusion import Diffusion, wave_growth
-from sparsedp.flow.momentum import convection, face_laplacian, free_faces
+from sparsedp.flow.momentum import convection, face_laplacian, free_face_mask
 from sparsedp.flow.moving_walls import moving_walls
 from sparsedp.flow.pressure_projection import projection
 from sparsedp.flow.projection_setup import mask_of_faces
 from sparsedp.flow.scalars import Scalar
-from sparsedp.flow.settings import FlowSettings, takes_params_alone
+from sparsedp.flow.settings import FlowSettings, needs_fields
 from sparsedp.flow.variable_density import density_on_faces
-from sparsedp.flow.variable_diffusion import Coefficient, VariableDiffusion, is_constant
+from sparsedp.flow.variable_diffusion import Coefficient, VariableDiffusion, in_precision_of, is_constant
 from sparsedp.flow.viscous_stress import ViscousStress
 from sparsedp.grid.boundary_conditions import inflow as inflow_side
 from sparsedp.grid.boundary_conditions import no_slip, occurring
@@ -84,9 +84,10 @@ if TYPE_CHECKING:
 __all__ = ["FlowStep", "flow_step"]
 
 SCALAR_ENTRIES = ("diffusivity", "boundary", "values", "source")
-# Largest accepted amplification of a wave in a step. Without damping, Adams-Bashforth always amplifies waves slightly.
+# Largest accepted amplification of a wave in a step at Courant numbers above SAFE_COURANT. Without damping,
+# Adams-Bashforth always amplifies waves slightly.
 MAX_GROWTH = 1.02
-SAFE_COURANT = 0.5  # Courant number up to which the amplification stays below MAX_GROWTH
+SAFE_COURANT = 0.5  # Courant number up to which steps are accepted; without viscosity, waves grow there by 2.7 %
 
 
 def flow_step(
@@ -131,14 +132,14 @@ def flow_step(
     walls : callable or array, optional
         Tangential velocities of moving walls, and of flow that enters at an angle. ``walls(params)`` returns the
         velocities at the end of a step, one flat array on ``face_lift(grid, boundary).domain`` [velocity];
-        differentiable. Constant velocities may be given as the array ``face_lift(grid, boundary)(velocities)``.
-        Default: 0.
+        differentiable. Constant velocities may be given as the array ``face_lift(grid, boundary)(velocities)``, unless
+        the viscosity depends on the shear rate. Default: 0.
     scalars : dict, optional
         Cell fields that the flow carries, such as ``{"heat": {"diffusivity": 0.1, "boundary": {"x": dp.dirichlet},
         "values": values, "source": lambda s, params: ...}}``. All four entries are optional. "diffusivity": >= 0
-        [length^2 / time], one number or one for each cell, or a function ``diffusivity(params)`` or, for explicit
-        diffusion, ``diffusivity(s, params)`` that returns them; differentiable. "boundary": a condition or a dict
-        (default neumann). "values": wall values as `lift` takes them, here for x-lower, x-upper, y-lower and y-upper
+        [length^2 / time], one number or one for each cell, or a function ``diffusivity(params)`` or
+        ``diffusivity(s, params)`` that returns them; differentiable. "boundary": a condition or a dict (default
+        neumann). "values": wall values as `lift` takes them, here for x-lower, x-upper, y-lower and y-upper
         ``dp.lift(grid, {"x": dp.dirichlet}).domain.join(1.0, 0.0, 0.0, 0.0)``, or a function ``values(params)`` that
         returns those at the end of a step; differentiable. "source": a function that returns the rate [scalar / time]
         from the dict of all scalars. With scalars, the force is called as ``force(v, s, params)``.
@@ -168,23 +169,24 @@ def flow_step(
         ``step.start(v, params, s)`` takes a dict of cell fields. The state then also holds these as "s" and their
         previous rates as "r". If `walls` is a function, the state also holds the wall velocities as "walls"; if wall
         values of scalars are functions, it holds these as "values"; if `dt` is a function, the step length as "dt"; if
-        an implicit viscosity depends on the shear rate, the previous velocity as "before". With a density, the pressure
-        has the unit [density velocity^2].
+        an implicit viscosity depends on the shear rate, the previous velocity as "before"; if an implicit diffusivity
+        depends on scalars, the previous scalars as "s_before". With a density, the pressure has the unit
+        [density velocity^2].
 
     Raises
     ------
     ValueError
         If dt, the viscosity, a diffusivity or the density is out of range, a scalar has an entry other than those
         four, a friction is given with implicit viscosity, `inflow` is given without an inflow boundary, an array as
-        `walls` without a side that has a tangential velocity, or it does not determine the tangential velocity at an
-        inflow boundary, or if an implicit diffusivity is a function of the scalars. On use, if a friction is < 0 or
-        complex, or `walls` is an array beside a viscosity that varies.
+        `walls` without a side that has a tangential velocity, or beside a viscosity that depends on the shear rate, or
+        it does not determine the tangential velocity at an inflow boundary. On use, if a friction is < 0 or complex, or
+        `walls` is an array that does not determine the velocities of walls, which a viscosity for each cell needs.
     ShapeError
         If `walls` is an array of another shape than the faces, or a viscosity, diffusivity or density is an array of
         another shape than the cells. On use, if the state does not have the entries that ``step.start`` returns, or a
         force, friction, source, inflow or wall velocity has the wrong shape.
     TypeError
-        If scalars is not a dict, or a force or source does not take the right number of arguments.
+        If scalars is not a dict, or a function does not take the right number of arguments.
     DerivativeError
         If dt, a viscosity, a diffusivity or a density that is not given as a function is traced.
     NonFiniteError
@@ -202,13 +204,20 @@ def flow_step(
     Explicit viscosity is stable for dt nu / h^2 <= 1/8 in 2-D (Adams-Bashforth), and for <= 1/16 where it varies in
     space; a larger dt raises an error.
     At an outflow the normal viscous stress is 0, as if the velocity there did not change along the axis.
+    A function that is the viscosity, a diffusivity or the density is called with the params alone if it accepts one
+    positional argument, and with the fields too if it accepts as many as are named above. The rule is the same for
+    functions, methods, ``functools.partial`` and objects with ``__call__``. A function that accepts both numbers, by a
+    default value or by ``*args``, is refused; bind other values by keyword: ``lambda params, *, k=k: ...``.
+    Implicit terms take the viscosity and the diffusivity at half the step. A viscosity of the shear rate, and a
+    diffusivity of scalars, are computed there from fields that are extrapolated from this and the previous step, so
+    that each step solves linear systems alone and the order remains 2.
     A viscosity, diffusivity or density in solid cells has no effect, is not checked and has the derivative 0: beside an
     obstacle, stresses are computed from the harmonic average of the viscosity of fluid cells alone. In solid cells a
     function of the shear rate gets that of the first fluid cell.
     A viscosity, diffusivity or density that varies in space is not available on ranks.
-    Convection is explicit. A step raises an error if it would amplify waves by more than 2 %. Let the Courant number c
-    be dt times the largest sum over the axes of |v| / h in a cell: without viscosity the limit is c = 0.53, and
-    viscosity increases it.
+    Convection is explicit. Let the Courant number c be dt times the largest sum over the axes of |v| / h in a cell. A
+    step with c > 0.5 raises an error if it would amplify waves by more than 2 %. Without viscosity the limit is
+    therefore c = 0.5, where waves grow by 2.7 % a step, and viscosity increases it.
     The force that a friction exerts in a step is the sum of volumes * friction * (v* - (v - v_previous) / 2), where
     v* = v_next + dt G (p_next - p), as in benchmarks/cylinder.py. The bracket equals v_next only at a steady state.
     Cost: one pressure solve per step, and one more solve for implicit viscosity; as many in the backward pass. A solve
@@ -264,7 +273,7 @@ def _check(settings: FlowSettings) -> None:
     """Raise an error if arguments of `flow_step` are out of range or contradict each other."""
     check_grid("flow_step", settings.grid)
     if callable(settings.dt):
-        check_function("flow_step", settings.dt, "dt=lambda params: ...", 1)
+        needs_fields("dt", settings.dt, ())
     else:
         _check_constant("dt", settings.dt, "> 0")
     _check_coefficient("viscosity", settings.viscosity, ">= 0")
@@ -278,17 +287,11 @@ def _check(settings: FlowSettings) -> None:
             check_function("flow_step", settings.force, "force=lambda v, s, params: ...", 3)
         else:
             check_function("flow_step", settings.force, "force=lambda v, params: ...", 2)
-    if not takes_params_alone(settings.density):
-        check_function("flow_step", settings.density, "density=lambda s, params: ...", 2)
-        if not settings.scalars:
-            raise ValueError(
-                "density of flow_step is a function of scalars, and there are none; write density=lambda params: ..."
-            )
-    if not takes_params_alone(settings.viscosity):
-        if settings.scalars:
-            check_function("flow_step", settings.viscosity, "viscosity=lambda shear_rate, s, params: ...", 3)
-        else:
-            check_function("flow_step", settings.viscosity, "viscosity=lambda shear_rate, params: ...", 2)
+    if needs_fields("density", settings.density, settings.fields_of("density")) and not settings.scalars:
+        raise ValueError(
+            "density of flow_step is a function of scalars, and there are none; write density=lambda params: ..."
+        )
+    needs_fields("viscosity", settings.viscosity, settings.fields_of("viscosity"))
     if callable(settings.walls):
         check_function("flow_step, as walls,", settings.walls, "walls=lambda params: values", 1)
     elif settings.walls is not None:
@@ -306,13 +309,7 @@ def _check(settings: FlowSettings) -> None:
             )
         diffusivity = entries.get("diffusivity", 0.0)
         _check_coefficient(f"diffusivity of {name!r}", diffusivity, ">= 0")
-        if not takes_params_alone(diffusivity):
-            check_function("flow_step", diffusivity, "diffusivity=lambda s, params: ...", 2)
-            if settings.implicit:
-                raise ValueError(
-                    f"implicit diffusion of flow_step takes a diffusivity of {name!r} that is a function of params "
-                    "alone, got one of the scalars; write implicit=False"
-                )
+        needs_fields("diffusivity", diffusivity, settings.fields_of("diffusivity"))
         if entries.get("source") is not None:
             check_function("flow_step", entries["source"], "source=lambda s, params: ...", 2)
         if callable(entries.get("values")):
@@ -398,15 +395,24 @@ class FlowStep(Reconstructible):
             self._density = Coefficient("density", settings.density, settings, "> 0")
             self._to_faces = density_on_faces(grid)
             self._weighted_projection = self.project.weighted
-        self._extrapolates = self.viscous.varies and settings.implicit and self.viscous.coefficient.needs_fields
+        depends_on_flow = self.viscous.varies and self.viscous.coefficient.needs_fields
+        self._extrapolates = settings.implicit and depends_on_flow
         self.walls = moving_walls(settings, setup.sides)
+        if depends_on_flow and settings.walls is not None and not self.walls.changes:
+            raise ValueError(
+                "flow_step takes walls= as a function beside a viscosity that depends on the shear rate; write "
+                "walls=lambda params: values, with values on face_lift(grid, boundary).domain"
+            )
         self.scalars = {
             name: Scalar(name, settings, self.divergence, **entries)
             for name, entries in (settings.scalars or {}).items()
         }
+        self._extrapolates_scalars = settings.implicit and any(
+            scalar.diffusion.varies and scalar.diffusion.coefficient.needs_fields for scalar in self.scalars.values()
+        )
         self._open_faces = mask(grid.faces, setup.open)
         # Forces are set to 0 on all other faces, because an implicit viscosity would spread them into the fluid.
-        self._free_faces = mask(grid.faces, free_faces(grid, setup.sides, settings.solid))
+        self._free_faces = mask(grid.faces, free_face_mask(grid, setup.sides, settings.solid))
         self._total_flow = Operator(self.divergence.structure.absolute, grid.faces, grid.cells, "total flow")
         self._inflow_faces: Any = None
         if settings.inflow is not None:
@@ -456,13 +462,13 @@ class FlowStep(Reconstructible):
         if self._density is None:
             v = self.project(v)
         else:
-            v, _ = self._weighted_projection.split(v, self._face_density(s, params, dtype_of(v)))
+            v, _ = self._weighted_projection.split(v, self._face_density(s, params, v))
         walls = self.walls.velocities(params, dtype_of(v))
-        dt = self._step_length(params)
+        dt = self._step_length(params, dtype_of(v))
         state = {
             "v": v,
             "p": np.zeros(np.shape(v)[:-1] + self.grid.shape, dtype_of(v)),
-            "a": self.acceleration(v, params, s, self._friction(params), walls, dt),
+            "a": self.acceleration(v, params, s, self._friction(params, dtype_of(v)), walls, dt),
         }
         if self.walls.changes:
             state["walls"] = walls
@@ -472,6 +478,8 @@ class FlowStep(Reconstructible):
             state["before"] = v
         if s:
             state["s"] = s
+            if self._extrapolates_scalars:
+                state["s_before"] = s
             values = self._wall_values(s, params)
             state["r"] = self._rates(v, s, params, values, dt)
             if values:
@@ -494,13 +502,13 @@ class FlowStep(Reconstructible):
         dict
         """
         self._check_state(state)
-        dt = self._step_length(params)
         v = state["v"]
+        dt = self._step_length(params, dtype_of(v))
         p = state["p"]
         s = state.get("s", {})
         if self.convect is not None and self.settings.strict:
             check_values(self._check_convection, v, dt)
-        friction = self._friction(params)
+        friction = self._friction(params, dtype_of(v))
         walls = state.get("walls", self.walls.constant)
         walls_after = self.walls.velocities(params, dtype_of(v))
         a = self.acceleration(v, params, s, friction, walls, dt)
@@ -512,7 +520,7 @@ class FlowStep(Reconstructible):
             mean_scalars = {name: 0.5 * (u + scalars["s"][name]) for name, u in s.items()}
         slope_of_p = self.pressure_gradient(p)
         if self._density is not None:
-            density = self._face_density(mean_scalars, params, dtype_of(v))
+            density = self._face_density(mean_scalars, params, v)
             slope_of_p = slope_of_p / density
         predicted = v + dt * (self._half_step_ahead(a, state["a"], state, dt) - slope_of_p)
         if friction is not None:
@@ -540,17 +548,19 @@ class FlowStep(Reconstructible):
             new["dt"] = dt
         if self._extrapolates:
             new["before"] = v
+        if self._extrapolates_scalars:
+            new["s_before"] = s
         if s:
             new.update(scalars or self._advance_scalars(state, params, dt))
         return new
 
-    def _step_length(self, params: Any) -> Any:
-        """Return the length of the step."""
+    def _step_length(self, params: Any, dtype: np.dtype) -> Any:
+        """Return the length of the step; that of a function has the precision of the flow."""
         if not callable(self.dt):
             return self.dt
         dt = self.dt(params)
         check_values(_check_step_length, dt)
-        return dt
+        return cast(dt, real_dtype(dtype))
 
     def _half_step_ahead(self, now: Any, before: Any, state: dict[str, Any], dt: Any) -> Any:
         """Return a value half a step ahead, extrapolated from those at the beginning of this and the previous step."""
@@ -575,38 +585,31 @@ class FlowStep(Reconstructible):
 
         `middle`, `s` and `density` are the velocity, the scalars and the density on faces at half the step.
         """
-        self._check_wall_velocities()
         sum_of_walls = None
         mean_of_walls = None
         if self.walls.changes:
             sum_of_walls = walls + walls_after
             mean_of_walls = 0.5 * sum_of_walls
         viscosity = self._viscosity(middle, s, params, mean_of_walls)
-        return self.viscous.step_implicit(predicted, v, viscosity, sum_of_walls, density, dt)
+        wall_part = partial(self.walls.laplacian_part_sum, walls, walls_after)
+        return self.viscous.step_implicit(
+            predicted, v, viscosity, wall_part, partial(self.walls.for_stress, sum_of_walls, 2.0), density, dt
+        )
 
     def _viscosity(self, v: Any, s: dict[str, Any], params: Any, walls: Any) -> Any:
         """Return a viscosity that varies, a number or one value for each cell."""
 
         def fields():
-            self._check_wall_velocities()
             shear_rate = self.viscous.form.shear_rate(v, walls)
             if self.scalars:
                 return shear_rate, s
             return (shear_rate,)
 
-        return self.viscous.coefficient(fields, params, dtype_of(v))
+        return self.viscous.coefficient(fields, params, dtype_of(v), np.shape(v)[:-1])
 
-    def _check_wall_velocities(self) -> None:
-        """Raise an error if only the result of `face_lift` is known of the velocities of walls."""
-        if self.settings.walls is not None and not self.walls.changes:
-            raise ValueError(
-                "flow_step takes walls= as a function where the viscosity varies; write walls=lambda params: values, "
-                "with values on face_lift(grid, boundary).domain"
-            )
-
-    def _face_density(self, s: dict[str, Any], params: Any, dtype: np.dtype) -> Any:
+    def _face_density(self, s: dict[str, Any], params: Any, v: Any) -> Any:
         """Return the density on faces, or a number."""
-        density = self._density(lambda: (s,), params, dtype)
+        density = self._density(lambda: (s,), params, dtype_of(v), np.shape(v)[:-1])
         if np.shape(sample(density)) == ():
             return density
         return self._to_faces(density)
@@ -618,11 +621,14 @@ class FlowStep(Reconstructible):
         after = self._wall_values(s, params)
         rates = self._rates(state["v"], s, params, before, dt)
         new: dict[str, Any] = {"r": rates, "s": {}}
+        middle = s
+        if self._extrapolates_scalars:
+            middle = {name: self._half_step_ahead(u, state["s_before"][name], state, dt) for name, u in s.items()}
         for name, scalar in self.scalars.items():
             change = dt * self._half_step_ahead(rates[name], state["r"][name], state, dt)
             diffusivity = None
             if self.settings.implicit:
-                diffusivity = scalar.diffusivity(s, params)
+                diffusivity = scalar.diffusivity(middle, params)
             new["s"][name] = scalar.step(s[name], change, before.get(name), after.get(name), diffusivity, dt)
         if after:
             new["values"] = after
@@ -638,6 +644,8 @@ class FlowStep(Reconstructible):
             names += ["dt"]
         if self._extrapolates:
             names += ["before"]
+        if self._extrapolates_scalars:
+            names += ["s_before"]
         if any(scalar.changes for scalar in self.scalars.values()):
             names += ["values"]
         if not isinstance(state, dict) or state.keys() != set(names):
@@ -672,10 +680,9 @@ class FlowStep(Reconstructible):
         viscosity = self._viscosity(v, s or {}, params, walls)
         density = None
         if self._density is not None:
-            density = self._face_density(s or {}, params, dtype_of(v))
-        if np.shape(sample(viscosity)) != ():
-            self._check_wall_velocities()
-        return self.viscous.add_explicit(a, v, viscosity, wall_part, walls, density, dt)
+            density = self._face_density(s or {}, params, v)
+        for_stress = partial(self.walls.for_stress, walls, 1.0)
+        return self.viscous.add_explicit(a, v, viscosity, wall_part, for_stress, density, dt)
 
     def _force(self, v: Any, params: Any, s: dict[str, Any] | None) -> Any:
         """Return the force as an array on faces; a force that is one number applies to all faces."""
@@ -684,9 +691,9 @@ class FlowStep(Reconstructible):
         if np.shape(sample(force)) == ():
             return force * np.ones(v.shape, dtype_of(v))
         check_on("flow_step, as force,", force, self.grid.faces, "; join its components with grid.join")
-        return force
+        return in_precision_of(force, dtype_of(v))
 
-    def _friction(self, params: Any) -> Any:
+    def _friction(self, params: Any, dtype: np.dtype) -> Any:
         """Return the friction, set to 0 on faces that are not free; None if there is no friction."""
         friction = self.settings.friction
         if friction is None:
@@ -695,7 +702,7 @@ class FlowStep(Reconstructible):
             friction = friction(params)
         check_on("flow_step, as friction,", friction, self.grid.faces, "; write one number for each face")
         check_values(_check_friction, friction)
-        return self._free_faces(friction)
+        return self._free_faces(in_precision_of(friction, dtype))
 
     def _set_inflow(self, v: Any, params: Any) -> Any:
         """Return the velocity with the values of `inflow` on the faces of inflow boundaries."""

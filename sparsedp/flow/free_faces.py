@@ -60,5 +60,5 @@ def free_faces(grid: Grid, boundary: Any = no_slip, solid: ArrayLike | None = No
     array([0., 1., 0., 0., 1.])
     """
     check_grid("free_faces", grid)
-    mask = momentum.free_faces(grid, resolve(grid, boundary, no_slip, patches=True), solid)
+    mask = momentum.free_face_mask(grid, resolve(grid, boundary, no_slip, patches=True), solid)
     return Operator(Mask(mask), grid.faces, grid.faces, "free_faces")

@@ -76,7 +76,7 @@ __all__ = [
     "convection",
     "face_laplacian",
     "face_lift",
-    "free_faces",
+    "free_face_mask",
     "gradient_around",
     "inflow_points",
     "stresses",
@@ -130,7 +130,7 @@ def face_laplacian(
     array([ 0.,  0., -4., -4.,  0.,  0.,  0.,  0.,  0.,  0.,  0.,  0.])
     """
     sides = resolve(grid, boundary, no_slip, patches=True)
-    free = Mask(free_faces(grid, sides, solid))
+    free = Mask(free_face_mask(grid, sides, solid))
     stress = stresses(grid, sides, solid, solid_boundary)
     if solid is None:
         structure = compose(free, stress)
@@ -180,7 +180,7 @@ def face_lift(grid: Grid, boundary: Any = no_slip, solid: ArrayLike | None = Non
     array([0., 0., 0., 2., 0., 0., 0., 0., 0., 0., 0., 0.])
     """
     sides = resolve(grid, boundary, no_slip, patches=True)
-    structure = compose(Mask(free_faces(grid, sides, solid)), wall_stresses(grid, sides))
+    structure = compose(Mask(free_face_mask(grid, sides, solid)), wall_stresses(grid, sides))
     name = f"face_lift{describe_patches(sides)}"
     return Operator(structure, wall_velocities(grid, sides), grid.faces, name)
 
@@ -247,7 +247,7 @@ def convection(grid: Grid, boundary: Any = no_slip, solid: ArrayLike | None = No
     sides = resolve(grid, boundary, no_slip, patches=True)
     fluxes = MomentumFluxes(grid, sides)
     gain = fluxes.gain
-    free = Mask(free_faces(grid, sides, solid))
+    free = Mask(free_face_mask(grid, sides, solid))
     C = Operator(compose(free, gain.structure), gain.domain, grid.faces, f"gain{describe_patches(sides)}")
 
     def convect(v, w, walls=None):
@@ -410,7 +410,7 @@ def wall_stresses(grid: Grid, sides: tuple) -> Kronecker:
     return Kronecker(grid.faces.parts, wall_velocities(grid, sides).parts, blocks)
 
 
-def free_faces(grid: Grid, sides: tuple, solid: ArrayLike | None) -> NDArray[np.bool_]:
+def free_face_mask(grid: Grid, sides: tuple, solid: ArrayLike | None) -> NDArray[np.bool_]:
     """Return the mask of the faces whose velocity is unknown: all except those on walls, inflows and obstacles."""
     return mask_of_faces(grid, sides, solid, lambda condition: condition == outflow)
 

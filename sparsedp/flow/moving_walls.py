@@ -5,8 +5,9 @@ They are given in one of two forms:
 - a function ``walls(params)``, whose result holds the velocities themselves, one flat array on the domain of
   `face_lift` (`ChangingWalls`);
 - an array on faces, ``face_lift(grid, boundary)(velocities)``: the contribution of constant velocities to the
-  Laplacian of the flow (`ConstantWalls`). Viscosity uses this array directly. Convection needs the velocities at inflow
-  boundaries, which `velocities_from_lift` recovers from the array.
+  Laplacian of the flow (`ConstantWalls`). A viscosity that is one number uses this array directly. Convection needs the
+  velocities at inflow boundaries, and a viscosity that varies in space those of all walls; `velocities_from_lift`
+  recovers them from the array.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import scipy.sparse as sp
 from sparsedp.autodiff.backend import gathered
 from sparsedp.autodiff.program_trace import check_values
 from sparsedp.autodiff.tape import cast
-from sparsedp.flow.momentum import check_walls, face_lift, free_faces, inflow_points, wall_stresses, wall_velocities
+from sparsedp.flow.momentum import check_walls, face_lift, free_face_mask, inflow_points, wall_stresses, wall_velocities
 from sparsedp.grid.boundary_conditions import inflow, occurring
 from sparsedp.operators.masks_and_lift import mask
 from sparsedp.operators.operator import Operator
@@ -28,6 +29,8 @@ from sparsedp.operators.structure.base import Matrix
 from sparsedp.operators.structure.lazy import Mask, compose
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from sparsedp.flow.settings import FlowSettings
     from sparsedp.grid.grid import Grid
 
@@ -92,16 +95,30 @@ class WallsAtRest:
         """Return the sum of `laplacian_part` for the velocities before and after a step; None stands for 0."""
         return None
 
+    def for_stress(self, velocities: Any, factor: float) -> Any:
+        """Return the velocities that the stress of a viscosity that varies in space needs; None stands for 0.
+
+        Parameters
+        ----------
+        velocities : array or None
+            The sum of the velocities at some times, if they depend on params.
+        factor : float
+            The number of these times.
+        """
+        return None
+
 
 class ConstantWalls(WallsAtRest):
     """Constant wall velocities, given as ``face_lift(grid, boundary)(velocities)``."""
 
     def __init__(self, settings: FlowSettings, sides: tuple) -> None:
         grid = settings.grid
+        self._settings = settings
+        self._sides = sides
         # Set to 0 on faces that are not free, because an implicit viscosity would spread these values into the fluid.
-        self._lifted = mask(grid.faces, free_faces(grid, sides, settings.solid))(settings.walls)
+        self._lifted = mask(grid.faces, free_face_mask(grid, sides, settings.solid))(settings.walls)
         if settings.convective and inflow in occurring(sides):
-            self.constant = velocities_from_lift(settings.walls, grid, sides)
+            self.constant = velocities_from_lift(settings.walls, grid, sides, inflow_points(grid, sides))
 
     def laplacian_part(self, velocities: Any) -> Any:
         """Return the given array; see `WallsAtRest`."""
@@ -110,6 +127,16 @@ class ConstantWalls(WallsAtRest):
     def laplacian_part_sum(self, before: Any, after: Any) -> Any:
         """Return twice the given array; see `WallsAtRest`."""
         return 2.0 * self._lifted
+
+    def for_stress(self, velocities: Any, factor: float) -> Any:
+        """Return the recovered velocities of all walls, times the factor; see `WallsAtRest`."""
+        return factor * self._of_all_walls
+
+    @cached_property
+    def _of_all_walls(self) -> Any:
+        grid = self._settings.grid
+        everywhere = np.ones(wall_velocities(grid, self._sides).size, bool)
+        return velocities_from_lift(self._settings.walls, grid, self._sides, everywhere)
 
 
 class ChangingWalls(WallsAtRest):
@@ -138,9 +165,13 @@ class ChangingWalls(WallsAtRest):
         """Return the lift of the sum of the velocities; see `WallsAtRest`."""
         return self._lift(before + after)
 
+    def for_stress(self, velocities: Any, factor: float) -> Any:
+        """Return the given velocities; see `WallsAtRest`."""
+        return velocities
 
-def velocities_from_lift(lifted: Any, grid: Grid, sides: tuple) -> Any:
-    """Recover the wall velocities at inflow boundaries from the result of `face_lift`; other walls get 0.
+
+def velocities_from_lift(lifted: Any, grid: Grid, sides: tuple, wanted: NDArray) -> Any:
+    """Recover wall velocities from the result of `face_lift`; those on faces that are not free get 0.
 
     Parameters
     ----------
@@ -149,6 +180,8 @@ def velocities_from_lift(lifted: Any, grid: Grid, sides: tuple) -> Any:
     grid : Grid
     sides : tuple
         The flow conditions as `resolve` returns them.
+    wanted : bool array on the domain of `face_lift`
+        The velocities to recover; all others get 0.
 
     Returns
     -------
@@ -157,15 +190,14 @@ def velocities_from_lift(lifted: Any, grid: Grid, sides: tuple) -> Any:
     Raises
     ------
     ValueError
-        If a face at an inflow boundary also touches another wall with a velocity. The array then holds only the sum of
+        If a face with a wanted velocity also touches another wall with a velocity. The array then holds only the sum of
         both contributions, from which they cannot be separated.
     """
-    lift = compose(Mask(free_faces(grid, sides, None)), wall_stresses(grid, sides)).explicit().tocsr()
+    lift = compose(Mask(free_face_mask(grid, sides, None)), wall_stresses(grid, sides)).explicit().tocsr()
     walls = wall_velocities(grid, sides)
-    wanted = inflow_points(grid, sides)
     wall_count = np.diff(lift.indptr)  # number of wall velocities that each face depends on
-    at_inflow = abs(lift) @ wanted > 0
-    check_values(partial(_check_separate, at_inflow & (wall_count > 1)), lifted)
+    needed = abs(lift) @ wanted > 0
+    check_values(partial(_check_separate, needed & (wall_count > 1)), lifted)
     # If a face depends on a single wall velocity, this velocity is the value on the face divided by the coefficient.
     face, wall = lift.nonzero()
     invertible = (wall_count[face] == 1) & wanted[wall]
@@ -178,6 +210,6 @@ def _check_separate(is_shared, lifted):
     """Raise ValueError if a result of `face_lift` is nonzero on faces that depend on several wall velocities."""
     if np.any(gathered(lifted)[is_shared]):
         raise ValueError(
-            "walls of flow_step got an array in which the velocities of walls that meet at an inflow are summed; write "
+            "walls of flow_step got an array in which the velocities of walls that meet are summed; write "
             "walls=lambda params: values, with values on face_lift(grid, boundary).domain"
         )

@@ -73,7 +73,8 @@ def projection(
         records the solves.
         ``P(v, density)`` returns v + G(p) / density without divergence, for a fluid whose density varies: a number > 0,
         or one for each cell or each face. The density of a face is the mean of its two cells, weighted by their widths.
-        The density of solid cells has no effect. Differentiable in both, to every order.
+        The density of solid cells has no effect. Leading axes of v are a batch, and the density may have one leading
+        axis, for a density of each entry. Differentiable in both, to every order.
 
     Raises
     ------
@@ -155,8 +156,9 @@ class Projection(Operator):
         Parameters
         ----------
         v : array on faces
+            Leading axes are a batch.
         density : number, array on cells or array on faces, optional
-            > 0; see `projection`. Default: the same everywhere.
+            > 0; see `projection`. One leading axis is a batch. Default: the same everywhere.
         """
         if density is None:
             return super().__call__(v)
@@ -164,7 +166,8 @@ class Projection(Operator):
 
     @public("dp.projection(grid)")
     def _with_density(self, v: Any, density: Any) -> Any:
-        check_on("projection", v, self.domain, "; join its components with grid.join")
+        if np.shape(v)[-1:] != self.domain.shape:  # leading axes are a batch
+            check_on("projection", v, self.domain, "; join its components with grid.join")
         projected, _ = self.weighted.split(v, self.weighted.face_density(density, dtype_of(v)))
         return projected
 

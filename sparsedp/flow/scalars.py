@@ -24,7 +24,13 @@ from sparsedp.autodiff.tape import cast, dtype_of
 from sparsedp.autodiff.tape_constants import frozen
 from sparsedp.errors import ShapeError
 from sparsedp.flow.diffusion import Diffusion
-from sparsedp.flow.variable_diffusion import DiffusionForm, VariableDiffusion, is_constant
+from sparsedp.flow.variable_diffusion import (
+    DiffusionForm,
+    VariableDiffusion,
+    as_array,
+    in_precision_of,
+    is_constant,
+)
 from sparsedp.grid.boundary_conditions import neumann
 from sparsedp.operators.difference import divergence, gradient, laplacian
 from sparsedp.operators.harmonic import harmonic_average
@@ -79,11 +85,11 @@ class Scalar:
         self._fluid: Any = None
         if solid is not None:
             self._fluid = mask(grid.cells, ~check_solid(grid, solid))
-        self._values: Any = values
         self.changes = callable(values)
+        self._values: Any = values if self.changes or values is None else as_array(values)
         self._constant_parts: tuple = (None, None)
         if values is not None and not self.changes:
-            self._constant_parts = self._contributions(values)
+            self._constant_parts = self._contributions(self._values)
         build_laplacian = partial(laplacian, grid, boundary, solid)
         coefficient_name = f"diffusivity of {name!r}"
         self.diffusion: Any
@@ -129,7 +135,9 @@ class Scalar:
         """Return the diffusivity for these scalars if it varies, else None."""
         if not self.diffusion.varies:
             return None
-        return self.diffusion.coefficient(lambda: (scalars,), params, dtype_of(scalars[self.name]))
+        u = scalars[self.name]
+        batch = np.shape(u)[: np.ndim(u) - len(self._divergence.codomain.shape)]
+        return self.diffusion.coefficient(lambda: (scalars,), params, dtype_of(u), batch)
 
     def rate(self, v: Any, scalars: dict[str, Any], params: Any, values: Any = None, dt: Any = None) -> Any:
         """Return the explicit part r of the rate of change; see the module docstring.
@@ -150,11 +158,10 @@ class Scalar:
                     f"flow_step takes a source of {self.name!r} of shape {u.shape}, or a number, got an array of shape "
                     f"{np.shape(sample(source))}; write one number for each cell"
                 )
-            rate = rate + source
+            rate = rate + in_precision_of(source, dtype_of(u))
         if self.diffusion.varies:
             k = self.diffusivity(scalars, params)
-            walls = self._at_walls(values)
-            rate = self.diffusion.add_explicit(rate, u, k, lambda: wall_part, walls, None, dt)
+            rate = self.diffusion.add_explicit(rate, u, k, lambda: wall_part, lambda: self._at_walls(values), None, dt)
         else:
             rate = self.diffusion.add_explicit(rate, u, lambda: wall_part)
         check_values(partial(check_finite, f"the rate of {self.name!r}"), rate)
@@ -180,25 +187,30 @@ class Scalar:
             The diffusivity, and the length of the step `dt`, if the diffusivity varies.
         """
         explicit = u + change
-        if self.diffusion.varies:
-            if not self.diffusion.implicit:
-                return explicit
-            if before is not None:
-                walls = before + after
-            elif self._values is None:
-                walls = None
-            else:
-                walls = 2.0 * self._values
-            return self.diffusion.step_implicit(explicit, u, k, walls, None, dt)
-        if self.diffusion.solve is None:
+        if not self.diffusion.implicit:
             return explicit
+        wall_part = partial(self._sum_of_parts, before, after, dtype_of(u))
+        if self.diffusion.varies:
+            walls = partial(self._sum_at_walls, before, after)
+            return self.diffusion.step_implicit(explicit, u, k, wall_part, walls, None, dt)
+        return self.diffusion.step_implicit(explicit, u, wall_part())
+
+    def _sum_at_walls(self, before: Any, after: Any) -> Any:
+        """Return the sum of the wall values at the beginning and the end of a step; None stands for 0."""
         if before is not None:
-            wall_part, _ = self._parts(before + after, dtype_of(u))
-        else:
-            wall_part, _ = self._parts(None, dtype_of(u))
-            if wall_part is not None:
-                wall_part = 2.0 * wall_part
-        return self.diffusion.step_implicit(explicit, u, wall_part)
+            return before + after
+        if self._values is None:
+            return None
+        return 2.0 * self._values
+
+    def _sum_of_parts(self, before: Any, after: Any, dtype: np.dtype) -> Any:
+        """Return the contribution of `_sum_at_walls` to the Laplacian; None stands for 0."""
+        if before is not None:
+            return self._parts(before + after, dtype)[0]
+        wall_part, _ = self._parts(None, dtype)
+        if wall_part is None:
+            return None
+        return 2.0 * wall_part
 
 
 class DiffusiveFlux(DiffusionForm):

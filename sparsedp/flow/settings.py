@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import FunctionType
+from inspect import Signature, signature
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sparsedp.grid.grid import Grid
 
-__all__ = ["FlowSettings", "takes_params_alone"]
+__all__ = ["FlowSettings", "needs_fields"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,13 +39,70 @@ class FlowSettings:
 
     @property
     def may_be_implicit(self) -> bool:
-        """Whether `implicit=True` is allowed: no friction is given, and no diffusivity is a function of scalars."""
-        diffusivities = [entries.get("diffusivity") for entries in (self.scalars or {}).values()]
-        return self.friction is None and all(map(takes_params_alone, diffusivities))
+        """Whether `implicit=True` is allowed: no friction is given."""
+        return self.friction is None
+
+    def fields_of(self, argument: str) -> tuple[str, ...]:
+        """Return the names of the fields that a function of fields gets before the params."""
+        if argument != "viscosity":
+            return ("s",)
+        if self.scalars:
+            return "shear_rate", "s"
+        return ("shear_rate",)
 
 
-def takes_params_alone(given: Any) -> bool:
-    """Return whether an argument is not a function, or a function with one argument that has no default value."""
-    if type(given) is not FunctionType:
-        return True
-    return given.__code__.co_argcount - len(given.__defaults__ or ()) <= 1
+def needs_fields(argument: str, given: Any, fields: tuple[str, ...]) -> bool:
+    """Return whether an argument of `flow_step` is a function of fields and params, and not of params alone.
+
+    This depends on how many positional arguments it accepts, by its signature: one, or one more than there are fields.
+    The rule is the same for functions, methods, functools.partial and objects with ``__call__``.
+
+    Parameters
+    ----------
+    argument : str
+        Name of the argument.
+    given : Any
+    fields : tuple of str
+        The names of the fields; empty if the argument may be a function of params alone.
+
+    Raises
+    ------
+    TypeError
+        If it is a function that accepts neither number of arguments, or both.
+    """
+    if not callable(given):
+        return False
+    examples = {1: f"{argument}=lambda params: ..."}
+    if fields:
+        examples[1 + len(fields)] = f"{argument}=lambda {', '.join(fields)}, params: ..."
+    expected = _signature(given)
+    if expected is None and not fields:
+        return False
+    accepted = [count for count in examples if expected is None or _accepts(expected, count)]
+    if len(accepted) == 1:
+        return accepted[0] > 1
+    counts = f"{' or '.join(map(str, examples))} argument{'s'[: len(examples) - 1]}"
+    advice = " or ".join(examples.values())
+    if accepted:
+        raise TypeError(
+            f"flow_step calls {argument} with {counts}, got a function that accepts both; write {advice}, "
+            "without default values"
+        )
+    raise TypeError(f"flow_step calls {argument} with {counts}, got a function of {expected}; write {advice}")
+
+
+def _signature(function: Any) -> Signature | None:
+    """Return the signature of a callable, None if it has none."""
+    try:
+        return signature(function)
+    except ValueError:
+        return None
+
+
+def _accepts(expected, count):
+    """Return whether a signature accepts a number of positional arguments."""
+    try:
+        expected.bind(*range(count))
+    except TypeError:
+        return False
+    return True

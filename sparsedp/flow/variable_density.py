@@ -20,8 +20,9 @@ import scipy.sparse as sp
 from sparsedp._utils.validation import check_finite, check_kind, check_plain
 from sparsedp.autodiff.program_trace import check_values
 from sparsedp.autodiff.tape import cast, dtype_of, isbox, real_dtype, sample
-from sparsedp.errors import ShapeError
+from sparsedp.errors import NonFiniteError, ShapeError
 from sparsedp.flow.fluid_cells import FluidPart
+from sparsedp.flow.variable_diffusion import solved_in_batch
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.operators.harmonic import lower_share
 from sparsedp.operators.masks_and_lift import check_solid, mask, solid_faces
@@ -82,20 +83,21 @@ class WeightedProjection:
         if not isbox(density):
             value = np.asarray(density)
         shape = np.shape(sample(value))
-        if shape not in ((), grid.cells.shape, grid.faces.shape):
+        fields = (grid.cells.shape, grid.faces.shape)
+        if shape != () and shape not in fields and shape[1:] not in fields:
             raise ShapeError(
                 f"projection takes a density that is a number or a field on {grid.cells} or {grid.faces}, got an array "
                 f"of shape {shape}"
             )
         check_kind("the density of projection", dtype_of(value), "real numbers", "; write its .real")
-        if shape == grid.cells.shape:
+        if shape == ():
+            check_values(_check_density, value)
+        elif grid.cells.shape in (shape, shape[1:]):
             value = self._fluid_values(self._fluid_cells, value)
             if np.shape(sample(value)) != ():
                 value = self._to_faces(value)
-        elif shape == grid.faces.shape:
-            value = self._fluid_values(self._fluid_faces, value)
         else:
-            check_values(_check_density, value)
+            value = self._fluid_values(self._fluid_faces, value)
         return cast(value, real_dtype(dtype))
 
     def _fluid_values(self, fluid: FluidPart, density: Any) -> Any:
@@ -109,8 +111,22 @@ class WeightedProjection:
         """Return the velocity without divergence, and the q of the module docstring."""
         check_values(self._setup.check_faces, v)  # on walls too, where the values are not used
         v = self._open(v)
-        q = self.solver(1.0 / density, self._divergence(v))
+        check_values(_check_reciprocal, density)
+        q = solved_in_batch(self.solver, 1.0 / density, self._divergence(v))
         return v + self._gradient(q) / density, q
+
+
+def _check_reciprocal(density):
+    """Raise an error for a density that is 0 or infinite in its dtype, or whose reciprocal is."""
+    density = np.asarray(density)
+    with np.errstate(divide="ignore", over="ignore"):
+        reciprocal = 1.0 / density
+    usable = np.logical_and(reciprocal > 0, reciprocal < np.inf)
+    if not np.all(usable):
+        raise NonFiniteError(
+            f"the density and its reciprocal must be finite in {density.dtype}, got a density of "
+            f"{density.flat[np.argmin(usable)]:.6g}; write the density in other units"
+        )
 
 
 def _check_density(density):

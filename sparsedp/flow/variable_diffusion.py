@@ -9,14 +9,17 @@ coefficient is one number, the term is k (L u + B) / rho, with the Laplacian L, 
 Implicit terms are advanced by the trapezoidal rule with k and rho at half the step:
 
     (2 rho / dt - div k E) u_next = 2 rho / dt u_explicit + div(k (E u + W (walls + walls_next))).
+
+A batch of flows may have a coefficient for each of them, along the same leading axes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
+import autograd.numpy as anp
 import numpy as np
 
 from sparsedp._utils.pytree import mapped
@@ -24,16 +27,24 @@ from sparsedp._utils.validation import check_finite, check_kind, check_number, c
 from sparsedp.autodiff.program_trace import check_values, sample
 from sparsedp.autodiff.tape import cast, dtype_of, isbox, real_dtype
 from sparsedp.autodiff.tape_constants import frozen
-from sparsedp.flow.diffusion import check_stable, spectral_bound
+from sparsedp.flow.diffusion import check_stable, spectral_bound, trapezoidal_step
 from sparsedp.flow.fluid_cells import FluidPart
-from sparsedp.flow.settings import takes_params_alone
+from sparsedp.flow.settings import needs_fields
 from sparsedp.solvers.parametric import EllipticSolver, elliptic_solver
 
 if TYPE_CHECKING:
     from sparsedp.flow.settings import FlowSettings
     from sparsedp.operators.operator import Operator
 
-__all__ = ["Coefficient", "DiffusionForm", "VariableDiffusion", "as_array", "is_constant"]
+__all__ = [
+    "Coefficient",
+    "DiffusionForm",
+    "VariableDiffusion",
+    "as_array",
+    "in_precision_of",
+    "is_constant",
+    "solved_in_batch",
+]
 
 
 class DiffusionForm:
@@ -66,10 +77,16 @@ class DiffusionForm:
         return elliptic_solver(self.divergence, self.slopes)
 
     def largest_row_sum(self, k: Any, density: Any) -> float:
-        """Return an upper bound of the eigenvalues of div k E / density, for plain arrays."""
+        """Return an upper bound of the eigenvalues of div k E / density, for plain arrays or batches of them."""
         slopes = self._magnitudes[1](np.ones(self.slopes.domain.size))
-        row_sums = self._magnitudes[0](np.asarray(k, float).reshape(-1) * slopes)
-        return float(np.max(row_sums / np.asarray(density, float).reshape(-1), initial=0.0))
+        densities = np.asarray(density, float).reshape(-1, self.slopes.domain.size if np.ndim(density) else 1)
+        coefficients = np.asarray(k, float).reshape(-1, slopes.size)
+        largest = 0.0
+        for entry in range(max(len(coefficients), len(densities))):
+            flows = coefficients[entry % len(coefficients)] * slopes
+            row_sums = self._magnitudes[0](flows) / densities[entry % len(densities)]
+            largest = max(largest, float(np.max(row_sums, initial=0.0)))
+        return largest
 
     @cached_property
     def _magnitudes(self) -> tuple[Any, Any]:
@@ -84,7 +101,7 @@ class Coefficient:
     name : str
         Name in error messages, such as "viscosity".
     given : number, array or callable
-        A function with one argument is called with the params, a function with more with the fields and the params.
+        A function is called with the params, or with the fields and the params; see `needs_fields`.
     settings : FlowSettings
     needs : str
         The range of valid numbers: ">= 0" or "> 0".
@@ -102,12 +119,13 @@ class Coefficient:
         self._cells = settings.grid.cells
         self._needs = needs
         self.fluid = FluidPart.of_cells(settings.grid, settings.solid)
-        self.needs_fields = not takes_params_alone(given)
+        argument = name.split()[0]
+        self.needs_fields = needs_fields(argument, given, settings.fields_of(argument))
         if not callable(given):
             given = self._checked(given)
         self._given = given
 
-    def __call__(self, fields: Callable[[], tuple], params: Any, dtype: np.dtype) -> Any:
+    def __call__(self, fields: Callable[[], tuple], params: Any, dtype: np.dtype, batch: tuple[int, ...] = ()) -> Any:
         """Return the coefficient, a number or one value for each cell.
 
         Parameters
@@ -116,7 +134,9 @@ class Coefficient:
             ``fields()`` returns the first arguments of a function of fields.
         params : tree
         dtype : dtype
-            Dtype of the flow. A result that is an array has the same precision.
+            Dtype of the flow. The result of a function, and an array, have the same precision.
+        batch : tuple of int
+            The leading axes of the flow, which a function of fields may return too.
         """
         value = self._given
         if callable(value):
@@ -124,12 +144,12 @@ class Coefficient:
                 value = value(*mapped(frozen, fields()), params)
             else:
                 value = value(params)
-            value = self._checked(value)
-        if np.shape(sample(value)) == ():
+            value = self._checked(value, batch)
+        elif np.ndim(value) == 0:
             return value
         return cast(value, real_dtype(dtype))
 
-    def _checked(self, value: Any) -> Any:
+    def _checked(self, value: Any, batch: tuple[int, ...] = ()) -> Any:
         """Return a valid value, with the values of solid cells replaced; raise an error for other values.
 
         Where there is no fluid, the value has no effect and is 1.
@@ -138,7 +158,8 @@ class Coefficient:
         if np.shape(sample(value)) == ():
             check_values(self._check_range, value)
             return value
-        check_on(f"flow_step, as {self.name},", sample(value), self._cells, "; write one number for each cell")
+        if np.shape(sample(value)) != (*batch, *self._cells.shape):
+            check_on(f"flow_step, as {self.name},", sample(value), self._cells, "; write one number for each cell")
         check_kind(f"the {self.name} of flow_step", dtype_of(value), "real numbers", "; write its .real")
         check_values(self._check_range, value)
         if self.fluid.empty:
@@ -164,6 +185,14 @@ def as_array(value: Any) -> Any:
     if isbox(value) or np.ndim(value) == 0:
         return value
     return np.asarray(value)
+
+
+def in_precision_of(value: Any, dtype: np.dtype) -> Any:
+    """Return a value of a user's function in the precision of a field; a complex value stays complex."""
+    kind = dtype_of(value).kind
+    if kind == "c":
+        return cast(value, np.result_type(dtype, np.complex64))
+    return cast(value, real_dtype(dtype))
 
 
 def is_constant(coefficient: Any, settings: FlowSettings) -> bool:
@@ -225,7 +254,7 @@ class VariableDiffusion:
         return spectral_bound(self.op)
 
     def add_explicit(
-        self, rate: Any, u: Any, k: Any, wall_part: Callable[[], Any], walls: Any, density: Any, dt: Any
+        self, rate: Any, u: Any, k: Any, wall_part: Callable[[], Any], walls: Callable[[], Any], density: Any, dt: Any
     ) -> Any:
         """Return the rate plus this term if the term is explicit; return the rate itself if it is implicit.
 
@@ -234,9 +263,9 @@ class VariableDiffusion:
         rate, u : array
         k : number or array on cells
         wall_part : callable
-            ``wall_part()`` returns the contribution of walls to L u, or None if it is 0.
-        walls : array or None
-            The values on walls; None stands for 0.
+            ``wall_part()`` returns the contribution of walls to L u, or None if it is 0; it is called if k is a number.
+        walls : callable
+            ``walls()`` returns the values on walls, or None if they are 0; it is called if k is an array.
         density : array like u, or None
             None stands for 1.
         dt : number
@@ -253,12 +282,14 @@ class VariableDiffusion:
         else:
             at_sites = cast(self.form.at_sites(k), dtype_of(k))
             check_values(self._check_field, k, at_sites, dt, 1.0 if density is None else density)
-            term = self.form.flux_divergence(at_sites, u, walls)
+            term = self.form.flux_divergence(at_sites, u, walls())
         if density is not None:
             term = term / density
         return rate + term
 
-    def step_implicit(self, explicit: Any, u: Any, k: Any, walls: Any, density: Any, dt: Any) -> Any:
+    def step_implicit(
+        self, explicit: Any, u: Any, k: Any, wall_part: Callable[[], Any], walls: Any, density: Any, dt: Any
+    ) -> Any:
         """Return the field at the end of the step.
 
         Parameters
@@ -268,19 +299,34 @@ class VariableDiffusion:
         u : array
             The field at the beginning of the step.
         k : number or array on cells
-        walls : array or None
-            The sum of the values on walls at the beginning and at the end of the step; None stands for 0.
+        wall_part : callable
+            ``wall_part()`` returns the sum of the contributions of walls to L u at the beginning and at the end of the
+            step, or None if it is 0; it is called if k is a number.
+        walls : callable
+            ``walls()`` returns the sum of the values on walls at the beginning and at the end of the step, or None if
+            they are 0; it is called if k is an array.
         density : array like u, or None
         dt : number
         """
         if np.shape(sample(k)) == ():
-            k = k * np.ones(self.settings.grid.shape, dtype_of(u))
-        k = self.form.at_sites(k)
-        shift = 2.0 / dt
+            number = k
+            k = self.form.at_sites(k * np.ones(self.settings.grid.shape, dtype_of(u)))
+            change = self.form.flux_divergence(k, u)
+            part = wall_part()
+            if part is not None:
+                change = change + number * part
+        else:
+            k = self.form.at_sites(k)
+            change = self.form.flux_divergence(k, u, walls())
+        half_step = 0.5 * dt
         if density is not None:
-            shift = shift * density
-        change = self.form.flux_divergence(k, u, walls)
-        return self.form.solver(k, cast(shift * explicit + change, dtype_of(u)), shift)
+            half_step = half_step / density
+        solve = partial(self._solve, k, 1.0 / half_step)
+        return trapezoidal_step(explicit, cast(change, dtype_of(u)), half_step, solve)
+
+    def _solve(self, k: Any, shift: Any, b: Any) -> Any:
+        """Return w of (I - div k E / shift) w = b."""
+        return solved_in_batch(self.form.solver, k, shift * b, shift)
 
     def _check_number(self, k: Any, dt: Any, density: Any) -> None:
         """Raise UnstableStepError if the explicit term is unstable for one number as coefficient."""
@@ -292,3 +338,25 @@ class VariableDiffusion:
         if self.settings.strict:
             rate = self.form.largest_row_sum(at_sites, density)
             check_stable(f"the largest {self.name}", float(np.max(k, initial=0.0)), dt, rate, self.settings)
+
+
+def solved_in_batch(solver: EllipticSolver, k: Any, b: Any, shift: Any = 0.0) -> Any:
+    """Return ``solver(k, b, shift)`` for arguments with any number of leading axes, which an EllipticSolver has one of.
+
+    Parameters
+    ----------
+    solver : EllipticSolver
+    k, shift : array
+        With the leading axes of b, or without.
+    b : array
+    """
+    k_shape = solver.D.domain.shape
+    shape = solver.D.codomain.shape
+    batch = np.shape(b)[: np.ndim(b) - len(shape)]
+    if len(batch) < 2:
+        return solver(k, b, shift)
+    if np.ndim(k) > len(k_shape):
+        k = anp.reshape(k, (-1, *k_shape))
+    if np.ndim(shift) > len(shape):
+        shift = anp.reshape(shift, (-1, *shape))
+    return anp.reshape(solver(k, anp.reshape(b, (-1, *shape)), shift), (*batch, *shape))

@@ -30,7 +30,7 @@ from sparsedp.flow.momentum import (
     WallSide,
     at_wall,
     conditions_along,
-    free_faces,
+    free_face_mask,
     gradient_around,
     wall_sides,
     wall_velocities,
@@ -78,7 +78,7 @@ class ViscousStress(DiffusionForm):
         grid = settings.grid
         grid.backend.check("a viscosity that varies in flow_step")
         gain = MomentumFluxes(grid, sides).gain
-        free = mask(grid.faces, free_faces(grid, sides, settings.solid))
+        free = mask(grid.faces, free_face_mask(grid, sides, settings.solid))
         self._grid = grid
         self._sites = gain.domain
         self._number = {pair: number for number, pair in enumerate(product(range(grid.dim), repeat=2))}

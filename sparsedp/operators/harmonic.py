@@ -39,8 +39,8 @@ def harmonic_average(grid: Grid) -> Callable:
     Returns
     -------
     callable
-        A function of k on cells, finite and >= 0 [unit]. It returns values on faces [unit]; a wall face has the value
-        of its cell.
+        A function of k on cells, finite and >= 0 [unit]; leading axes are a batch. It returns values on faces [unit]; a
+        wall face has the value of its cell.
 
     Raises
     ------
@@ -72,7 +72,8 @@ def harmonic_average(grid: Grid) -> Callable:
     def average(k):
         check_native("harmonic_average", k)
         values = as_field(sample(k))
-        check_on("harmonic_average", values, grid.cells)
+        if np.shape(values)[-grid.dim :] != grid.shape:  # leading axes are a batch
+            check_on("harmonic_average", values, grid.cells)
         check_kind("k of harmonic_average", values.dtype, "real numbers", "; write k.real")
         check_values(_check_coefficient, k)
         return pair(below(k), above(k))

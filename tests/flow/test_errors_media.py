@@ -52,33 +52,34 @@ REFUSED = [
     ),
     ({"dt": lambda p: -p}, ValueError, "dt of flow_step must be > 0, got -1"),
     (
-        {"viscosity": 0.1 * np.ones((4, 4)), "walls": np.zeros(40)},
+        {"viscosity": lambda rate, p: 0.1 + rate, "walls": np.zeros(40)},
         ValueError,
-        "flow_step takes walls= as a function where the viscosity varies; write walls=lambda params: values, "
-        "with values on face_lift(grid, boundary).domain",
-    ),
-    (
-        {"implicit": True, "scalars": {"c": {"diffusivity": lambda s, p: s["c"]}}},
-        ValueError,
-        "implicit diffusion of flow_step takes a diffusivity of 'c' that is a function of params alone, got one of the "
-        "scalars; write implicit=False",
+        "flow_step takes walls= as a function beside a viscosity that depends on the shear rate; write "
+        "walls=lambda params: values, with values on face_lift(grid, boundary).domain",
     ),
     (
         {"viscosity": lambda rate, p: rate, "scalars": {"c": {}}},
         TypeError,
-        "flow_step calls a function with 3 arguments, got one that takes 2; write viscosity=lambda shear_rate, s, "
-        "params: ...",
+        "flow_step calls viscosity with 1 or 3 arguments, got a function of (rate, p); write viscosity=lambda params: "
+        "... or viscosity=lambda shear_rate, s, params: ...",
     ),
     (
         {"viscosity": lambda rate, s, p: rate},
         TypeError,
-        "flow_step calls a function with 2 arguments, got one that takes 3; write viscosity=lambda shear_rate, "
-        "params: ...",
+        "flow_step calls viscosity with 1 or 2 arguments, got a function of (rate, s, p); write viscosity=lambda "
+        "params: ... or viscosity=lambda shear_rate, params: ...",
+    ),
+    (
+        {"viscosity": lambda rate, p=None: rate},
+        TypeError,
+        "flow_step calls viscosity with 1 or 2 arguments, got a function that accepts both; write viscosity=lambda "
+        "params: ... or viscosity=lambda shear_rate, params: ..., without default values",
     ),
     (
         {"density": lambda v, s, p: 1.0},
         TypeError,
-        "flow_step calls a function with 2 arguments, got one that takes 3; write density=lambda s, params: ...",
+        "flow_step calls density with 1 or 2 arguments, got a function of (v, s, p); write density=lambda params: ... "
+        "or density=lambda s, params: ...",
     ),
     (
         {"density": lambda s, p: 1.0},
@@ -88,7 +89,7 @@ REFUSED = [
     (
         {"dt": lambda s, p: 1.0},
         TypeError,
-        "flow_step calls a function with 1 arguments, got one that takes 2; write dt=lambda params: ...",
+        "flow_step calls dt with 1 argument, got a function of (s, p); write dt=lambda params: ...",
     ),
     (
         {"viscosity": np.full((4, 4), 2.0)},
@@ -138,6 +139,12 @@ PROJECTION = [
     (NEGATIVE, ValueError, "the density of projection must be > 0, got -1"),
     (1j, TypeError, "the density of projection must hold real numbers, got dtype complex128; write its .real"),
     (np.nan, dp.errors.NonFiniteError, "the density of projection must be finite, got nan; write a finite number"),
+    (
+        1e-320,
+        dp.errors.NonFiniteError,
+        "the density and its reciprocal must be finite in float64, got a density of 9.99989e-321; write the density in "
+        "other units",
+    ),
 ]
 
 

@@ -453,7 +453,7 @@ REFUSED = [
     Case(
         act=lambda: dp.flow_step(ROOM, 0.1, boundary=SIDES, walls=EVERYWHERE),
         error=ValueError,
-        match="walls of flow_step got an array in which the velocities of walls that meet at an inflow are summed; "
+        match="walls of flow_step got an array in which the velocities of walls that meet are summed; "
         r"write walls=lambda params: values, with values on face_lift\(grid, boundary\).domain",
     ),
     Case(

@@ -1,10 +1,13 @@
 """flow_step with a viscosity, diffusivity, density and step length that vary."""
 
+from functools import partial
+
 import autograd.numpy as anp
 import numpy as np
 import pytest
 
 import sparsedp as dp
+from sparsedp.flow.diffusion import wave_growth
 
 
 def channel(n):
@@ -265,6 +268,213 @@ def test_smagorinsky_at_rest():
     step = dp.flow_step(grid, 0.1, lambda rate, c: c * rate)
     gradient = dp.grad(lambda v: anp.sum(step(step.start(v, 0.1), 0.1)["v"] ** 2))(np.zeros(grid.faces.size))
     assert np.all(gradient == 0)
+
+
+def nothing_bound(rate, s, params, *, power=1.0):
+    return params * (1 + rate) ** power * s["c"]
+
+
+class Law:
+    """An object that is called, and a method that is."""
+
+    def __call__(self, rate, s, params):
+        return nothing_bound(rate, s, params)
+
+    def at(self, params):
+        return 2 * params
+
+
+@pytest.mark.parametrize(
+    ("law", "plain"),
+    [
+        (Law(), nothing_bound),
+        (Law().__call__, nothing_bound),
+        (partial(nothing_bound, power=2.0), lambda rate, s, p: p * (1 + rate) ** 2 * s["c"]),
+        (lambda rate, *rest: nothing_bound(rate, *rest), None),
+        (lambda rate, s, p=None: nothing_bound(rate, s, p), nothing_bound),
+        (lambda rate, s=None, p=None: nothing_bound(rate, s, p), None),
+        (dp.jit(lambda rate, s, p: nothing_bound(rate, s, p)), nothing_bound),
+        (Law().at, lambda p: 2 * p),
+        (lambda p, *, k=3.0: k * p, lambda p: 3 * p),
+        (lambda p, k=3.0: k * p, lambda p: 3 * p),
+        (partial(lambda k, p: k * p, 3.0), lambda p: 3 * p),
+        (lambda *params: 3 * params[0], None),
+        (lambda: 3.0, None),
+    ],
+)
+def test_functions_of_all_kinds(law, plain, rng):
+    """A viscosity with scalars is called with one argument or with three, whichever it accepts; both are refused."""
+    grid = dp.Grid((3, 3))
+    v = rng.standard_normal(grid.faces.size)
+    c = rng.uniform(0.5, 1.0, grid.shape)
+
+    def rate(viscosity):
+        step = dp.flow_step(grid, 1e-3, viscosity, scalars={"c": {}})
+        return step.start(v, 0.1, {"c": c})["a"]
+
+    if plain is None:
+        with pytest.raises(TypeError, match="^flow_step calls viscosity with 1 or 3 arguments, got a function "):
+            rate(law)
+    else:
+        np.testing.assert_array_equal(rate(law), rate(plain))
+
+
+@pytest.mark.parametrize("argument", ["density", "diffusivity", "dt"])
+def test_methods_as_other_arguments(argument, rng):
+    """Density and diffusivity take the params, or scalars and params; dt the params, with or without default values."""
+    grid = dp.Grid((3, 3))
+    c = rng.uniform(0.5, 1.0, grid.shape)
+
+    def end(**given):
+        scalars = {"c": {"diffusivity": given.pop("diffusivity", 0.0)}}
+        step = dp.flow_step(grid, **{"dt": 1e-3, **given}, viscosity=0.1, scalars=scalars)
+        state = step(step.start(np.arange(24.0), 0.01, {"c": c}), 0.01)
+        return np.concatenate([state["v"], state["s"]["c"].ravel()])
+
+    np.testing.assert_array_equal(end(**{argument: Law().at}), end(**{argument: lambda p: 2 * p}))
+    ambiguous = lambda p, q=2.0: q * p
+    if argument == "dt":
+        np.testing.assert_array_equal(end(dt=ambiguous), end(dt=lambda p: 2 * p))
+        return
+    method = partial(lambda q, s, p: q * p * s["c"], 2.0)
+    np.testing.assert_array_equal(end(**{argument: method}), end(**{argument: lambda s, p: 2 * p * s["c"]}))
+    with pytest.raises(TypeError, match=f"^flow_step calls {argument} with 1 or 2 arguments, got a function that acc"):
+        end(**{argument: ambiguous})
+
+
+def test_lifted_walls_beside_a_viscosity_for_each_cell(rng):
+    """The array of face_lift gives the step of the function that returns the velocities."""
+    grid = dp.Grid((4, 3), spacing=[rng.uniform(0.5, 1, 4), rng.uniform(0.5, 1, 3)])
+    lift = dp.face_lift(grid)
+    speeds = rng.standard_normal(lift.domain.size)
+    viscosity = rng.uniform(0.01, 0.02, grid.shape)
+    v = rng.standard_normal(grid.faces.size)
+    for implicit, medium in ((False, viscosity), (True, viscosity), (True, lambda p: 0.1)):
+        for density in (None, 2.0):
+            options = {"density": density, "implicit": implicit}
+            steps = [
+                dp.flow_step(grid, 0.01, medium, walls=walls, **options) for walls in (lift(speeds), lambda p: speeds)
+            ]
+            ends = [dp.rollout(step, step.start(v), None, 2)["v"] for step in steps]
+            np.testing.assert_allclose(ends[0], ends[1], rtol=1e-11, atol=1e-12)
+
+
+def test_implicit_diffusivity_of_a_scalar():
+    """Steady conduction for the diffusivity 1 + u, and order 2 in time; values at walls may be a list."""
+    grid = dp.Grid(16, size=1.0)
+    ends = {"x": dp.dirichlet}
+    heat = {"diffusivity": lambda s, p: 1 + p * s["u"], "boundary": ends, "values": [0.0, 1.0]}
+    x = grid.centres()[0]
+
+    def end(dt, time, start):
+        step = dp.flow_step(grid, dt, scalars={"u": heat}, implicit=True, convective=False)
+        return dp.rollout(step, step.start(np.zeros(17), 1.0, {"u": start}), 1.0, round(time / dt))["s"]["u"]
+
+    np.testing.assert_allclose(end(0.1, 3.0, x), np.sqrt(1 + 3 * x) - 1, atol=1e-3)
+    start = x + 0.5 * np.sin(np.pi * x)
+    coarse, middle, fine = (end(0.02 / n, 0.08, start) for n in (1, 2, 4))
+    assert np.max(np.abs(coarse - middle)) / np.max(np.abs(middle - fine)) > 3.5
+
+
+def batch(rng, lead, implicit):
+    """Return a run of flows with media of their own, their velocities and scalars."""
+    grid = dp.Grid((4, 3), spacing=0.5)
+    step = dp.flow_step(
+        grid,
+        0.01,
+        lambda rate, s, p: p * (1 + rate) * s["c"],
+        density=lambda s, p: 1 + s["c"],
+        scalars={"c": {"diffusivity": lambda s, p: p * s["c"]}},
+        implicit=implicit,
+    )
+    v = rng.standard_normal((*lead, grid.faces.size))
+    c = rng.uniform(0.5, 1, (*lead, *grid.shape))
+    return lambda v, c, p: step(step.start(v, p, {"c": c}), p), v, c
+
+
+@pytest.mark.parametrize("implicit", [False, True])
+@pytest.mark.parametrize("lead", [(2,), (2, 1, 2)])
+def test_a_batch_of_flows(lead, implicit, rng):
+    """Each entry has its own viscosity, density and diffusivity."""
+    run, v, c = batch(rng, lead, implicit)
+    end = run(v, c, 0.1)
+    for entry in np.ndindex(*lead):
+        alone = run(v[entry], c[entry], 0.1)
+        np.testing.assert_allclose(end["v"][entry], alone["v"], rtol=1e-8, atol=1e-9)
+        np.testing.assert_allclose(end["s"]["c"][entry], alone["s"]["c"], rtol=1e-10)
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("implicit", [False, True])
+@pytest.mark.parametrize("lead", [(2,), (2, 1, 2)])
+def test_derivatives_of_a_batch_of_flows(lead, implicit, rng):
+    run, v, c = batch(rng, lead, implicit)
+    loss = lambda x: anp.sum(run(x["v"], x["c"], x["p"])["v"] ** 3)
+    assert dp.check.gradient(loss, {"v": v, "c": c, "p": 0.1}, quick=True).verdict == "agrees"
+
+
+def test_a_batch_of_projections(rng):
+    """A batch of velocities, of densities, or of both, and their derivatives."""
+    grid = dp.Grid((2, 3), spacing=0.5)
+    project = dp.projection(grid)
+    v = rng.standard_normal((2, grid.faces.size))
+    weights = rng.standard_normal(v.shape)
+    for density in (rng.uniform(0.5, 2, (2, *grid.shape)), rng.uniform(0.5, 2, (2, grid.faces.size))):
+        of_all = project(v, density[0])
+        np.testing.assert_allclose(of_all, [project(one, density[0]) for one in v], rtol=1e-9, atol=1e-9)
+        of_pairs = project(v, density)
+        np.testing.assert_allclose(of_pairs, list(map(project, v, density)), rtol=1e-9, atol=1e-9)
+        of_densities = project(v[0], density)
+        np.testing.assert_allclose(of_densities, [project(v[0], rho) for rho in density], rtol=1e-9, atol=1e-9)
+        together = lambda x, v=v: anp.sum(weights * project(v, x) ** 2)
+        one_by_one = lambda x, v=v: sum(anp.sum(weights[i] * project(v[i], x[i]) ** 2) for i in range(2))
+        wanted = dp.grad(one_by_one)(density)
+        np.testing.assert_allclose(dp.grad(together)(density), wanted, rtol=1e-6, atol=1e-8)
+    deep = project(v[:, None] * np.ones((2, 2, 1)), density[0])
+    np.testing.assert_allclose(deep[1, 1], project(v[1], density[0]), rtol=1e-9, atol=1e-9)
+
+
+def test_limit_of_the_courant_number():
+    """Up to 0.5 steps are accepted, and waves grow by 2.7 %; above, without viscosity, they are refused."""
+    assert wave_growth(0.5, 0.0, False) == pytest.approx(1.0267, abs=1e-4)
+    grid = dp.Grid((4, 4), periodic=True)
+    wind = np.ones(grid.faces.size)
+    for dt in (0.25, 0.2501):
+        step = dp.flow_step(grid, dt)
+        if dt == 0.25:
+            np.testing.assert_allclose(step(step.start(wind))["v"], 1.0)
+        else:
+            with pytest.raises(dp.errors.UnstableStepError, match="dt = 0.25 is safe"):
+                step(step.start(wind))
+
+
+@pytest.mark.parametrize("number", [float, np.float64, np.asarray])
+def test_functions_that_return_double_precision(number):
+    """A flow in single precision stays so, forward and in its derivative."""
+    grid = dp.Grid((3, 3))
+    ones = np.ones(grid.faces.size)
+    state = lambda step, p: step.start(ones.astype(np.float32), p, {"c": np.ones(grid.shape, np.float32)})
+    scalars = {"c": {"diffusivity": lambda p: number(0.1), "source": lambda s, p: np.ones(grid.shape)}}
+    media = {"viscosity": lambda p: number(0.1), "density": lambda p: number(2.0), "scalars": scalars}
+    media |= {"dt": lambda p: number(0.1), "force": lambda v, s, p: ones}
+    for more in ({"implicit": True}, {"friction": ones}, {"friction": lambda p: ones}):
+        step = dp.flow_step(grid, **media, **more)
+        end = step(step(state(step, None)))
+        assert {leaf.dtype for leaf in (end["v"], end["p"], end["a"], end["dt"], *end["s"].values())} == {
+            np.dtype(np.float32)
+        }
+    step = dp.flow_step(grid, lambda p: p, lambda p: p, scalars={"c": {}})
+    energy = lambda p: anp.sum(step(state(step, p), p)["v"] ** 2)
+    value, _ = dp.value_and_grad(energy)(0.1)
+    assert value == energy(np.asarray(0.1))
+
+
+def test_a_step_at_the_limit_in_single_precision():
+    """A step length at the limit may be rounded up."""
+    grid = dp.Grid((4, 4))
+    for dt in np.linspace(0.3, 0.7, 9):
+        step = dp.flow_step(grid, lambda p, dt=dt: dt, 0.125 / dt)
+        step.start(np.zeros(grid.faces.size, np.float32))
 
 
 @pytest.mark.whole

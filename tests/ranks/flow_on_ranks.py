@@ -226,7 +226,7 @@ def moving_walls():
     meeting = {"z": (dp.inflow, dp.outflow)}
     lift = dp.face_lift(grid, meeting)
     lifted = lift(dp.identity(lift.domain)(np.ones(lift.domain.size)))
-    words = "the velocities of walls that meet at an inflow are summed"
+    words = "the velocities of walls that meet are summed"
     refused(ValueError, words, lambda: dp.flow_step(grid, 0.02, 0.01, boundary=meeting, walls=lifted))
 
 
