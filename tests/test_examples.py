@@ -31,10 +31,10 @@ def test_heat_rod():
 
 @example("conservation_laws.py")
 def test_conservation_laws():
-    """With 100 cells: shocks where they belong, water conserved, the pressure found again."""
+    """With 64 cells: shocks where they belong, water conserved, the pressure found again."""
     printed = run("conservation_laws.py")
     tube, dam = map(float, re.findall(r"mean error of the d\w+ (\S+?),? ?(?:water|$)", printed, re.MULTILINE))
-    assert tube < 0.008 and dam < 0.005
+    assert tube < 0.8 / 64 and dam < 0.5 / 64
     assert float(re.search(r"water lost (\S+)", printed)[1]) < 1e-14
     assert abs(float(re.search(r"on the left: (\S+)", printed)[1]) - 1) < 1e-4
 

@@ -19,6 +19,7 @@ from sources import (
     jitted,
     modules,
     names,
+    trees_of_tests,
     within,
 )
 
@@ -417,14 +418,15 @@ def test_every_module_imports(name):
         pytest.skip(f"{cause.name} is not installed")
 
 
+@pytest.mark.xdist_group("sources")
 def test_the_tests_import_what_is_there():
     """A file of tests whose import fails is skipped without an error (--doctest-ignore-import-errors)."""
     wrong = []
     without_ranks = importlib.util.find_spec("mpi4py") is None
-    for path in sorted((ROOT / "tests").rglob("*.py")):
+    for path, tree in trees_of_tests():
         if without_ranks and path.parent.name == "ranks":
             continue
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        for node in tree.body:
             if isinstance(node, ast.Import):
                 wrong += [f"{path.name}: no module {one.name}" for one in node.names if not can_be_found(one.name)]
             if not isinstance(node, ast.ImportFrom):

@@ -8,7 +8,10 @@ import ast
 import re
 from functools import cache
 
-from sources import FUNCTION, ROOT, called, modules
+import pytest
+from sources import FUNCTION, called, modules, trees_of_tests, walked
+
+pytestmark = pytest.mark.xdist_group("sources")  # of the tests that parse all files
 
 HOLE = "\0"  # stands for what is put in at run time
 LEAST = 8  # letters that a message must have written out
@@ -46,14 +49,15 @@ def join(parts):
     return texts
 
 
+@cache
 def assigned(tree):
     """Return the expressions that each name stands for: strings given to variables, results of functions."""
     scope = {}
-    for node in ast.walk(tree):
+    for node in walked(tree):
         if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
             scope.setdefault(node.targets[0].id, []).append(node.value)
         elif isinstance(node, FUNCTION):
-            returned = [n.value for n in ast.walk(node) if isinstance(n, ast.Return) and n.value is not None]
+            returned = [n.value for n in walked(node) if isinstance(n, ast.Return) and n.value is not None]
             scope.setdefault(node.name, []).extend(returned)
     return scope
 
@@ -66,8 +70,8 @@ def makes_error(call):
 def errors_in(tree):
     """Pairs (line, text) of every error that is made, raised on the spot or not."""
     outer = assigned(tree)
-    owners = {id(n): f for f in ast.walk(tree) if isinstance(f, FUNCTION) for n in ast.walk(f)}  # the innermost wins
-    for node in ast.walk(tree):
+    owners = {id(n): f for f in walked(tree) if isinstance(f, FUNCTION) for n in walked(f)}  # the innermost wins
+    for node in walked(tree):
         if isinstance(node, ast.Call) and makes_error(node):
             scope = {**outer, **assigned(owners[id(node)])} if id(node) in owners else outer
             for text in sentences(node.args[0], scope):
@@ -90,11 +94,11 @@ def plain(text):
 def expected():
     """Every expected message the tests state."""
     found = set()
-    for path in sorted((ROOT / "tests").rglob("*.py")):
-        tree = ast.parse(path.read_text(encoding="utf-8"))
+    for path, tree in trees_of_tests():
+        nodes = [*ast.walk(tree)]
         if path.name.startswith("test_errors"):
-            found |= {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant) and isinstance(n.value, str)}
-        keywords = [n for n in ast.walk(tree) if isinstance(n, ast.keyword) and n.arg == "match"]
+            found |= {n.value for n in nodes if isinstance(n, ast.Constant) and isinstance(n.value, str)}
+        keywords = [n for n in nodes if isinstance(n, ast.keyword) and n.arg == "match"]
         found |= {
             n.value.value for n in keywords if isinstance(n.value, ast.Constant) and isinstance(n.value.value, str)
         }

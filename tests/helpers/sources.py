@@ -56,6 +56,13 @@ def modules():
 
 
 @cache
+def trees_of_tests():
+    """Pairs (path, syntax tree) of all files of the tests, in the order of their paths."""
+    paths = sorted((ROOT / "tests").rglob("*.py"))
+    return tuple((path, ast.parse(path.read_text(encoding="utf-8"))) for path in paths)
+
+
+@cache
 def names():
     """Dotted names of all modules and folders of modules."""
     return {module.name for module in modules()} | {module.package for module in modules()}

@@ -85,7 +85,8 @@ def test_a_jump_that_moves():
     assert all(isinstance(error, float) for error in judge("van der Pol, 20", [1e-3]))
 
 
-@pytest.mark.parametrize("name, most", [("Robertson", 2e-6), pytest.param("HIRES", 1e-2, marks=pytest.mark.whole)])
+@pytest.mark.whole
+@pytest.mark.parametrize("name, most", [("Robertson", 2e-6), ("HIRES", 1e-2)])
 def test_values_fall_with_the_tolerance(name, most):
     """Newton's method took errors of 1e-5 in species of 5e-5 for rounding, and they added up."""
     rate, _, start, params, end, _ = SCENES[name]

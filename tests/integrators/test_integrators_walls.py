@@ -52,7 +52,7 @@ def errors(method, reaction, n):
     return np.sqrt(np.mean((end(params) - exact(X, 1.0, params[1])) ** 2)), np.hypot(of_nu, of_w - wanted)
 
 
-CHEAP = {("backward_euler", 1.0), ("crank_nicolson", 0.0), ("tr_bdf2", 0.0), ("imex", 1.0), ("etdrk4", 0.0)}
+CHEAP = {("backward_euler", 0.0), ("crank_nicolson", 0.0), ("tr_bdf2", 0.0), ("imex", 1.0), ("etdrk4", 0.0)}
 WALLS = list(product(ORDERS, (0.0, 1.0)))  # with a reaction, steps of many methods are Newton's
 
 

@@ -48,9 +48,12 @@ def random_field(rng, space, dtype):
 def test_transpose_and_twin_in_every_dtype(made, drawn, rng):
     """Dot test and explicit against matrix-free, in the scaling of the gates: both at most 10."""
     worst = 0.0  # in double precision
-    seeds = 5 if drawn is list else 1
-    kinds = [np.float64] * seeds + [np.float32, np.complex128, np.complex64]
-    for op, explicit, free in some(made, *SHAPES):
+    others = [np.float32, np.complex128, np.complex64]
+    for number, (op, explicit, free) in enumerate(some(made, *SHAPES)):
+        if drawn is list:
+            kinds = [np.float64] * 5 + others
+        else:
+            kinds = [np.float64, others[number % 3]]
         matrix = explicit.matrix
         assert matrix.indices.dtype == matrix.indptr.dtype == np.int32
         sizes = abs(matrix)

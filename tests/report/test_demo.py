@@ -37,9 +37,7 @@ def demo(folder, *arguments, way=("-m", "sparsedp"), **variables):
 # ---- a run ---------------------------------------------------------------------------------------------------------
 
 
-FEWER = (
-    "import sys; from sparsedp.report.demo import story; story.ITERATIONS = 10; from sparsedp.__main__ import main; "
-)
+FEWER = "import sys; from sparsedp.report.demo import story; story.ITERATIONS = 4; from sparsedp.__main__ import main; "
 
 
 @pytest.fixture(scope="module", params=["short", pytest.param("whole", marks=pytest.mark.whole)])
