@@ -283,17 +283,32 @@ def _transposed(matrix: csr_array | None) -> csr_array | None:
     return csr_array(matrix.T.tocsr())
 
 
-def ruge_stueben(matrix: csr_array, strength: float, levels: int) -> list[Level]:
+def ruge_stueben(matrix: csr_array, strength: float, levels: int, second_pass: bool = True) -> list[Level]:
     """Return the levels that PyAMG builds.
 
     The result is reproducible, because the coarse-fine splitting that is used here draws no random numbers.
+
+    Parameters
+    ----------
+    matrix : csr_array
+    strength : float
+        Couplings above this share of the largest one of a row are strong.
+    levels : int
+        The largest number of levels.
+    second_pass : bool
+        Whether strongly coupled fine unknowns get a common coarse one. Needed for convergence if coefficients jump
+        randomly; for smooth coefficients in 3-D the levels hold half as many entries without it.
+
+    Returns
+    -------
+    list of Levels
     """
     from pyamg import ruge_stuben_solver
 
     solver = ruge_stuben_solver(
         csr_matrix(matrix),  # PyAMG requires csr_matrix and does not accept csr_array
         strength=("classical", {"theta": strength}),
-        CF=("RS", {"second_pass": True}),  # needed for convergence if coefficients jump randomly
+        CF=("RS", {"second_pass": second_pass}),
         max_levels=levels,
         max_coarse=COARSEST,
     )

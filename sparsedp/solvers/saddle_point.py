@@ -413,7 +413,7 @@ def _block(system, own, places):
     if upwinding is not None:
         convection = upwinding.diagonal() / scale
         scaled = sp.csr_array(scaled + upwinding)
-    levels = ruge_stueben(scaled, STRENGTH, LEVELS)
+    levels = ruge_stueben(scaled, STRENGTH, LEVELS, second_pass=False)
     coarsest = levels[-1].A.shape[0]
     if coarsest > DENSE_UP_TO:
         raise ConvergenceError(
