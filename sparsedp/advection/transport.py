@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from sparsedp._utils.base_classes import Frozen, Reconstructible
 from sparsedp._utils.calls import public
 from sparsedp._utils.validation import check_choice
 from sparsedp.advection.arguments import check_step, flatten_array
+from sparsedp.advection.cut_transport import CutTransport
 from sparsedp.advection.eulerian import Eulerian
 from sparsedp.advection.maccormack import MacCormack
 from sparsedp.advection.method import Identity, TransportMethod
@@ -30,7 +31,7 @@ from sparsedp.grid.boundary_conditions import (
 )
 from sparsedp.grid.grid import check_grid
 from sparsedp.kernels.fluxes import SCHEMES
-from sparsedp.operators.masks_and_lift import check_solid, refuse_body
+from sparsedp.operators.masks_and_lift import Body, check_solid
 from sparsedp.operators.operator import Operator
 from sparsedp.operators.structure.base import Matrix
 
@@ -58,6 +59,30 @@ CHOICES = {  # the accepted values of the options; the first one is the default
 }
 
 
+@overload
+def transport(
+    grid: Grid,
+    scheme: str = ...,
+    boundary: Any = ...,
+    velocity: str = ...,
+    of: str = ...,
+    interpolation: str = ...,
+    form: str | None = ...,
+    backtrace: str = ...,
+    clamp: bool = ...,
+    solid: ArrayLike | None = ...,
+    unstable: str = ...,
+) -> Transport: ...
+@overload
+def transport(
+    grid: Grid,
+    scheme: str = ...,
+    boundary: Any = ...,
+    *,
+    form: str | None = ...,
+    solid: Body,
+    unstable: str = ...,
+) -> CutTransport: ...
 def transport(
     grid: Grid,
     scheme: str = "upwind",
@@ -68,9 +93,9 @@ def transport(
     form: str | None = None,
     backtrace: str = "euler",
     clamp: bool = True,
-    solid: ArrayLike | None = None,
+    solid: ArrayLike | Body | None = None,
     unstable: str = "raise",
-) -> Transport:
+) -> Transport | CutTransport:
     """Return one time step of transport, ``move(u, v, dt, inflow=0.0)``, differentiable in all four arguments.
 
     Parameters
@@ -117,9 +142,11 @@ def transport(
     clamp : bool
         For maccormack: whether to clamp the result to the least and greatest value of u at the corners of the cell
         around the departure point, so that there are no new extrema.
-    solid : bool array, shape grid.shape, optional
+    solid : bool array, shape grid.shape, or body of `cut_cells`, optional
         Solid cells. There is no flux through their faces, and their values do not change. semi_lagrangian and
         maccormack, when they interpolate u, replace the value of a solid cell by the mean of its fluid neighbours.
+        Around a body of `cut_cells` upwind and van_leer in flux form are steps with its `advection`; cells of less
+        than half a cell count as half cells in the CFL number.
     unstable : "raise" or "allow"
         For upwind and van_leer: whether to raise UnstableStepError if the CFL number exceeds the limit of the scheme.
 
@@ -181,7 +208,6 @@ def transport(
     array([0.  , 0.75, 0.25, 0.  ])
     """
     check_grid("transport", grid)
-    refuse_body("transport", solid, "u + dt * body.advection(u, v)")
     check_choice("scheme= of transport", scheme, METHODS)
     options = METHODS[scheme].options
     choices = dict(
@@ -203,6 +229,9 @@ def transport(
             form = "flux"
         else:
             form = "advective"
+    body = None
+    if isinstance(solid, Body):
+        body, solid = solid, None
     settings = TransportSettings(
         grid=grid,
         scheme=scheme,
@@ -216,7 +245,28 @@ def transport(
         solid=None if solid is None else check_solid(grid, solid).copy(),
         unstable=unstable,
     )
+    if body is not None:
+        _check_body(settings, body)
+        return CutTransport(settings, body)
     return Transport(settings)
+
+
+def _check_body(settings, body):
+    """Raise ValueError for options that transport around a body of cut_cells does not have."""
+    if settings.grid != body.grid:
+        raise ValueError(f"transport takes a body of cut_cells on its grid {settings.grid}, got one on {body.grid}")
+    form = settings.scheme, settings.velocity, settings.of, settings.form
+    if form not in (("upwind", "faces", "cells", "flux"), ("van_leer", "faces", "cells", "flux")):
+        raise ValueError(
+            "transport around a body of cut_cells takes upwind or van_leer in flux form, of cells with a velocity on "
+            f"faces, got scheme={settings.scheme!r}, form={settings.form!r}, of={settings.of!r}, "
+            f"velocity={settings.velocity!r}"
+        )
+    if any(isinstance(wall, MixedWall) for _, _, wall in walls_of(settings.sides)):
+        raise ValueError(
+            "transport around a body of cut_cells takes one condition for each wall, got a patch; write "
+            "u + dt * body.advection(u, v, inflow) with inflow on faces"
+        )
 
 
 def _sides(grid: Grid, boundary: Any) -> tuple:

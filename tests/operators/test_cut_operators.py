@@ -114,6 +114,81 @@ def test_leading_axes_are_a_batch(rng):
     assert np.isclose(np.sum(slope * rate[0]), (ends[0] - ends[1]) / (2 * h), rtol=1e-8)
 
 
+# ------------------------------------------------------------ advection of order 2
+
+
+def rotating_cylinder(n):
+    """A body, the velocity of a rotating fluid in a cylinder, and the ink in it after an angle."""
+    grid = dp.Grid((n, n), size=2.0, origin=-1.0)
+    body = dp.cut_cells(grid, lambda x, y: 0.81 - np.hypot(x - 0.013, y + 0.021))
+    nodes = np.meshgrid(grid.coordinates(0, "nodes"), grid.coordinates(1, "nodes"), indexing="ij")
+    stream = np.maximum(0.81**2 - (nodes[0] - 0.013) ** 2 - (nodes[1] + 0.021) ** 2, 0.0) / 2
+    v = dp.curl(grid)(stream) / np.where(body.apertures > 0, body.apertures, 1.0)
+    x, y = grid.centres()
+
+    def ink(angle):
+        along_x, along_y = 0.013 + 0.55 * np.cos(angle), -0.021 + 0.55 * np.sin(angle)
+        return body.is_fluid * np.exp(-((x - along_x) ** 2 + (y - along_y) ** 2) / 0.04)
+
+    return body, v, ink
+
+
+@pytest.mark.whole
+def test_advection_of_order_2_along_a_curved_wall():
+    errors = []
+    for n in (24, 48):
+        body, v, ink = rotating_cylinder(n)
+        dt = 0.5 / n
+        u = ink(0.0)
+        content = np.sum(body.volumes * u)
+        for _ in range(2 * n):
+            middle = u + dt * body.advection(u, v, order=2)
+            u = 0.5 * (u + middle + dt * body.advection(middle, v, order=2))
+        assert np.isclose(np.sum(body.volumes * u), content, rtol=1e-13)
+        assert -0.01 < np.min(u) and np.max(u) < 1.0
+        errors.append(np.sum(body.volumes * abs(u - ink(1.0))))
+    assert np.log2(errors[0] / errors[1]) > 1.6
+
+
+def test_advection_of_order_2_is_exact_for_linear_fields(rng):
+    grid = dp.Grid((9, 8), spacing=[np.linspace(0.1, 0.2, 9), 0.15])
+    everywhere = dp.cut_cells(grid, np.ones(grid.nodes.shape))
+    x, y = grid.centres()
+    at_walls = grid.join(*(1.0 + 2.0 * x + 3.0 * y for x, y in map(grid.face_centres, (0, 1))))
+    rate = everywhere.advection(1.0 + 2.0 * x + 3.0 * y, grid.join(0.7, -0.4), at_walls, order=2)
+    assert np.allclose(rate[:-1, 1:], -(0.7 * 2.0 - 0.4 * 3.0), rtol=1e-12)  # without the walls where the fluid leaves
+    uniform = dp.Grid((9, 8), size=(1.1, 0.9))
+    body = dp.cut_cells(uniform, lambda x, y: 1.37 - x - y)
+    x, y = uniform.centres()
+    v = uniform.join(0.7, -0.7)  # along the wall
+    at_walls = uniform.join(*(1.0 + 2.0 * x + 3.0 * y for x, y in map(uniform.face_centres, (0, 1))))
+    rate = body.advection(1.0 + 2.0 * x + 3.0 * y, v, at_walls, order=2)
+    far = (x + y < 1.0) & (x > 0.2) & (y > 0.2)
+    assert np.count_nonzero(far) >= 10 and np.allclose(rate[far], 0.7, rtol=1e-12)
+    batch = body.advection(rng.standard_normal((2, 9, 8)), np.stack([v, -v]), order=2)
+    assert batch.shape == (2, 9, 8)
+    ones = 1.0 * body.is_fluid
+    assert np.allclose(body.advection(ones, body.project(v), 1.0, order=2), 0.0, atol=1e-9)  # constants are kept
+
+
+def test_derivatives_of_advection_of_order_2(rng):
+    body, v, ink = rotating_cylinder(8)
+    weights, tangent = rng.standard_normal((2, 8, 8))
+    of_v = rng.standard_normal(v.size)
+
+    def loss(q):
+        return np.sum(weights * body.advection(ink(0.3) + q * tangent, v + q * of_v, q, order=2) ** 2)
+
+    other = ink(1.1)[::-1]
+    rate = dp.jit(lambda u, v: body.advection(u, v, order=2))
+    assert np.array_equal(rate(ink(0.3), v), body.advection(ink(0.3), v, order=2))
+    assert np.array_equal(rate(other, -v), body.advection(other, -v, order=2))  # decisions are made anew
+    h = 1e-6
+    slope = dp.grad(loss)(0.2)
+    assert np.isclose(slope, (loss(0.2 + h) - loss(0.2 - h)) / (2 * h), rtol=1e-6)
+    assert np.isclose(dp.jvp(loss, 0.2, 1.0)[1], slope, rtol=1e-10)
+
+
 # ------------------------------------------------------------ arguments
 
 
@@ -165,6 +240,16 @@ def test_refused_arguments(body):
         body.gradient(np.nan * u)
     with pytest.raises(TypeError, match="^v of cut_cells must hold real numbers, got dtype complex128; write v.real$"):
         body.advection(u, 1j * k)
+    with pytest.raises(ValueError, match="order= of advection must be one of 1, 2, got 3"):
+        body.advection(u, k, order=3)
+    with pytest.raises(
+        TypeError, match="^u of cut_cells must hold real numbers, got dtype complex128; write u.real and u.imag$"
+    ):
+        body.advection(1j * u, k, order=2)
+    with pytest.raises(
+        TypeError, match="^u of cut_cells must be float32, float64, complex64 or complex128, got float16"
+    ):
+        body.gradient(u.astype(np.float16))
     with pytest.raises(TypeError, match="u of cut_cells must hold numbers"):
         body.slopes(np.full(GRID.shape, "a"))
     with pytest.raises(

@@ -222,10 +222,6 @@ def test_functions_without_a_body_name_its_method():
         r"body.gradient\(u\), or dp.laplacian\(grid, solid=body\)$",
     ):
         dp.gradient(GRID, solid=body)
-    with pytest.raises(
-        TypeError, match=r"^transport takes a boolean array as solid.*; write u \+ dt \* body.advection"
-    ):
-        dp.transport(GRID, solid=body)
     with pytest.raises(TypeError, match=r"^projection takes a boolean array as solid.*; write body.project\(v\)$"):
         dp.projection(GRID, solid=body)
     with pytest.raises(
@@ -414,6 +410,24 @@ def test_components_have_a_constant_each(rng):
     sums = strip.volumes * u
     assert np.allclose([np.sum(sums[:, :4], (1, 2)), np.sum(sums[:, 4:], (1, 2))], 0.0, atol=1e-14)
     assert np.allclose(u[0], strip.solve(b[0]) + 1j * strip.solve(b[1]), atol=1e-12)
+
+
+def test_coefficients_of_0_divide_the_fluid_into_components(rng):
+    """Which cells are connected depends on k, also in programs of jit that are recorded with another k."""
+    body = dp.cut_cells(GRID, lambda x, y: hypot(x - 0.5, y - 0.45) - 0.13, nullspace="project")
+    b = rng.standard_normal(GRID.shape)
+    kx, ky = (np.array(part) for part in GRID.faces.split(np.ones(GRID.faces.size)))
+    kx[2] = 0.0
+    divided = GRID.join(kx, ky)
+    u = body.solve(b, k=divided)
+    assert np.allclose([np.sum((body.volumes * u)[:2]), np.sum((body.volumes * u)[2:])], 0.0, atol=1e-14)
+    program = dp.jit(lambda k: body.solve(b, k=k))
+    assert np.array_equal(program(np.ones(GRID.faces.size)), body.solve(b))
+    assert np.array_equal(program(divided), u)
+    gradient = dp.jit(dp.grad(lambda b, k: np.sum(body.solve(b, k=k) ** 3)))
+    plain = dp.grad(lambda b: np.sum(body.solve(b, k=divided) ** 3))(b)
+    assert gradient(b, np.ones(GRID.faces.size)).shape == b.shape
+    assert np.allclose(gradient(b, divided), plain, rtol=1e-12)
 
 
 def test_derivatives_of_the_free_constant(rng):
