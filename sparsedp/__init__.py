@@ -44,6 +44,7 @@ _PUBLIC_NAMES = {
     "flow.free_faces": "free_faces",
     "flow.obstacles": "brinkman forces",
     "flow.pressure_projection": "projection",
+    "flow.cut_flow": "cut_flow",
     "flow.flow_step": "flow_step",
     "integrators.stepper": "stepper",
     "integrators.leapfrog": "matched_layer sponge",

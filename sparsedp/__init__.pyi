@@ -13,6 +13,7 @@ from .autodiff.derivative import vjp as vjp
 from .autodiff.flattening import flatten as flatten
 from .autodiff.jit import jit as jit
 from .autodiff.tape import differentiable as differentiable
+from .flow.cut_flow import cut_flow as cut_flow
 from .flow.finite_volumes import conservation_law as conservation_law
 from .flow.flow_step import flow_step as flow_step
 from .flow.free_faces import free_faces as free_faces

@@ -196,8 +196,8 @@ def flow_step(
 
     See Also
     --------
-    transport, projection, convection, face_laplacian, face_lift, brinkman, no_slip, free_slip, inflow, outflow,
-    rollout
+    transport, projection, convection, face_laplacian, face_lift, brinkman, cut_flow, no_slip, free_slip, inflow,
+    outflow, rollout
 
     Notes
     -----

@@ -345,6 +345,11 @@ class MomentumFluxes:
         check_walls("convection", walls, self._walls)
         return self._carried(v) + self._wall_carried(walls)
 
+    @property
+    def matrices(self) -> tuple:
+        """The matrices of `carried` and `carrier`, without walls."""
+        return self._carried.matrix, self._carrier.matrix
+
     def carrier(self, w: Any, walls: Any = None) -> Any:
         """Return the convecting velocity w, averaged to the same sides."""
         if walls is None:

@@ -117,7 +117,7 @@ def forces(
 
     See Also
     --------
-    brinkman
+    brinkman, cut_flow
 
     Notes
     -----
@@ -166,7 +166,7 @@ def brinkman(grid: Grid) -> Callable[[Any], Any]:
 
     See Also
     --------
-    cut_cells, flow_step, forces
+    cut_cells, cut_flow, flow_step, forces
 
     Notes
     -----

@@ -25,6 +25,7 @@ import numpy as np
 
 from sparsedp.autodiff.tape import sample
 from sparsedp.operators.cut_geometry import sum_at_places
+from sparsedp.operators.small_systems import solve_definite
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -173,7 +174,7 @@ def _fitted_slopes(geometry, pairs, widths):
         row[i] = row[i] + (SLOPE_DAMPING if i < len(widths) else CURVATURE_DAMPING) * total
         matrix.append(row)
     outward: list = [-geometry.normals[a] / widths[a] for a in axes]
-    solution = _solved(matrix, outward + [0.0] * (len(basis) - len(outward)))
+    solution = solve_definite(matrix, outward + [0.0] * (len(basis) - len(outward)))
     coefficients = weights * reduce(add, [z[walls] * term for z, term in zip(solution, basis, strict=True)])
     return coefficients, gather(weights * ahead**2)
 
@@ -188,29 +189,3 @@ def _thickness(grid, geometry, pairs):
     has_area = np.asarray(sample(area)) > 0
     volume = gather(kernel * (geometry.fractions * grid.volumes.reshape(-1))[cells])
     return anp.where(has_area, volume, np.max(grid.size, initial=0.0)) / anp.where(has_area, area, 1.0)
-
-
-def _solved(matrix, right):
-    """Return the solution of symmetric positive definite systems with arrays as entries, by an LDL^T factorization.
-
-    Parameters
-    ----------
-    matrix : list of lists
-        The lower triangle.
-    right : list
-    """
-    size = len(right)
-    lower: list[list] = []
-    pivots: list = []
-    x: list = []
-    for i in range(size):
-        row: list = []
-        for j in range(i):
-            products = [row[p] * lower[j][p] * pivots[p] for p in range(j)]
-            row.append(reduce(lambda value, term: value - term, products, matrix[i][j]) / pivots[j])
-        pivots.append(reduce(lambda value, p: value - row[p] ** 2 * pivots[p], range(i), matrix[i][i]))
-        x.append(reduce(lambda value, p: value - row[p] * x[p], range(i), right[i]))
-        lower.append(row)
-    for i in reversed(range(size)):
-        x[i] = reduce(lambda value, p: value - lower[p][i] * x[p], range(i + 1, size), x[i] / pivots[i])
-    return x

@@ -87,7 +87,7 @@ def cut_cells(
 
     See Also
     --------
-    laplacian, elliptic_solver, brinkman
+    laplacian, elliptic_solver, brinkman, cut_flow
 
     Notes
     -----

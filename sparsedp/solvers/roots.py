@@ -114,7 +114,7 @@ def implicit(
 
     See Also
     --------
-    inverse, steady, continuation, differentiable, stepper
+    inverse, steady, continuation, differentiable, stepper, cut_flow
 
     Notes
     -----

@@ -113,6 +113,11 @@ BUILDERS = {
         lambda level, b: dp.cut_cells(GRID, level, b, dp.dirichlet),
         lambda body: body.solve(CELLS),
     ),
+    "cut_flow": (
+        (np.add.outer(np.arange(-1.3, 3.0), np.arange(4.0)), walls("flow")),
+        lambda level, b: dp.cut_flow(GRID, level, b),
+        lambda flow: leaves(flow.residual({"v": K, "p": CELLS}, 0.1, K)),
+    ),
     "implicit": ((sp.csr_array(np.eye(12)),), lambda s: dp.implicit(cubic, sparsity=s), lambda f: f(CELLS, CELLS)),
     "ensemble": (
         ([CELLS.copy(), 2 * CELLS], np.array([1.0, 2.0])),

@@ -28,7 +28,7 @@ continuation free_faces
 gradient harmonic_average hvp identity inflow interior jit jvp laplace laplacian lift mask matrix_exponential
 matched_layer matrix_function matrix_power minimize neumann no_slip Operator outflow
 patch physical_gradient plot projection prolong report restrict robin sample set_threads smoothness stress
-brinkman cut_cells distribute equal flatten gather interop total_variation update_direction upwind v_curve
+brinkman cut_cells cut_flow distribute equal flatten gather interop total_variation update_direction upwind v_curve
 value_and_grad vjp work_precision eigenpairs from_image load save testing
 """.split()
 
