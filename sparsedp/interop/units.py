@@ -13,6 +13,7 @@ P. W. Bridgman, Dimensional Analysis (1922), chapter 2.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -128,10 +129,13 @@ class DimensionCheck:
     ----------
     runs : list of ScaledRun
     rtol : float
+    gaps : list of str
+        What the runs do not show, such as an argument of 0, which is the same in all units.
     """
 
     runs: list[ScaledRun]
     rtol: float
+    gaps: list[str]
 
     @property
     def passed(self) -> bool:
@@ -140,10 +144,10 @@ class DimensionCheck:
 
     @property
     def verdict(self) -> str:
-        """Return "homogeneous", "not homogeneous", or "inconclusive" for a result that is 0 everywhere."""
+        """Return "homogeneous", "not homogeneous", or "inconclusive" if there are gaps."""
         if any(self._differs(run) for run in self.runs):
             return "not homogeneous"
-        if self.runs and not any(np.isfinite(run.found) for run in self.runs):
+        if self.gaps:
             return "inconclusive"
         return "homogeneous"
 
@@ -162,6 +166,7 @@ class DimensionCheck:
                 f"a number inside the scene has the dimension {', '.join(wrong)}, or a unit is declared wrongly: make "
                 "the number an argument with a unit"
             )
+        lines += self.gaps
         return "\n".join(lines)
 
 
@@ -212,6 +217,8 @@ class SceneWithUnits(Reconstructible):
             Like the argument, in the unit of the result divided by the unit declared for the argument.
         """
         argnum = check_whole("argnum", argnum, 0, f"; write the number of an argument of {self.name}")
+        if argnum >= len(self.arguments):
+            raise ValueError(f"argnum of {self.name} must be below {len(self.arguments)}, got {argnum}; 0 is the first")
         if not isinstance(self.result, str):
             raise DerivativeError(f"{self.name} needs one number with one unit as its result, to have a gradient")
         magnitudes = self._magnitudes(args)
@@ -235,6 +242,12 @@ class SceneWithUnits(Reconstructible):
         -------
         DimensionCheck
             ``print(report)`` shows a row for each dimension; `report.passed` says whether all agree.
+
+        Notes
+        -----
+        Floating-point results declared as None must be the same in all systems, like those declared as "". The check
+        is inconclusive if no unit has a dimension, and if an argument with a dimension, or a result, is 0 everywhere:
+        0 is 0 in every unit. Give other values, and leave out results that are always 0.
         """
         rtol = check_number("rtol", rtol, "between 0 and 1", "; the default is 1e-6")
         magnitudes = self._magnitudes(args)
@@ -244,6 +257,9 @@ class SceneWithUnits(Reconstructible):
             if is_variable(leaf):
                 check_finite(f"{place} of {self.name}", leaf)
         dimensions = sorted({dimension for unit in self._units.values() for dimension in unit.exponents})
+        gaps = self._gaps(args, magnitudes, value)
+        if not dimensions:
+            gaps.append("no argument and no result has a unit with a dimension: there is nothing to compare")
         runs: list[ScaledRun] = []
         for dimension in dimensions:
             scaled = [self._scaled(arg, number, dimension) for number, arg in enumerate(magnitudes)]
@@ -254,9 +270,23 @@ class SceneWithUnits(Reconstructible):
                 runs.append(ScaledRun(dimension, "result", np.nan, np.nan, np.inf, f"{type(error).__name__}: {error}"))
                 continue
             for place, name, one, other in zip(places, names, leaves(value), others, strict=True):
-                if name is not None:
+                if name is not None or is_variable(one):
                     runs.append(_compared(dimension, place, self._exponent(name, dimension), one, other))
-        return DimensionCheck(runs, rtol)
+        return DimensionCheck(runs, rtol, gaps)
+
+    def _gaps(self, args: tuple, magnitudes: list, value: Any) -> list[str]:
+        """Return a sentence for each argument with a dimension, and for each result, that is 0 everywhere."""
+        gaps = []
+        for number, (argument, magnitude) in enumerate(zip(args, magnitudes, strict=True)):
+            places = labels(argument, f"argument {number}")
+            for place, name, leaf in zip(places, self._names(argument, number), leaves(magnitude), strict=True):
+                if leaf is not None and name is not None and self._units[name].exponents and not np.any(leaf):
+                    gaps.append(f"{place} is 0, which is the same in all units: give another value")
+        names = self._names_of_result(value)
+        for place, name, leaf in zip(labels(value, "result"), names, leaves(value), strict=True):
+            if leaf is not None and (name is not None or is_variable(leaf)) and not np.any(leaf):
+                gaps.append(f"{place} is 0, which is the same in all units: give other arguments")
+        return gaps
 
     # ------------------------------------------------------------ units
 
@@ -264,19 +294,38 @@ class SceneWithUnits(Reconstructible):
         """Store a unit; raise an error for a name that is no unit."""
         if name is None:
             return
+        offset = f"{place}: {name!r} has an offset, so that it has no multiples; write 'K'"
         try:
             unit = self._registry.Unit(name)
             base = self._registry.Quantity(1.0, unit).to_base_units()
-            zero = self._registry.Quantity(0.0, unit).to_base_units()
+            zero, two = (self._registry.Quantity(number, unit).to_base_units().magnitude for number in (0.0, 2.0))
         except pint.OffsetUnitCalculusError:
-            raise ValueError(f"{place}: {name!r} has an offset, so that it has no multiples; write 'K'") from None
+            raise ValueError(offset) from None
         except Exception:  # pint raises errors of many types for texts that are no units
-            raise ValueError(f"{place}: {name!r} is no unit that pint knows; write for example 'W/m^2'") from None
-        if zero.magnitude != 0:
-            raise ValueError(f"{place}: {name!r} has an offset, so that it has no multiples; write 'K'")
+            raise ValueError(f"{place}: {self._no_unit(name)}") from None
+        if zero != 0:
+            if np.isclose(two - base.magnitude, base.magnitude - zero):
+                raise ValueError(offset)
+            raise ValueError(
+                f"{place}: {name!r} is logarithmic, so that it has no multiples; convert the level to a ratio, and "
+                "write ''"
+            )
         self._units[name] = Unit(name, float(base.magnitude), base.units, _exponents(unit))
 
-    def _exponent(self, name: str, dimension: str) -> float:
+    def _no_unit(self, name: Any) -> str:
+        """Return the message for a text that is no unit."""
+        with suppress(Exception):  # pint raises errors of many types for texts that are no quantities
+            quantity = self._registry.Quantity(str(name))
+            unit = str(quantity.units).replace("dimensionless", "")
+            return (
+                f"{name!r} is a quantity, not a unit; write {unit!r}, and give the number with the argument or the "
+                "result"
+            )
+        return f"{name!r} is no unit that pint knows; write for example 'W/m^2'"
+
+    def _exponent(self, name: str | None, dimension: str) -> float:
+        if name is None:
+            return 0.0
         return self._units[name].exponents.get(dimension, 0.0)
 
     def _names(self, argument: Any, number: int) -> list:
@@ -352,7 +401,7 @@ class SceneWithUnits(Reconstructible):
         entries, rebuild = flatten(argument)
         scaled = []
         for name, leaf in zip(self._names(argument, number), entries, strict=True):
-            exponent = 0.0 if name is None else self._exponent(name, dimension)
+            exponent = self._exponent(name, dimension)
             scaled.append(leaf * FACTOR**exponent if exponent else leaf)
         return rebuild(scaled)
 

@@ -36,6 +36,22 @@ TABLE = [
         ValueError,
         "result: 'degC' has an offset, so that it has no multiples; write 'K'",
     ),
+    (
+        lambda: with_units(area, ("dB", "m"), "m"),
+        ValueError,
+        "arguments[0]: 'dB' is logarithmic, so that it has no multiples; convert the level to a ratio, and write ''",
+    ),
+    (
+        lambda: with_units(area, ("5 m", "m"), "m"),
+        ValueError,
+        "arguments[0]: '5 m' is a quantity, not a unit; write 'meter', and give the number with the argument or the "
+        "result",
+    ),
+    (
+        lambda: with_units(area, ("m", "m"), 2),
+        ValueError,
+        "result: 2 is a quantity, not a unit; write '', and give the number with the argument or the result",
+    ),
     (lambda: AREA(Q(1.0, "m")), TypeError, "with_units(area) takes 2 arguments, got 1"),
     (
         lambda: AREA(Q(1.0, "m"), 2.0),
@@ -73,6 +89,11 @@ TABLE = [
         lambda: AREA.value_and_grad(Q(1.0, "m"), Q(1.0, "m"), argnum=-1),
         ValueError,
         "argnum must be a whole number >= 0, got -1; write the number of an argument of with_units(area)",
+    ),
+    (
+        lambda: AREA.value_and_grad(Q(1.0, "m"), Q(1.0, "m"), argnum=2),
+        ValueError,
+        "argnum of with_units(area) must be below 2, got 2; 0 is the first",
     ),
     (
         lambda: AREA.check(Q(1.0, "m"), Q(1.0, "m"), rtol=2.0),

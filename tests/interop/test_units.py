@@ -84,9 +84,40 @@ def test_a_number_with_a_dimension_is_found():
 
 
 def test_a_result_of_zero_shows_nothing():
-    scene = dp.interop.with_units(lambda h: 0.0 * h, ("m",), "s")
+    scene = dp.interop.with_units(lambda h: {"fall": h, "rise": 0.0 * h}, ("m",), "m")
     report = scene.check(Q(3.0, "m"))
     assert report.verdict == "inconclusive" and not report.passed
+    assert report.gaps == ["result['rise'] is 0, which is the same in all units: give other arguments"]
+    assert str(report).endswith(f"verdict: inconclusive\n{report.gaps[0]}")
+
+
+def test_an_argument_of_zero_shows_nothing():
+    """9.81 has a unit, but is multiplied by 0."""
+    scene = dp.interop.with_units(lambda h, s: h + 9.81 * anp.sum(s["t"]), ("m", {"t": "s", "n": None}), "m")
+    report = scene.check(Q(3.0, "m"), {"t": Q(np.zeros(2), "s"), "n": 0})
+    assert report.verdict == "inconclusive"
+    assert report.gaps == ["argument 1['t'] is 0, which is the same in all units: give another value"]
+    assert scene.check(Q(3.0, "m"), {"t": Q(np.array([0.0, 1.0]), "s"), "n": 0}).verdict == "not homogeneous"
+
+
+def test_results_declared_as_none_are_compared():
+    weight = dp.interop.with_units(lambda m: 9.81 * m, ("kg",), None)
+    report = weight.check(Q(2.0, "kg"))
+    assert report.verdict == "not homogeneous" and report.runs[0].expected == 0.0 and report.runs[0].found == 1.0
+    counted = dp.interop.with_units(
+        lambda m: {"mass": m, "ratio": m / m, "count": 3}, ("kg",), {"mass": "kg", "ratio": None, "count": None}
+    )
+    assert counted.check(Q(2.0, "kg")).passed
+
+
+def test_a_scene_without_dimensions_shows_nothing():
+    for scene in (
+        dp.interop.with_units(lambda x: 9.81 * x, ("",), ""),
+        dp.interop.with_units(lambda x: x, (None,), None),
+    ):
+        report = scene.check(2.0)
+        assert report.verdict == "inconclusive"
+        assert report.gaps == ["no argument and no result has a unit with a dimension: there is nothing to compare"]
 
 
 def test_scenes_on_a_grid():
