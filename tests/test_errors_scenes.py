@@ -382,32 +382,53 @@ TABLE = [
     (
         lambda: dp.matched_layer(LINE, 5, 1.0),
         VALUE,
-        "matched_layer on x needs 0 to 4 cells, got 5",
+        "matched_layer on x needs a whole number of cells from 0 to 4, got 5",
     ),
     (
-        lambda: dp.matched_layer(LINE, 2, 0),
+        lambda: dp.matched_layer(dp.Grid(12), True, 1.0),
+        VALUE,
+        "matched_layer on x needs a whole number of cells from 0 to 12, got True",
+    ),
+    (
+        lambda: dp.matched_layer(dp.Grid(12), {"x": (0, 5)}, 1.0),
+        VALUE,
+        "matched_layer on x needs 0 or at least 6 cells, got 5; fewer reflect more than 1e-3 of a wave",
+    ),
+    (
+        lambda: dp.matched_layer(dp.Grid((20, 13)), {"y": (7, 6)}, 1.0),
+        VALUE,
+        "matched_layer on y got 7 + 6 of 13 cells; leave cells between the layers",
+    ),
+    (
+        lambda: dp.matched_layer(dp.Grid(8), {"x": (6, 0)}, 1.0).coefficients(1e-320),
+        VALUE,
+        "omega of a matched layer is too small, got 1e-320 beside rates up to 4.74; give the angular frequency of the "
+        "waves",
+    ),
+    (
+        lambda: dp.matched_layer(LINE, 0, 0),
         VALUE,
         "speed of matched_layer must be > 0, got 0; give the speed of the fastest waves",
     ),
     (
-        lambda: dp.matched_layer(LINE, 2, 1.0, echo=2.0),
+        lambda: dp.matched_layer(LINE, 0, 1.0, echo=2.0),
         VALUE,
         "echo of matched_layer must be between 0 and 1, got 2; the default is 1e-8",
     ),
     (
-        lambda: dp.matched_layer(LINE, 2, 1.0).coefficients(0.0),
+        lambda: dp.matched_layer(LINE, 0, 1.0).coefficients(0.0),
         VALUE,
         "omega of a matched layer must be one finite number, not 0, got 0.0",
     ),
     (
-        lambda: dp.matched_layer(LINE, 2, 1.0).coefficients([1.0, 2.0]),
+        lambda: dp.matched_layer(LINE, 0, 1.0).coefficients([1.0, 2.0]),
         VALUE,
         "omega of a matched layer must be one finite number, not 0, got [1.0, 2.0]",
     ),
     (
         lambda: dp.sponge(LINE, 5, 1.0),
         VALUE,
-        "sponge on x needs 0 to 4 cells, got 5",
+        "sponge on x needs a whole number of cells from 0 to 4, got 5",
     ),
     (
         lambda: dp.sponge(LINE, 2, 0),

@@ -1,5 +1,8 @@
 """Perfectly matched layers: reflection of plane waves and pulses, circular waves, derivatives in the frequency."""
 
+import copy
+import pickle
+
 import autograd.numpy as anp
 import numpy as np
 import pytest
@@ -7,7 +10,7 @@ import pytest
 import sparsedp as dp
 
 
-@pytest.mark.parametrize(("deep", "most"), [(8, 1.5e-4), (20, 1e-4)])
+@pytest.mark.parametrize(("deep", "most"), [(6, 5e-4), (8, 1.5e-4), (20, 1e-4)])
 def test_plane_waves_up_to_60_degrees(deep, most):
     """Waves exp(i l y) of ten cells a wavelength, by the equation across the layer that remains for them."""
     omega = 2 * np.pi / 10
@@ -91,3 +94,25 @@ def test_stretches_of_a_layer():
     assert np.all(in_cells == 1) and np.all(on_faces == 1)
     assert layer == dp.matched_layer(grid, {"x": (8, 0), "y": (0, 8)}, 2.0, echo=0.01) != dp.matched_layer(grid, 0, 2.0)
     assert repr(layer) == "<matched_layer on Grid(9 x 10 cells, size 9 x 10)>"
+
+
+def test_layers_cannot_be_changed():
+    layer = dp.matched_layer(dp.Grid((9, 10)), {"x": (0, 8)}, 2.0)
+    for other in (layer, copy.deepcopy(layer), pickle.loads(pickle.dumps(layer))):
+        assert other == layer and hash(other) == hash(layer)
+        for rates in (*other.in_cells, *other.on_faces[0], *other.on_faces[1], *other.damping[0]):
+            with pytest.raises(ValueError, match="read-only"):
+                rates[0, 0] = 1.0
+
+
+def test_layers_of_low_frequencies():
+    """Stretches of 1e200 are finite, though their squares are not."""
+    in_cells, on_faces = dp.matched_layer(dp.Grid((9, 10)), {"x": (0, 8)}, 2.0).coefficients(1e-200)
+    assert np.all(np.isfinite(in_cells)) and np.all(np.isfinite(on_faces))
+
+
+@pytest.mark.parametrize("function", [dp.sponge, dp.matched_layer])
+@pytest.mark.parametrize("cells", [True, {"x": (8, True)}, "8", 2.5, -1, None, [8, "9"]])
+def test_numbers_of_cells(function, cells):
+    with pytest.raises(ValueError, match=f"{function.__name__} on x needs a whole number of cells from 0 to 30, got "):
+        function(dp.Grid(30), cells, 1.0)
