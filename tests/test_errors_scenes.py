@@ -121,8 +121,7 @@ TABLE = [
     (
         lambda: law(boundary=dp.free_slip, momentum=1)(np.ones(4)),
         SHAPE,
-        "conservation_law needs a field for each number in momentum=(1,), got u of shape (4,); give a state that holds "
-        "them all",
+        "conservation_law needs a field for each number in momentum=(1,), got u of shape (4,)",
     ),
     (
         lambda: law()(np.ones(5)),
@@ -208,8 +207,7 @@ TABLE = [
     (
         lambda: dp.shallow_water(LINE)(np.ones(4)),
         SHAPE,
-        "shallow_water needs a field for each number in momentum=(1,), got u of shape (4,); give a state that holds "
-        "them all",
+        "shallow_water needs u of shape (2, 4), the depth and a discharge for each axis, got u of shape (4,)",
     ),
     (
         lambda: dp.shallow_water(LINE)(WATER - 2.0),
@@ -236,19 +234,17 @@ TABLE = [
     (
         lambda: dp.shallow_water(LINE, boundary=dp.inflow, inflow=[-1.0, 0.0])(WATER),
         UNSTABLE,
-        "the depth at the inflow of a shallow_water must be >= 0, got -1 in cell 0 and in 1 more; give a state without "
-        "such cells, or take smaller steps, dt <= law.time_step(u, params)",
+        "the depth of the inflow of a shallow_water at the lower end of x must be >= 0, got -1; change inflow=",
     ),
     (
         lambda: law(boundary=dp.inflow, inflow=-1.0, positive={"amount": lambda u, p: u})(np.ones(4)),
         UNSTABLE,
-        "the amount at the inflow of a conservation_law must be > 0, got -1 in cell 0 and in 1 more; give a state "
-        "without such cells, or take smaller steps, dt <= law.time_step(u, params)",
+        "the amount of the inflow of a conservation_law at the lower end of x must be > 0, got -1; change inflow=",
     ),
     (
         lambda: dp.shallow_water(LINE, "hill"),
         TYPE,
-        "the bathymetry of a shallow_water must hold real numbers, got dtype <U4; write its .real",
+        "the bathymetry of a shallow_water must hold real numbers, got dtype <U4; write a number or an array",
     ),
     (
         lambda: law(positive=["density"]),
@@ -402,7 +398,7 @@ TABLE = [
     (
         lambda: dp.matched_layer(dp.Grid(8), {"x": (6, 0)}, 1.0).coefficients(1e-320),
         VALUE,
-        "omega of a matched layer is too small, got 1e-320 beside rates up to 4.74; give the angular frequency of the "
+        "omega of a matched layer is too small, got 1e-320 beside rates up to 6.14; give the angular frequency of the "
         "waves",
     ),
     (

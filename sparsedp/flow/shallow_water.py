@@ -261,9 +261,9 @@ class ShallowWater(FiniteVolumes):
         flat = np.zeros(self.grid.shape)
         if isinstance(z, (list, tuple)):
             z = anp.array(z)
-        check_kind(
-            self._what("bathymetry"), np.asarray(sample(z)).dtype, "real numbers", "; write a number or an array"
-        )
+        dtype = np.asarray(sample(z)).dtype
+        advice = "; write its .real" if dtype.kind == "c" else "; write a number or an array"
+        check_kind(self._what("bathymetry"), dtype, "real numbers", advice)
         if np.ndim(z) == 0:
             z = z + flat
         checked_result(self._what("bathymetry"), z, flat)

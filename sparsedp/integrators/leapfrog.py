@@ -396,8 +396,8 @@ def _check_frequency(largest_rates, omega):
         largest = np.prod(1.0 + largest_rates / abs(omega))
     if not np.isfinite(largest):
         raise ValueError(
-            f"omega of a matched layer is too small, got {omega!r} beside rates up to {np.max(largest_rates):.3g}; give "
-            "the angular frequency of the waves"
+            f"omega of a matched layer is too small, got {omega!r} beside rates up to {np.max(largest_rates):.3g}; "
+            "give the angular frequency of the waves"
         )
 
 

@@ -302,7 +302,14 @@ class SceneWithUnits(Reconstructible):
         except pint.OffsetUnitCalculusError:
             raise ValueError(offset) from None
         except Exception:  # pint raises errors of many types for texts that are no units
-            raise ValueError(f"{place}: {self._no_unit(name)}") from None
+            number = self._number_in(name)
+            if number is not None:
+                unit = str(number.units).replace("dimensionless", "")
+                raise ValueError(
+                    f"{place}: {name!r} is a quantity, not a unit; write {unit!r}, and give the number with the "
+                    "argument or the result"
+                ) from None
+            raise ValueError(f"{place}: {name!r} is no unit that pint knows; write for example 'W/m^2'") from None
         if zero != 0:
             if np.isclose(two - base.magnitude, base.magnitude - zero):
                 raise ValueError(offset)
@@ -312,16 +319,11 @@ class SceneWithUnits(Reconstructible):
             )
         self._units[name] = Unit(name, float(base.magnitude), base.units, _exponents(unit))
 
-    def _no_unit(self, name: Any) -> str:
-        """Return the message for a text that is no unit."""
+    def _number_in(self, name: Any) -> Any:
+        """Return the Quantity that a text such as "5 m" stands for, or None."""
         with suppress(Exception):  # pint raises errors of many types for texts that are no quantities
-            quantity = self._registry.Quantity(str(name))
-            unit = str(quantity.units).replace("dimensionless", "")
-            return (
-                f"{name!r} is a quantity, not a unit; write {unit!r}, and give the number with the argument or the "
-                "result"
-            )
-        return f"{name!r} is no unit that pint knows; write for example 'W/m^2'"
+            return self._registry.Quantity(str(name))
+        return None
 
     def _exponent(self, name: str | None, dimension: str) -> float:
         if name is None:

@@ -235,7 +235,7 @@ def test_refusals():
     step = dp.stepper("leapfrog", (rates[0], lambda p, c: (p, p)), 0.1, damping=(None, 1.0))
     with pytest.raises(dp.errors.ShapeError, match="rate: expected one array or number, got a tuple of length 2"):
         step((np.ones(3), np.ones(3)))
-    with pytest.raises(ValueError, match="sponge on x needs 0 to 4 cells, got 5"):
+    with pytest.raises(ValueError, match="sponge on x needs a whole number of cells from 0 to 4, got 5"):
         dp.sponge(dp.Grid(4), 5, 1.0)
     with pytest.raises(ValueError, match="speed of sponge must be > 0, got 0; give the speed of the fastest waves"):
         dp.sponge(dp.Grid(4), 2, 0)
