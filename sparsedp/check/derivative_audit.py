@@ -11,7 +11,7 @@ uses a stored value of another point.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from math import inf, isfinite, isnan, log10
@@ -38,13 +38,14 @@ from sparsedp.check.loss_noise import measure_noise, noise_of_entries, noise_ste
 from sparsedp.check.overall_verdict import overall_verdict
 from sparsedp.check.point import MOST_LEAVES, Point, audit_generator
 from sparsedp.check.programs import Program, WrongResult
-from sparsedp.check.rounding_modes import ROUNDING_FACTOR, rounding_error
+from sparsedp.check.rounding_modes import ROUNDING_FACTOR, UNBOUNDED_ERROR, rounding_error
 from sparsedp.check.step_sizes import STEPS_BETWEEN, default_steps
 from sparsedp.check.summary import Row
 from sparsedp.check.thresholds import REVIEW
 
 __all__ = ["DerivativeAudit", "Group", "Options", "accept"]
 
+SINGLE_EPS = float(np.finfo(np.float32).eps)
 # Nine steps over eight decades. Single precision has the default steps.
 STEPS = tuple(2.0**-exponent for exponent in (2, 6, 10, 14, 17, 20, 23, 26, 29))
 FIRST_STEP = 2.0**-10  # step of the first difference
@@ -602,13 +603,49 @@ class DerivativeAudit:
         if gap <= HIDDEN_EPS * self.like.eps * norm(weights * self.base):
             gap = 0.0
         allowed = self.allowed(DUALITY_SHARE, LINEAR_EPS)
-        if gap > allowed * size:
-            allowed = max(allowed, ROUNDING_FACTOR * rounding_error(difference) / size)
         if gap:
             gap = gap / size
-        self.rows.append(Row("<g, jvp(t)> = <vjp(g), t>", gap, allowed, gap <= allowed))
-        if not gap <= allowed:
-            self.findings.append(("broken", f"vjp is not the transpose of jvp: they differ by {gap:.1e}"))
+        reason = f"vjp is not the transpose of jvp: they differ by {gap:.1e}"
+        self.compare("<g, jvp(t)> = <vjp(g), t>", gap, allowed, difference, size, reason)
+
+    def compare(
+        self, name: str, gap: float, allowed: float, difference: Callable[[], float], size: float, reason: str
+    ) -> None:
+        """Add the row of an identity, and a finding if the gap is larger than allowed and than rounding errors.
+
+        Parameters
+        ----------
+        name : str
+            The identity.
+        gap, allowed : float
+            Relative to `size`.
+        difference : callable
+            Computes the gap anew, not divided by `size`.
+        size : float
+        reason : str
+            Of the finding.
+        """
+        error = 0.0
+        if gap > allowed:
+            error = self.rounding_error(difference)
+            if isfinite(error):
+                allowed = max(allowed, ROUNDING_FACTOR * error / size)
+        self.rows.append(Row(name, gap, allowed, gap <= allowed))
+        if gap <= allowed:
+            return
+        if isfinite(error):
+            self.findings.append(("broken", reason))
+        else:
+            self.findings.append(("unsound", f"{reason}, but {UNBOUNDED_ERROR}"))
+
+    def rounding_error(self, function: Callable[[], float]) -> float:
+        """Return the largest change of a number that the program computes in other rounding modes."""
+        return rounding_error(function, self.in_single_precision)
+
+    @property
+    def in_single_precision(self) -> bool:
+        """Whether x or f(x) is in single precision."""
+        return max(self.point.eps, self.program.result.eps) > SINGLE_EPS / 2
 
     @property
     def _first_product(self) -> NDArray[Any]:

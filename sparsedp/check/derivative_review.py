@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
-from math import inf
+from math import inf, isfinite
 from typing import Any
 
 import numpy as np
@@ -14,13 +14,12 @@ from sparsedp._utils.pytree import norm
 from sparsedp.check.direction_evidence import CONFIRMING_WORDS, UNDECIDED_WORDS, WRONG_WORDS, DirectionEvidence
 from sparsedp.check.directions import reclassify_kinks
 from sparsedp.check.evaluations import EVALUATION_ERRORS
-from sparsedp.check.rounding_modes import ROUNDING_FACTOR, rounding_error
+from sparsedp.check.rounding_modes import ROUNDING_FACTOR, UNBOUNDED_ERROR
 from sparsedp.check.thresholds import REVIEW
 
 __all__ = ["review", "rounds_in_single_precision"]
 
 ABSOLUTE = "absolute"  # name of directions with steps relative to a whole leaf, if there are relative ones too
-SINGLE_EPS = float(np.finfo(np.float32).eps)
 
 
 def review(audit: Any) -> None:
@@ -190,7 +189,7 @@ def _roughness(audit: Any) -> float | None:
     It is about 0 for a smooth function of the vector, and about 1 if the results are rounding errors. It is None if
     the results do not change.
     """
-    if max(audit.point.eps, audit.program.result.eps) > SINGLE_EPS / 2:
+    if audit.in_single_precision:
         return 0.0  # every change is rounded
     vector, _ = audit.pairs[0]
     change = REVIEW.nudge * vector * np.random.default_rng(0).uniform(-1.0, 1.0, vector.size)
@@ -207,7 +206,7 @@ def rounds_in_single_precision(audit: Any) -> bool:
     Then it rounds values that depend on x.
     """
     group = audit.groups[0]
-    if max(audit.point.eps, audit.program.result.eps) > SINGLE_EPS / 2 or group.evaluations.noise > REVIEW.smooth_noise:
+    if audit.in_single_precision or group.evaluations.noise > REVIEW.smooth_noise:
         return False
     point = audit.point
     change = REVIEW.larger_nudge * point.units * np.random.default_rng(1).uniform(-1.0, 1.0, point.size)
@@ -253,8 +252,10 @@ def _rounding_reason(audit: Any, group: Any, direction: DirectionEvidence) -> st
     step = _coarsest_step(direction)
     if not step > 0:  # no step changes f
         return None
-    in_f = rounding_error(partial(audit.difference_along, group, direction, step))
-    in_derivative = rounding_error(partial(audit.slope_along, group, direction))
+    in_f = audit.rounding_error(partial(audit.difference_along, group, direction, step))
+    if not isfinite(in_f):
+        return UNBOUNDED_ERROR
+    in_derivative = audit.rounding_error(partial(audit.slope_along, group, direction))
     if in_f < REVIEW.amplified_share * in_derivative:  # only the derivative under test has errors: it is at fault
         in_derivative = 0.0
     error = in_f + in_derivative
@@ -263,7 +264,7 @@ def _rounding_reason(audit: Any, group: Any, direction: DirectionEvidence) -> st
             f"in another rounding mode the derivatives of f change by {error / direction.scale:.1e}: "
             "f amplifies rounding errors, the problem is too ill-conditioned to tell"
         )
-    error = rounding_error(partial(audit.functional, group, direction))
+    error = audit.rounding_error(partial(audit.functional, group, direction))
     is_contradicted = step < direction.steps[0]
     if is_contradicted and direction.size * step <= ROUNDING_FACTOR * error:
         return f"only at steps up to {step:.0e}, at which rounding errors of f hide its derivative"

@@ -44,10 +44,68 @@ def test_the_rounding_error_of_a_number():
 @needs_modes
 def test_the_usual_rounding_mode_returns():
     tenth = np.array([1.0, -1.0]) / 10.0
-    runs = iter([0.0])
-    with pytest.raises(StopIteration):  # raised by the second run, in another mode
-        rounding_error(lambda: next(runs))
+    runs = []
+
+    def interrupted():
+        if np.divide(1.0, 10.0) + np.divide(-1.0, 10.0) or runs:  # in another mode
+            raise KeyboardInterrupt
+        runs.append(1)
+        return 0.0
+
+    with pytest.raises(KeyboardInterrupt):
+        rounding_error(interrupted)
     np.testing.assert_array_equal(np.array([1.0, -1.0]) / 10.0, tenth)
+
+
+def is_rounded_in_another_way():
+    return bool(np.any(np.array([1.0, -1.0]) / 10.0 != np.array([0.1, -0.1])))
+
+
+def nan_elsewhere(x):
+    """Return NaN in other rounding modes."""
+    if is_rounded_in_another_way():
+        return x * np.nan
+    return x
+
+
+def exception_elsewhere(x):
+    """Raise an exception in other rounding modes, as a solver that does not converge there."""
+    if is_rounded_in_another_way():
+        raise AssertionError("not converged")
+    return x
+
+
+@needs_modes
+@pytest.mark.parametrize("elsewhere", [nan_elsewhere, exception_elsewhere])
+def test_programs_that_work_in_the_usual_mode_only(elsewhere):
+    """Their rounding errors have no bound: a gap of f, of vjp beside jvp, or of symmetry shows nothing."""
+    assert rounding_error(lambda: elsewhere(1.0)) == np.inf
+    f = lambda x: elsewhere(x**2)
+    result = dp.check.vjp(f, lambda x, g: 2.2 * x * g, B, rng=0)
+    assert result.verdict == "inconclusive" and "in another rounding mode the program fails" in result.reason
+    # A derivative that is at fault alone.
+    wrong = dp.check.vjp(lambda x: x**2, lambda x, g: elsewhere(2.2 * x * g), B, rng=0)
+    assert wrong.verdict == "disagrees", wrong
+    # The identities are tested after the differences, which agree here.
+    jvp = lambda x, t: elsewhere(2.2 * x * t)
+    both = dp.check.vjp(lambda x: x**2, lambda x, g: 2 * x * g, B, jvp=jvp, rng=0)
+    assert both.verdict == "inconclusive" and "vjp is not the transpose of jvp" in both.reason, both
+    skewed = np.eye(12)
+    skewed[0, 1] = 1e-3
+    gradient = lambda x: skewed @ x
+    hessian = dp.check.hessian(gradient, lambda x, v: elsewhere(skewed @ v), B, gradient=gradient, rng=0)
+    assert hessian.verdict == "inconclusive" and "the Hessian is not symmetric" in hessian.reason, hessian
+    plain = dp.check.hessian(gradient, lambda x, v: skewed @ v, B, gradient=gradient, rng=0)
+    assert plain.verdict == "disagrees" and "the Hessian is not symmetric" in plain.reason, plain
+
+
+@needs_modes
+def test_modes_in_which_functions_of_single_precision_are_wrong():
+    """The sine of NumPy may assume the usual mode: its errors in others are no rounding errors of a program."""
+    angles = np.linspace(1.0, 30.0, 30, dtype=np.float32)
+    assert rounding_error(lambda: float(np.sin(angles) @ np.ones(30, np.float32)), single=True) < 1e-4
+    wrong = dp.check.vjp(np.sin, lambda x, g: np.float32(1.003) * np.cos(x) * g, angles, rng=0)
+    assert "another rounding mode" not in wrong.reason, wrong
 
 
 @needs_modes
