@@ -171,7 +171,7 @@ def transport(
 
     See Also
     --------
-    upwind, conservation_law, flow_step, convection, dirichlet, neumann, patch
+    upwind, conservation_law, cut_cells, flow_step, convection, dirichlet, neumann, patch
 
     Notes
     -----

@@ -17,7 +17,7 @@ F. H. Harlow, J. E. Welch, Phys. Fluids 8 (1965) 2182-2189 (the staggered grid).
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
@@ -26,11 +26,12 @@ from sparsedp._utils.calls import public
 from sparsedp._utils.validation import check_on
 from sparsedp.autodiff.tape import dtype_of
 from sparsedp.errors import ShapeError
+from sparsedp.flow.cut_projection import CutProjection
 from sparsedp.flow.projection_setup import ProjectionSetup
 from sparsedp.flow.variable_density import WeightedProjection
 from sparsedp.grid.boundary_conditions import describe_patches, no_slip
 from sparsedp.grid.grid import check_grid
-from sparsedp.operators.masks_and_lift import refuse_body
+from sparsedp.operators.masks_and_lift import Body
 from sparsedp.operators.operator import Operator
 from sparsedp.solvers.choose_method import check_settings
 
@@ -42,22 +43,43 @@ if TYPE_CHECKING:
 __all__ = ["Projection", "projection"]
 
 
+@overload
 def projection(
     grid: Grid,
-    solid: ArrayLike | None = None,
+    solid: Body,
+    boundary: Any = ...,
+    method: str = ...,
+    rtol: float = ...,
+    maxiter: int | None = ...,
+    **options: Any,
+) -> CutProjection: ...
+@overload
+def projection(
+    grid: Grid,
+    solid: ArrayLike | None = ...,
+    boundary: Any = ...,
+    method: str = ...,
+    rtol: float = ...,
+    maxiter: int | None = ...,
+    **options: Any,
+) -> Projection: ...
+def projection(
+    grid: Grid,
+    solid: ArrayLike | Body | None = None,
     boundary: Any = no_slip,
     method: str = "auto",
     rtol: float = 1e-10,
     maxiter: int | None = None,
     **options: Any,
-) -> Projection:
+) -> Projection | CutProjection:
     """Return the operator that removes the divergence from a velocity on faces.
 
     Parameters
     ----------
     grid : Grid
-    solid : bool array, shape `grid.shape`, optional
-        Obstacles. The result is 0 on faces that touch an obstacle.
+    solid : bool array, shape `grid.shape`, or body of `cut_cells`, optional
+        Obstacles. The result is 0 on faces that touch an obstacle. Of a body only the shape is used; the result is then
+        a function of the velocity with `pressure` and `info`, and is 0 on faces without fluid.
     boundary : flow condition or dict
         no_slip, free_slip (here equivalent: the normal velocity is 0), inflow (the normal velocity is kept) or outflow
         (pressure 0), for all bounded sides or as {"x": (lower, upper), ...}; axes that are not named are no_slip. An
@@ -92,7 +114,7 @@ def projection(
 
     See Also
     --------
-    divergence, flow_step, no_slip, free_slip, inflow, outflow, patch
+    divergence, flow_step, cut_cells, no_slip, free_slip, inflow, outflow, patch
 
     Notes
     -----
@@ -119,13 +141,14 @@ def projection(
     array([1., 1., 1.])
     """
     check_grid("projection", grid)
-    refuse_body("projection", solid, "body.project(v)")
+    settings = check_settings(method, rtol, maxiter, "project", options, common=("rtol", "maxiter"))
+    if isinstance(solid, Body):
+        return CutProjection(grid, solid, boundary, settings)
     if solid is not None and np.shape(solid) == grid.faces.shape != grid.shape:
         raise ShapeError(
             f"the second argument of projection is solid, a boolean array on {grid.cells}, got an array on "
             f"{grid.faces}; write dp.projection(grid)(v) for a velocity v"
         )
-    settings = check_settings(method, rtol, maxiter, "project", options, common=("rtol", "maxiter"))
     set_up = grid.backend.implementation(ProjectionSetup)
     return Projection(set_up(grid, solid, boundary, settings))
 

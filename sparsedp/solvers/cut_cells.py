@@ -87,7 +87,7 @@ def cut_cells(
 
     See Also
     --------
-    laplacian, elliptic_solver, brinkman, cut_flow
+    laplacian, elliptic_solver, projection, transport, brinkman, cut_flow
 
     Notes
     -----
@@ -167,6 +167,11 @@ class CutCells(CutOperators):
     def with_settings(self, settings: SolveSettings) -> CutCells:
         """Return the same body with other settings of its solves."""
         grid, level, boundary, solid_boundary, _ = self._arguments
+        return CutCells(grid, level, boundary, solid_boundary, settings)
+
+    def with_conditions(self, boundary: Any, solid_boundary: Any, settings: SolveSettings) -> CutCells:
+        """Return a body of the same shape with other conditions and other settings of its solves."""
+        grid, level, *_ = self._arguments
         return CutCells(grid, level, boundary, solid_boundary, settings)
 
     def solve(
@@ -254,14 +259,16 @@ class CutCells(CutOperators):
             self._solvers[nullspace] = solver
         return solver
 
-    def project(self, v: Any) -> Any:
-        """Return the divergence-free part v - grad p of a velocity; nothing flows through the wall of the body.
+    def project(self, v: Any, density: Any = None) -> Any:
+        """Return the divergence-free part v - grad p / density of a velocity; nothing flows through the body.
 
         On the walls of the grid, p has the conditions `boundary`: neumann keeps v there, dirichlet lets it flow freely.
 
         Parameters
         ----------
         v : array, a field on the faces; leading axes are a batch
+        density : number, or array on faces, > 0, optional
+            Default: 1.
 
         Returns
         -------
@@ -270,26 +277,61 @@ class CutCells(CutOperators):
         Raises
         ------
         ValueError
-            If `solid_boundary` is not neumann.
+            If `solid_boundary` is not neumann, or the density is not > 0.
         IncompatibleError
             If more enters a region through neumann walls than leaves it.
         """
+        mobility = self._mobility(density)
+        field = self._face_field("v", v)
+        result = field - mobility * self.gradient(self._potential(field, mobility))
+        remainder = self._outflow(self.apertures * result)
+        through_faces = self._sum_over_faces(self.apertures * anp.abs(field))
+        check_values(partial(_check_balance, self.grid.dim), remainder, through_faces)
+        return in_dtype_of(v, result)
+
+    def potential(self, v: Any, density: Any = None) -> Any:
+        """Return the p of `project` [velocity length, times the unit of density], with mean 0 if it is free.
+
+        Parameters
+        ----------
+        v, density
+            As for `project`.
+
+        Returns
+        -------
+        array, a field on the cells; 0 in cells without fluid
+        """
+        return in_dtype_of(v, self._potential(self._face_field("v", v), self._mobility(density)))
+
+    def _potential(self, v, mobility):
+        return self._solve(-self.divergence(v), k=mobility, nullspace="project")
+
+    def _mobility(self, density):
+        """Return 1 / density as a number or a field on the faces; check that the body has a potential."""
         if self.solid_boundary != neumann:
             raise ValueError(
                 f"project of cut_cells needs solid_boundary=dp.neumann, got {self.solid_boundary}; build another body"
             )
-        field = self._face_field("v", v)
-        pressure = self._solve(-self.divergence(field), nullspace="project")
-        result = field - self.gradient(pressure)
-        remainder = self._outflow(self.apertures * result)
-        check_values(
-            partial(_check_balance, self.grid.dim), remainder, self._sum_over_faces(self.apertures * anp.abs(field))
-        )
-        return in_dtype_of(v, result)
+        if density is None:
+            return 1.0
+        if np.ndim(density) > 1:
+            raise ShapeError(
+                f"project of cut_cells takes a number or one field on faces as density, got an array of shape "
+                f"{np.shape(density)}"
+            )
+        density = self._face_field("density", density, "real numbers", "; write density.real")
+        check_values(_check_positive, anp.where(self._is_open, density, 1.0))
+        return 1.0 / anp.where(self._is_open, density, 1.0)
 
     def __repr__(self) -> str:
         counts = f"{np.count_nonzero(self.is_fluid)} of {self.is_fluid.size} cells hold fluid"
         return f"<cut_cells: {counts}, {self._geometry.cut.size} are cut, {self.solid_boundary} on the wall>"
+
+
+def _check_positive(density):
+    least = np.min(density, initial=np.inf)
+    if not least > 0:
+        raise ValueError(f"density of cut_cells must be > 0, got {least:g}")
 
 
 def _check_balance(dim, outflow, size):

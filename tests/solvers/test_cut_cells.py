@@ -222,8 +222,6 @@ def test_functions_without_a_body_name_its_method():
         r"body.gradient\(u\), or dp.laplacian\(grid, solid=body\)$",
     ):
         dp.gradient(GRID, solid=body)
-    with pytest.raises(TypeError, match=r"^projection takes a boolean array as solid.*; write body.project\(v\)$"):
-        dp.projection(GRID, solid=body)
     with pytest.raises(
         TypeError, match="^this function takes a boolean array.*; write solid=~body.is_fluid for a stair"
     ):
