@@ -8,8 +8,9 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp._utils.validation import EPS, check_finite, check_number, check_plain, number_beside, rounded_down
-from sparsedp.autodiff.tape import cast, dtype_of, isbox
+from sparsedp.autodiff.tape import cast, dtype_of, isbox, sample
 from sparsedp.errors import ShapeError, UnstableStepError
+from sparsedp.grid.boundary_conditions import dirichlet, occurring
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
     from sparsedp.advection.settings import TransportSettings
 
-__all__ = ["ROUNDING", "check_array", "check_numbers", "check_stability", "check_step", "flatten_array"]
+__all__ = ["ROUNDING", "check_array", "check_inflow", "check_numbers", "check_stability", "check_step", "flatten_array"]
 
 FLOAT = np.dtype(float)
 ROUNDING = 8 * EPS  # tolerance: with a CFL number of exactly 1 the weight is about -1e-16 instead of 0
@@ -27,6 +28,18 @@ ROUNDING = 8 * EPS  # tolerance: with a CFL number of exactly 1 the weight is ab
 def check_step(name: str, dt: Any) -> float:
     """Return a time step as a float; raise unless it is a finite number > 0."""
     return check_number(f"dt of {name}", dt, "> 0", "; write dt=0.01, or -v for a step backwards in time")
+
+
+def check_inflow(name: str, settings: TransportSettings, inflow: Any) -> None:
+    """Raise ValueError if no side uses the inflow values. Constant zeros and empty arrays are accepted."""
+    if dirichlet in occurring(settings.sides):
+        return
+    values = sample(inflow)
+    if np.size(values) and (isbox(inflow) or np.any(values)):
+        raise ValueError(
+            f"{name} uses inflow values at sides of dp.dirichlet only, and boundary= has none; write "
+            "boundary=dp.dirichlet, or leave the inflow out"
+        )
 
 
 def flatten_array(name: str, argument: str, value: Any, shapes: Sequence[tuple[int, ...]]) -> Any:

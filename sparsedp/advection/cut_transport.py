@@ -9,7 +9,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp._utils.base_classes import Reconstructible
-from sparsedp.advection.arguments import check_stability, check_step
+from sparsedp.advection.arguments import check_inflow, check_stability, check_step
 from sparsedp.advection.settings import wall_space
 from sparsedp.autodiff.program_trace import check_values
 from sparsedp.errors import ShapeError
@@ -68,6 +68,10 @@ class CutTransport(Reconstructible):
         """
         name = f"transport {self._settings.scheme}"
         check_values(partial(check_step, name), dt)
+        cells = self._settings.grid.cells
+        if np.shape(u)[-len(cells.shape) :] != cells.shape:
+            raise ShapeError(f"{name} takes a field on {cells}, got an array of shape {np.shape(u)}")
+        check_inflow(name, self._settings, inflow)
         shape = np.shape(inflow)
         if shape not in ((), self.walls.shape):
             raise ShapeError(

@@ -9,7 +9,7 @@ import numpy as np
 from sparsedp._utils.base_classes import Frozen, Reconstructible
 from sparsedp._utils.calls import public
 from sparsedp._utils.validation import check_choice
-from sparsedp.advection.arguments import check_step, flatten_array
+from sparsedp.advection.arguments import check_inflow, check_step, flatten_array
 from sparsedp.advection.cut_transport import CutTransport
 from sparsedp.advection.eulerian import Eulerian
 from sparsedp.advection.maccormack import MacCormack
@@ -17,7 +17,7 @@ from sparsedp.advection.method import Identity, TransportMethod
 from sparsedp.advection.rule import rule_of
 from sparsedp.advection.semi_lagrangian import SemiLagrangian
 from sparsedp.advection.settings import TransportSettings
-from sparsedp.autodiff.tape import isbox, sample
+from sparsedp.autodiff.tape import isbox
 from sparsedp.errors import DerivativeError
 from sparsedp.grid.boundary_conditions import (
     MixedWall,
@@ -25,7 +25,6 @@ from sparsedp.grid.boundary_conditions import (
     describe_patches,
     dirichlet,
     neumann,
-    occurring,
     resolve,
     walls_of,
 )
@@ -321,19 +320,8 @@ class Transport(Frozen, Reconstructible):
     def __call__(self, u: Any, v: Any, dt: Any, inflow: Any = 0.0) -> Any:
         """Return the field after one step, a new array; differentiable in every argument."""
         if not (type(inflow) is float and inflow == 0):
-            self._check_inflow(inflow)
+            check_inflow(self.method.name, self.settings, inflow)
         return self._rule(u, v, dt, inflow)
-
-    def _check_inflow(self, inflow: Any) -> None:
-        """Raise ValueError if no side uses the inflow values. Constant zeros and empty arrays are accepted."""
-        if dirichlet in occurring(self.settings.sides):
-            return
-        values = sample(inflow)
-        if np.size(values) and (isbox(inflow) or np.any(values)):
-            raise ValueError(
-                f"{self.method.name} uses inflow values at sides of dp.dirichlet only, and boundary= has none; write "
-                "boundary=dp.dirichlet, or leave the inflow out"
-            )
 
     @property
     def space(self) -> Space:

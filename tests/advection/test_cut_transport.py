@@ -4,7 +4,7 @@ import autograd.numpy as np
 import pytest
 
 import sparsedp as dp
-from sparsedp.errors import ShapeError, UnstableStepError
+from sparsedp.errors import NonFiniteError, ShapeError, UnstableStepError
 
 GRID = dp.Grid((9, 8), size=(1.1, 0.9))
 
@@ -107,5 +107,13 @@ def test_errors_of_transport_around_a_body(body):
         r"shape \(3,\); write move.walls.join\(...\)$",
     ):
         move(u, wind(body), 0.01, np.ones(3))
+    with pytest.raises(
+        ShapeError, match=r"^transport upwind takes a field on cells\(9, 8\), got an array of shape \(8, 9\)$"
+    ):
+        move(u.T, wind(body), 0.01)
+    with pytest.raises(NonFiniteError, match="inflow of cut_cells must be finite"):
+        move(u, wind(body), 0.01, np.nan)
+    with pytest.raises(ValueError, match="^transport upwind uses inflow values at sides of dp.dirichlet only"):
+        dp.transport(GRID, solid=body)(u, wind(body), 0.01, 0.5)
     with pytest.raises(ValueError, match="dt of transport upwind must be > 0"):
         move(u, wind(body), -0.01)
