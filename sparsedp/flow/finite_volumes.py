@@ -335,11 +335,11 @@ class FiniteVolumes(Reconstructible):
                 )
             )
 
-    def _checked_rate(self, u: Any, params: Any) -> Any:
-        """Return the rate of change of a state, after and before checks."""
+    def _checked_rate(self, u: Any, params: Any, rate_of: Callable | None = None) -> Any:
+        """Return the rate of change of a state, after and before checks; `rate_of` computes it in place of `_rate`."""
         u = self._checked_state(u)
         self._check_states(u, params)
-        rate = self._rate(u, params)
+        rate = (rate_of or self._rate)(u, params)
         check_values(partial(check_finite, self._what("rate")), rate)
         return cast(rate, dtype_of(u))
 

@@ -27,6 +27,17 @@ F = P, and nothing moves, beside dry ground too.
 The outflow through a face is at most s h_end with the largest wave speed s, and the depths at both ends add up to 2 h.
 Therefore an Euler step with dt s / d <= 1/2, summed over the axes, leaves h >= 0.
 
+Friction of Manning's law, with the coefficient n, slows the discharge at the rate k = g n^2 |v| / h^(4/3):
+
+    q' = ... - k q.
+
+k is without bound for thin layers. `ShallowWater.stepper` therefore takes -k q implicitly in each stage of "ssprk3",
+with k from the beginning of the stage. With the other terms f this is u + dt f divided by 1 + dt k. A last correction,
+
+    q <- (q + dt^2 k f) / (1 + (dt k)^2),
+
+makes the step second-order. Where f = k q nothing changes: steady flows are those of the law, for every dt.
+
 The velocity is q / h. Below the depth `dry` it is multiplied by a factor that decreases to 0 with the depth, since
 q / h is the quotient of two rounding errors there.
 """
@@ -39,11 +50,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import autograd.numpy as anp
 import numpy as np
 
+from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.calls import public
 from sparsedp._utils.validation import check_choice, check_finite, check_function, check_kind, check_number
 from sparsedp.autodiff.derivative import entrywise
 from sparsedp.autodiff.program_trace import check_values
-from sparsedp.autodiff.tape import plain, sample
+from sparsedp.autodiff.tape import cast, dtype_of, plain, sample
 from sparsedp.autodiff.tape_constants import constant
 from sparsedp.flow.finite_volumes import FiniteVolumes, check_positive, checked_result, sides_of
 from sparsedp.grid.boundary_conditions import outflow
@@ -58,7 +70,7 @@ if TYPE_CHECKING:
     from sparsedp.flow.finite_volumes import AxisFluxes
     from sparsedp.grid.grid import Grid
 
-__all__ = ["ShallowWater", "shallow_water"]
+__all__ = ["FrictionStep", "ShallowWater", "shallow_water"]
 
 TINY = 1e-30  # a rise of the depth, without influence on the values of a limiter
 ROUNDING = 16  # a depth that is negative by this many roundings of the largest depth counts as 0
@@ -73,6 +85,7 @@ def shallow_water(
     boundary: Any = outflow,
     inflow: Any = None,
     source: Callable | None = None,
+    manning: Any = None,
     dry: float = 1e-6,
 ) -> ShallowWater:
     """Return the rate of change of shallow water over any ground, with wet and dry cells.
@@ -94,7 +107,10 @@ def shallow_water(
     inflow : number, array, or callable, optional
         The state outside inflow boundaries, as `conservation_law` takes it.
     source : callable, optional
-        ``source(u, params)`` returns rates that are added in the cells [unit / time], for example rain or friction.
+        ``source(u, params)`` returns rates that are added in the cells [unit / time], for example rain.
+    manning : number >= 0, array of shape grid.shape, or callable, optional
+        Manning's coefficient n of the friction of the ground [time / length^(1/3)], about 0.03 s / m^(1/3) in a river;
+        or ``manning(params)`` that returns it. Take steps of ``law.stepper(dt)``, in which friction is implicit.
     dry : float, optional
         Depth [length] below which the velocity is reduced, to 0 for no water: thin layers that a wave leaves behind
         would otherwise be fast and require small steps. Take about 1e-6 of the largest depth.
@@ -104,17 +120,18 @@ def shallow_water(
     ShallowWater
         ``law(u, params=None)`` returns the rate, for `stepper`. u has the shape (1 + grid.dim, *grid.shape): depth, and
         discharge (depth times velocity) along each axis. Further fields are amounts of tracers: depth times
-        concentration. Differentiable in u and params. ``law.time_step(u, params)`` returns a stable dt.
+        concentration. Differentiable in u and params. ``law.time_step(u, params)`` returns a stable dt, and
+        ``law.stepper(dt)`` a step with implicit friction.
 
     Raises
     ------
     ValueError
         If scheme or boundary is not one of the above, if `inflow` does not go together with an inflow boundary, or if
-        gravity or dry is not > 0.
+        gravity or dry is not > 0, or if manning is negative.
     ShapeError
-        If the bathymetry, the state or the result of a function has the wrong shape.
+        If the bathymetry, manning, the state or the result of a function has the wrong shape.
     NonFiniteError
-        If the bathymetry, the depth or the rate contains NaN or infinity.
+        If the bathymetry, manning, the depth or the rate contains NaN or infinity.
     UnstableStepError
         On use, if a depth is negative: a previous step was too long, or the state is wrong.
     TypeError
@@ -141,6 +158,7 @@ def shallow_water(
     ----------
     Audusse, Bouchut, Bristeau, Klein, Perthame, SIAM J. Sci. Comput. 25 (2004) 2050-2065.
     Kurganov, Petrova, Commun. Math. Sci. 5 (2007) 133-160 (velocity of thin layers).
+    Chertock, Cui, Kurganov, Tong, SIAM J. Numer. Anal. 53 (2015) 2008-2029 (steps with implicit friction).
 
     Examples
     --------
@@ -165,9 +183,11 @@ def shallow_water(
         check_number("gravity of shallow_water", gravity, "> 0", "; write gravity=9.81")
     check_number("dry of shallow_water", dry, "> 0", "; write dry=1e-6")
     sides = sides_of("shallow_water", grid, boundary, inflow)
-    law = ShallowWater(grid, bathymetry, gravity, scheme, sides, inflow, source, dry)
+    law = ShallowWater(grid, bathymetry, gravity, scheme, sides, inflow, source, dry, manning)
     if not callable(bathymetry):
         law.ground(None)  # raises an error for a wrong bathymetry
+    if not callable(manning):
+        law.roughness(None)
     return law
 
 
@@ -187,7 +207,7 @@ class ShallowWater(FiniteVolumes):
 
     Parameters
     ----------
-    bathymetry, gravity, dry
+    bathymetry, gravity, dry, manning
         As `shallow_water` takes them.
     grid, scheme, sides, inflow, source
         As `FiniteVolumes` takes them.
@@ -205,6 +225,7 @@ class ShallowWater(FiniteVolumes):
         inflow: Any,
         source: Callable | None,
         dry: float,
+        manning: Any = None,
     ) -> None:
         super().__init__(grid, scheme, sides, tuple(range(1, 1 + grid.dim)), inflow, source)
         limiter = SCHEMES[scheme].limiter
@@ -212,6 +233,7 @@ class ShallowWater(FiniteVolumes):
         self.bathymetry = constant(bathymetry)
         self.gravity = constant(gravity)
         self.dry = dry
+        self.manning = constant(manning)
 
     def recipe(self) -> tuple:
         """Return the call that builds an equal object, for pickling and copying."""
@@ -224,6 +246,7 @@ class ShallowWater(FiniteVolumes):
             self.inflow,
             self.source,
             self.dry,
+            self.manning,
         )
 
     @public("dp.shallow_water(grid)")
@@ -255,20 +278,63 @@ class ShallowWater(FiniteVolumes):
         -------
         array, shape grid.shape
         """
-        z = self.bathymetry
-        if callable(z):
-            z = z(params)
+        return self._in_cells("bathymetry", self.bathymetry, params)
+
+    def roughness(self, params: Any = None) -> Any:
+        """Return Manning's coefficient in the cells, or None without friction.
+
+        Parameters
+        ----------
+        params : tree, optional
+            Passed to manning.
+
+        Returns
+        -------
+        array, shape grid.shape
+        """
+        if self.manning is None:
+            return None
+        roughness = self._in_cells("manning", self.manning, params)
+        check_values(_check_roughness, roughness)
+        return roughness
+
+    def stepper(self, dt: Any) -> FrictionStep:
+        """Return a step in which the friction is implicit: stable for every friction, also in thin layers.
+
+        Parameters
+        ----------
+        dt : number > 0, or callable
+            Length of the step [time]; or ``dt(params)`` that returns it. A dt from `time_step` is stable.
+
+        Returns
+        -------
+        FrictionStep
+            ``step(u, params=None)`` returns the state after dt, for `rollout`. It is second-order accurate, and keeps
+            the steady flows of the law. Differentiable in u and params.
+
+        See Also
+        --------
+        stepper : "ssprk3" takes the same step if there is no friction.
+        """
+        if not callable(dt):
+            check_values(_check_length, dt)
+        return FrictionStep(self, dt)
+
+    def _in_cells(self, name: str, value: Any, params: Any) -> Any:
+        """Return a number, an array or the result of a function as a field in the cells; raise if it is none."""
+        if callable(value):
+            value = value(params)
         flat = np.zeros(self.grid.shape)
-        if isinstance(z, (list, tuple)):
-            z = anp.array(z)
-        dtype = np.asarray(sample(z)).dtype
+        if isinstance(value, (list, tuple)):
+            value = anp.array(value)
+        dtype = np.asarray(sample(value)).dtype
         advice = "; write its .real" if dtype.kind == "c" else "; write a number or an array"
-        check_kind(self._what("bathymetry"), dtype, "real numbers", advice)
-        if np.ndim(z) == 0:
-            z = z + flat
-        checked_result(self._what("bathymetry"), z, flat)
-        check_values(partial(check_finite, self._what("bathymetry")), z)
-        return z
+        check_kind(self._what(name), dtype, "real numbers", advice)
+        if np.ndim(value) == 0:
+            value = value + flat
+        checked_result(self._what(name), value, flat)
+        check_values(partial(check_finite, self._what(name)), value)
+        return value
 
     def _pull(self, params: Any) -> Any:
         """Return gravity."""
@@ -286,6 +352,12 @@ class ShallowWater(FiniteVolumes):
         return f"shallow_water needs u of shape ({shape}), the depth and a discharge for each axis"
 
     def _rate(self, u: Any, params: Any) -> Any:
+        rate = self._rate_without_friction(u, params)
+        if self.manning is None:
+            return rate
+        return rate - self.friction_rate(u, params) * u
+
+    def _rate_without_friction(self, u: Any, params: Any) -> Any:
         g = self._pull(params)
         ground = self.ground(params)
         total = self._source_term(u, params)
@@ -293,6 +365,35 @@ class ShallowWater(FiniteVolumes):
             faces, rise = self._faces(axis, u, g, ground, params)
             total = total + self._rate_along(axis, u, g, faces, rise)
         return total
+
+    def frictionless(self, u: Any, params: Any) -> Any:
+        """Return the rate of change of a state without friction, after checks."""
+        return self._checked_rate(u, params, self._rate_without_friction)
+
+    def friction_rate(self, u: Any, params: Any = None) -> Any:
+        """Return the rate at which friction slows each field of a state [1 / time]; 0 for depth and tracers.
+
+        Parameters
+        ----------
+        u : array
+            The state, as for the call.
+        params : tree, optional
+
+        Returns
+        -------
+        array like u
+        """
+        is_discharge = np.arange(len(u)) - 1 < self.grid.dim
+        is_discharge[0] = False
+        is_discharge = is_discharge.reshape(-1, *[1] * self.grid.dim)
+        roughness = self.roughness(params)
+        if roughness is None:
+            return is_discharge * np.zeros(u.shape)
+        depth = anp.maximum(u[:1], self.dry)
+        square = anp.sum(self._velocity(_not_negative(u[:1], u[:1]), u[1 : 1 + self.grid.dim]) ** 2, axis=0)
+        moves = square > 0.0
+        speed = anp.where(moves, anp.sqrt(anp.where(moves, square, 1.0)), 0.0)  # sqrt has no derivative at 0
+        return is_discharge * (self._pull(params) * roughness**2 * speed / depth ** (4 / 3))
 
     def _velocity(self, depth: Any, discharge: Any) -> Any:
         """Return discharge / depth, reduced for depths below `dry`, and without overflow."""
@@ -417,6 +518,70 @@ def _check_depth(what, argument, depth):
     """Raise an error for a depth that is negative, and not only by rounding."""
     rounding = ROUNDING * np.finfo(depth.dtype).eps * np.max(np.abs(depth), initial=0.0)
     check_positive(what, depth, rounding, argument)
+
+
+class FrictionStep(Reconstructible):
+    """A step of shallow water with implicit friction, as `ShallowWater.stepper` returns it.
+
+    Parameters
+    ----------
+    law : ShallowWater
+    dt : number or callable
+    """
+
+    name = "a step of shallow_water"
+
+    def __init__(self, law: ShallowWater, dt: Any) -> None:
+        self.law = law
+        self.dt = dt
+
+    def recipe(self) -> tuple:
+        """Return the call that builds an equal object, for pickling and copying."""
+        return FrictionStep, (self.law, self.dt)
+
+    @public("dp.shallow_water(grid).stepper(dt)")
+    def __call__(self, u: Any, params: Any = None) -> Any:
+        """Return the state after a step.
+
+        Parameters
+        ----------
+        u : array, shape (1 + grid.dim, *grid.shape)
+        params : tree, optional
+            Passed to the law.
+
+        Returns
+        -------
+        array like u
+        """
+        dt = self.dt
+        if callable(dt):
+            dt = dt(params)
+            check_values(_check_length, dt)
+        first = self._stage(u, params, dt)
+        second = 0.75 * u + 0.25 * self._stage(first, params, dt)
+        third = u / 3 + (2 / 3) * self._stage(second, params, dt)
+        if self.law.manning is None:
+            return cast(third, dtype_of(u))
+        slowing = dt * self.law.friction_rate(third, params)
+        end = (third + dt * slowing * self.law.frictionless(third, params)) / (1.0 + slowing * slowing)
+        return cast(end, dtype_of(u))
+
+    def _stage(self, u: Any, params: Any, dt: Any) -> Any:
+        """Return the state after an Euler step with implicit friction."""
+        rate = self.law.frictionless(u, params)
+        return (u + dt * rate) / (1.0 + dt * self.law.friction_rate(u, params))
+
+    def __repr__(self) -> str:
+        return f"<step of {self.law}>"
+
+
+def _check_roughness(roughness):
+    if np.min(roughness, initial=0.0) < 0:
+        raise ValueError(f"manning of shallow_water must be >= 0, got {np.min(roughness):g}; write manning=0.03")
+
+
+def _check_length(dt):
+    check_number("dt of a step of shallow_water", dt, "> 0", "; take law.time_step(u, params)")
 
 
 def _check_gravity(g):

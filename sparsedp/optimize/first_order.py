@@ -256,8 +256,8 @@ class Adam(Method):
         Added to the root mean square of the gradient in the denominator. It is relative to the first gradient, so that
         the steps do not change when the loss is multiplied by a small number such as 1e-12.
     max_norm : float, optional
-        A gradient whose Euclidean norm over all entries of x exceeds this number is scaled to this norm. Default: no
-        clipping.
+        A gradient whose Euclidean norm over all entries of x exceeds this number is scaled to this norm. Default, and
+        for infinity: no clipping.
 
     Notes
     -----
@@ -284,7 +284,7 @@ class Adam(Method):
         if np.shape(self.betas) != (2,) or not all(is_number(beta) and 0 <= beta < 1 for beta in self.betas):
             raise ValueError(f"adam needs two betas from 0 to below 1, got {self.betas}; the default is (0.9, 0.999)")
         check_number("epsilon of adam", self.epsilon, "> 0", "; the default is 1e-8")
-        if self.max_norm is not None:
+        if self.max_norm is not None and not (is_number(self.max_norm) and self.max_norm == np.inf):
             check_number("max_norm of adam", self.max_norm, "> 0", "; leave it out for no clipping")
 
     @property

@@ -89,6 +89,27 @@ TABLE = [
         "the first at 1; change equilibrium=",
     ),
     (
+        lambda: dp.shallow_water(LINE, manning=[0.03, 0.02]),
+        ShapeError,
+        "the manning of a shallow_water must have shape (3,), got (2,)",
+    ),
+    (
+        lambda: dp.shallow_water(LINE, manning=-0.03),
+        ValueError,
+        "manning of shallow_water must be >= 0, got -0.03; write manning=0.03",
+    ),
+    (
+        lambda: dp.shallow_water(LINE, manning=0.03).stepper(0.0),
+        ValueError,
+        "dt of a step of shallow_water must be > 0, got 0; take law.time_step(u, params)",
+    ),
+    (
+        lambda: dp.shallow_water(LINE, manning=0.03).stepper(0.1)(BELOW),
+        UnstableStepError,
+        "the depth of a shallow_water must be >= 0, got -3 in cell 1; give a state without such cells, or take smaller "
+        "steps, dt <= law.time_step(u, params)",
+    ),
+    (
         lambda: law(positive={1: lambda u, params: u[0]}),
         TypeError,
         'the names in positive of conservation_law must be str, got int; write {"density": lambda u, params: u[0]}',

@@ -130,6 +130,11 @@ def test_adam_with_a_schedule_and_clipping_against_the_formula(max_norm):
     assert np.array_equal(expected[4], expected[3]) and not np.allclose(expected[3], expected[2])
 
 
+def test_adam_with_an_infinite_norm_does_not_clip():
+    run = lambda **options: dp.minimize(valley, np.array([-1.2, 1.0]), "adam", 5, 0, rate=0.1, **options).x
+    assert np.array_equal(run(max_norm=np.inf), run()) and not np.array_equal(run(max_norm=1e-3), run())
+
+
 @pytest.mark.parametrize("scale", [2.0**-660, 1e-12, 1e12, 2.0**660])
 @pytest.mark.parametrize("method, options", [("lbfgs", {}), ("gd", {}), ("adam", {"rate": 0.1})])
 def test_methods_are_invariant_to_the_scale_of_the_loss(scale, method, options):
