@@ -13,6 +13,7 @@ from time import perf_counter
 import autograd.numpy as np
 from autograd import elementwise_grad
 from scipy.integrate import quad
+from scipy.optimize import brentq
 
 import sparsedp as dp
 from benchmarks.tables import lines, print_rows
@@ -36,6 +37,35 @@ def power_law(n):
         return np.mean(grid.split(end["v"])[0])
 
     return mean_speed, 0.7
+
+
+def carreau(n):
+    """Mean speed in a channel for the viscosity 0.01 + 0.99 (1 + (2 rate)^2)^((m - 1) / 2) (Carreau)."""
+    grid = channel(n)
+    push = grid.join(1.0, 0.0)
+    law = lambda rate, m: 0.01 + 0.99 * (1 + (2 * rate) ** 2) ** ((m - 1) / 2)
+    step = dp.flow_step(grid, 0.05, law, lambda v, m: push, implicit=True)
+    start = np.zeros(grid.faces.size)
+
+    def mean_speed(m):
+        end = dp.rollout(step, step.start(start, m), m, 60)
+        return np.mean(grid.split(end["v"])[0])
+
+    return mean_speed, 0.5
+
+
+def smagorinsky(n):
+    """Mean speed in a channel for the viscosity 0.01 + l^2 rate, with the mixing length l (Smagorinsky)."""
+    grid = channel(n)
+    push = grid.join(1.0, 0.0)
+    step = dp.flow_step(grid, 0.1, lambda rate, l: 0.01 + l**2 * rate, lambda v, l: push, implicit=True)
+    start = np.zeros(grid.faces.size)
+
+    def mean_speed(l):
+        end = dp.rollout(step, step.start(start, l), l, 80)
+        return np.mean(grid.split(end["v"])[0])
+
+    return mean_speed, 0.3
 
 
 def hot_wall(n):
@@ -143,6 +173,15 @@ def conduction(n):
     return lambda p: np.mean(dp.rollout(step, step.start(np.zeros(n + 1), p, {"heat": x}), p, 60)["s"]["heat"]), 1.0
 
 
+def conduction_of_temperature(n):
+    """Mean temperature of a rod with the diffusivity 1 + p T: T = (sqrt(1 + (2 p + p^2) x) - 1) / p."""
+    grid = dp.Grid(n, size=1.0)
+    (x,), ends = grid.centres(), {"x": dp.dirichlet}
+    heat = {"diffusivity": lambda s, p: 1 + p * s["heat"], "boundary": ends, "values": [0.0, 1.0]}
+    step = dp.flow_step(grid, 0.05, scalars={"heat": heat}, implicit=True, convective=False)
+    return lambda p: np.mean(dp.rollout(step, step.start(np.zeros(n + 1), p, {"heat": x}), p, 60)["s"]["heat"]), 1.0
+
+
 def step_length(n):
     """Energy of decaying vortices after 2 n steps of length dt, beside the first: exp(-4 nu 2 n dt)."""
     grid = dp.Grid((n, n), size=2 * np.pi, periodic=True)
@@ -164,15 +203,34 @@ def mean_of_hot_wall(b):
     return middle * (moments[0] - moments[1]) - moments[1] + moments[2]
 
 
+def mean_in_channel(rate):
+    """Return the exact mean speed in a channel of width 1 where the stress s causes the shear rate rate(s)."""
+    return 2 * quad(lambda stress: rate(stress) * stress, 0, 0.5, epsabs=1e-13)[0]
+
+
+def rate_of_carreau(stress):
+    """Return the shear rate of `carreau` for a stress, by bisection."""
+    law = lambda rate: (0.01 + 0.99 * (1 + (2 * rate) ** 2) ** -0.25) * rate - stress
+    return brentq(law, 0.0, 100 * stress + 1, xtol=1e-14)
+
+
+def rate_of_smagorinsky(stress):
+    """Return the shear rate of `smagorinsky` for a stress."""
+    return (np.sqrt(1e-4 + 0.36 * stress) - 0.01) / 0.18
+
+
 DECAY = np.sqrt(2j * np.pi / 0.02)
 CASES = {  # name: scene, number that is compared, exact, cells, few cells
     "power law, m = 0.7": (power_law, "mean speed", 0.7 / 2.4 * 0.5 ** (1 + 1 / 0.7), 64, 8),
+    "Carreau, m = 0.5": (carreau, "mean speed", mean_in_channel(rate_of_carreau), 64, 8),
+    "Smagorinsky, l = 0.3": (smagorinsky, "mean speed", mean_in_channel(rate_of_smagorinsky), 64, 8),
     "viscosity exp(-2 T)": (hot_wall, "mean speed", mean_of_hot_wall(2.0), 64, 8),
     "Rayleigh-Taylor, 1:3": (rayleigh_taylor, "growth rate", np.sqrt(np.pi * np.tanh(np.pi)), 64, 8),
     "layers at rest, 1:1000": (layers_at_rest, "pressure drop", 500.5, 32, 8),
     "oscillating wall": (oscillating_wall, "mean speed", np.real((np.cosh(DECAY) - 1) / DECAY / np.sinh(DECAY)), 64, 8),
     "vortex, viscosity varies": (manufactured, "1 + error", 1.0, 32, 8),
     "diffusivity 1 + x": (conduction, "mean temperature", (2 * np.log(2) - 1) / np.log(2), 64, 8),
+    "diffusivity 1 + T": (conduction_of_temperature, "mean temperature", 5 / 9, 64, 8),
     "Taylor-Green, dt of params": (step_length, "energy", np.exp(-0.4), 32, 8),
 }
 

@@ -6,7 +6,10 @@ from benchmarks.media import row
 
 CLOSE = {  # error with few cells, and the least order
     "vortex, viscosity varies": (0.02, 1.8),
+    "Carreau, m = 0.5": (0.01, 1.8),
+    "Smagorinsky, l = 0.3": (0.01, 1.8),
     "diffusivity 1 + x": (1e-3, 1.8),
+    "diffusivity 1 + T": (1e-3, 1.8),
     "Taylor-Green, dt of params": (0.01, 1.8),
 }
 

@@ -600,6 +600,12 @@ BUGS = {
         "            areas[above] = weight\n",
         "tests/flow/test_media_beside_solids.py::test_the_stress_has_a_twin",
     ),
+    "a law of the shear rate with the trapezoidal rule": Bug(
+        "flow",
+        "for_stress, density, dt, middle)",
+        "for_stress, density, dt)",
+        "tests/flow/test_variable_media.py::test_long_steps_of_laws_of_the_shear_rate",
+    ),
     "an implicit diffusivity at the beginning of the step": Bug(
         "flow",
         'self._half_step_ahead(u, state["s_before"][name], state, dt)',

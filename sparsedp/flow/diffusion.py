@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from sparsedp.flow.settings import FlowSettings
     from sparsedp.operators.operator import Operator
 
-__all__ = ["Diffusion", "check_stable", "spectral_bound", "trapezoidal_step", "wave_growth"]
+__all__ = ["Diffusion", "check_stable", "implicit_step", "spectral_bound", "wave_growth"]
 
 ROUNDING = 1e-12  # tolerance: a step exactly at the stability limit may exceed it by a rounding error
 
@@ -112,7 +112,7 @@ class Diffusion:
             Contribution of walls to L u at the beginning of the step, plus their contribution at its end.
         """
         half_step = 0.5 * self.settings.dt * self.coefficient
-        return trapezoidal_step(explicit, self._laplacian(u, wall_part), half_step, self.solve)
+        return implicit_step(explicit, self._laplacian(u, wall_part), half_step, self.solve)
 
     def _laplacian(self, u: Any, wall_part: Any) -> Any:
         if wall_part is None:
@@ -120,21 +120,21 @@ class Diffusion:
         return self.op(u) + wall_part
 
 
-def trapezoidal_step(explicit: Any, rate: Any, half_step: Any, solve: Callable[[Any], Any]) -> Any:
-    """Return the field w at the end of a step with a linear implicit term A: w = explicit + half_step (A u + A w).
+def implicit_step(explicit: Any, rate: Any, length: Any, solve: Callable[[Any], Any]) -> Any:
+    """Return the field w at the end of a step with a linear implicit term A: w = explicit + length (rate + A w).
 
     Parameters
     ----------
     explicit : array
         The field after the step with all other terms.
     rate : array
-        A u, for the field u at the beginning of the step, with the contributions of walls at the beginning and at the
-        end of the step.
-    half_step : number or array
+        For the trapezoidal rule, A u of the field u at the beginning of the step; with the contributions of walls.
+    length : number or array
+        For the trapezoidal rule, half the length of the step.
     solve : callable
-        ``solve(b)`` returns the solution of w - half_step A w = b.
+        ``solve(b)`` returns the solution of w - length A w = b.
     """
-    return solve(explicit + half_step * rate)
+    return solve(explicit + length * rate)
 
 
 def spectral_bound(op: Operator) -> float:

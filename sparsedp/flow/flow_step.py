@@ -210,7 +210,8 @@ def flow_step(
     default value or by ``*args``, is refused; bind other values by keyword: ``lambda params, *, k=k: ...``.
     Implicit terms take the viscosity and the diffusivity at half the step. A viscosity of the shear rate, and a
     diffusivity of scalars, are computed there from fields that are extrapolated from this and the previous step, so
-    that each step solves linear systems alone and the order remains 2.
+    that each step solves linear systems alone, with order 2. Steps of any length are stable if such a viscosity changes
+    at most in proportion to the shear rate or to its inverse, as in Smagorinsky's model and for plastic fluids.
     A viscosity, diffusivity or density in solid cells has no effect, is not checked and has the derivative 0: beside an
     obstacle, stresses are computed from the harmonic average of the viscosity of fluid cells alone. In solid cells a
     function of the shear rate gets that of the first fluid cell.
@@ -528,8 +529,9 @@ class FlowStep(Reconstructible):
         predicted = self._set_inflow(predicted, params)
         if self.viscous.varies:
             if self.viscous.implicit:
-                before = state.get("before", v)
-                middle = self._half_step_ahead(v, before, state, dt)
+                middle = None
+                if self._extrapolates:
+                    middle = self._half_step_ahead(v, state["before"], state, dt)
                 predicted = self._step_viscosity(
                     predicted, v, middle, mean_scalars, params, walls, walls_after, density, dt
                 )
@@ -583,7 +585,8 @@ class FlowStep(Reconstructible):
     ) -> Any:
         """Return the velocity after an implicit viscosity that varies.
 
-        `middle`, `s` and `density` are the velocity, the scalars and the density on faces at half the step.
+        `middle`, `s` and `density` are the velocity, the scalars and the density on faces at half the step; `middle` is
+        None if the viscosity does not depend on the velocity.
         """
         sum_of_walls = None
         mean_of_walls = None
@@ -592,9 +595,8 @@ class FlowStep(Reconstructible):
             mean_of_walls = 0.5 * sum_of_walls
         viscosity = self._viscosity(middle, s, params, mean_of_walls)
         wall_part = partial(self.walls.laplacian_part_sum, walls, walls_after)
-        return self.viscous.step_implicit(
-            predicted, v, viscosity, wall_part, partial(self.walls.for_stress, sum_of_walls, 2.0), density, dt
-        )
+        for_stress = partial(self.walls.for_stress, sum_of_walls, 2.0)
+        return self.viscous.step_implicit(predicted, v, viscosity, wall_part, for_stress, density, dt, middle)
 
     def _viscosity(self, v: Any, s: dict[str, Any], params: Any, walls: Any) -> Any:
         """Return a viscosity that varies, a number or one value for each cell."""
@@ -621,15 +623,16 @@ class FlowStep(Reconstructible):
         after = self._wall_values(s, params)
         rates = self._rates(state["v"], s, params, before, dt)
         new: dict[str, Any] = {"r": rates, "s": {}}
-        middle = s
+        middle = None
         if self._extrapolates_scalars:
             middle = {name: self._half_step_ahead(u, state["s_before"][name], state, dt) for name, u in s.items()}
         for name, scalar in self.scalars.items():
             change = dt * self._half_step_ahead(rates[name], state["r"][name], state, dt)
             diffusivity = None
             if self.settings.implicit:
-                diffusivity = scalar.diffusivity(middle, params)
-            new["s"][name] = scalar.step(s[name], change, before.get(name), after.get(name), diffusivity, dt)
+                diffusivity = scalar.diffusivity(middle or s, params)
+            u = None if middle is None else middle[name]
+            new["s"][name] = scalar.step(s[name], change, before.get(name), after.get(name), diffusivity, dt, u)
         if after:
             new["values"] = after
         return new

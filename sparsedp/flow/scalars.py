@@ -173,7 +173,16 @@ class Scalar:
             return self._values
         return values
 
-    def step(self, u: Any, change: Any, before: Any = None, after: Any = None, k: Any = None, dt: Any = None) -> Any:
+    def step(
+        self,
+        u: Any,
+        change: Any,
+        before: Any = None,
+        after: Any = None,
+        k: Any = None,
+        dt: Any = None,
+        middle: Any = None,
+    ) -> Any:
         """Return the field after a step.
 
         Parameters
@@ -185,6 +194,8 @@ class Scalar:
             The wall values at the beginning and the end of the step; None if they are constant.
         k : number or array or None
             The diffusivity, and the length of the step `dt`, if the diffusivity varies.
+        middle : array or None
+            The field from which k was computed, at half the step; None if no diffusivity depends on scalars.
         """
         explicit = u + change
         if not self.diffusion.implicit:
@@ -192,7 +203,7 @@ class Scalar:
         wall_part = partial(self._sum_of_parts, before, after, dtype_of(u))
         if self.diffusion.varies:
             walls = partial(self._sum_at_walls, before, after)
-            return self.diffusion.step_implicit(explicit, u, k, wall_part, walls, None, dt)
+            return self.diffusion.step_implicit(explicit, u, k, wall_part, walls, None, dt, middle)
         return self.diffusion.step_implicit(explicit, u, wall_part())
 
     def _sum_at_walls(self, before: Any, after: Any) -> Any:

@@ -92,6 +92,38 @@ def test_power_law_fluid():
     assert error(8) / error(16) > 2.8  # tends to 4: the viscosity in the middle is singular
 
 
+@pytest.mark.parametrize("law", ["smagorinsky", pytest.param("plastic", marks=pytest.mark.whole)])
+def test_long_steps_of_laws_of_the_shear_rate(law):
+    """Steps far beyond the explicit limit reach the exact steady flow of a channel, with a shear stress 1/2 - y."""
+    cells = 8
+    stress = 0.5 - (np.arange(cells) + 0.5) / cells
+    if law == "smagorinsky":  # (0.001 + 0.25 g) g = stress
+        viscosity = lambda rate, p: 0.001 + 0.25 * rate
+        rate = (np.sqrt(1e-6 + np.abs(stress)) - 0.001) / 0.5
+    else:  # (0.1 + 1 / (g + 1)) g = stress
+        viscosity = lambda rate, p: 0.1 + 1 / (1 + rate)
+        excess = 1.1 - np.abs(stress)
+        rate = (np.sqrt(excess**2 + 0.4 * np.abs(stress)) - excess) / 0.2
+    speeds = steady_speeds(channel(cells), viscosity, None, 40, 1.0)
+    slopes = np.sign(stress) * rate
+    exact = (np.cumsum(slopes) - 0.5 * slopes) / cells
+    np.testing.assert_allclose(speeds, exact, atol=0.08 * np.max(exact))
+
+
+@pytest.mark.whole
+def test_order_in_time_of_an_implicit_law():
+    """A decaying flow with a viscosity that increases with the shear rate: order 2."""
+    grid = channel(8)
+    y = grid.face_centres(0)[1]
+
+    def end(n):
+        step = dp.flow_step(grid, 1 / n, lambda rate, p: 0.05 + 0.05 * rate, implicit=True)
+        return dp.rollout(step, step.start(grid.join(np.sin(np.pi * y), 0.0)), None, n)["v"]
+
+    coarse, middle, fine = end(20), end(40), end(80)
+    assert np.max(np.abs(coarse - middle)) / np.max(np.abs(middle - fine)) > 3.6
+
+
 @pytest.mark.whole
 def test_viscosity_of_temperature():
     """A channel with a hot wall and exp(-b T): (exp(b y) (y0 - y))' integrates to the exact profile."""
