@@ -144,7 +144,7 @@ def continuation(
 
     See Also
     --------
-    steady, implicit
+    steady, implicit, eigenpairs
 
     Notes
     -----

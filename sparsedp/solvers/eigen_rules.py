@@ -45,7 +45,7 @@ import autograd.numpy as anp
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.autodiff.derivative import of_argument
+from sparsedp.autodiff.derivative import of_argument, pullback
 from sparsedp.autodiff.tape import Rule, cast, dtype_of, isbox, plain
 from sparsedp.errors import ConvergenceError
 from sparsedp.operators.given import from_matrix
@@ -74,6 +74,7 @@ __all__ = [
     "IdentityMass",
     "member_values",
     "member_vectors",
+    "without_derivative",
 ]
 
 # Unknowns beyond which bordered systems of pairs at an end of the spectrum are solved by iterations in the complement
@@ -109,6 +110,13 @@ class PencilMember(ABC):
     def gradients(self, y: Any, x: Any, values: Sequence, places: Sequence[int]) -> list:
         """Return the gradients of sum(y * product(x, values)) in the coefficients at `places`."""
         return []
+
+    def change(self, x: Any, values: Sequence, tangents: dict[int, Any], transposed: bool = False) -> Any:
+        """Return the change of the products, or of those of the transpose, for tangents of some coefficients."""
+        directions = [tangents.get(place, 0.0) for place in range(len(self.coefficients))]
+        if transposed:
+            return pullback(lambda z: self.product(z, directions), x)[1](x)
+        return self.product(x, directions)
 
 
 class ConstantOperator(PencilMember):
@@ -264,7 +272,7 @@ class EigenProblem:
 
         def vjp(nums, ans, *values):
             def pull(g):
-                zero = anp.sum(_without_derivative(g, refusal))
+                zero = anp.sum(without_derivative(g, refusal))
                 return tuple(np.zeros(np.shape(plain(values[num]))) + zero for num in nums)
 
             return pull
@@ -583,7 +591,7 @@ def member_values(block: Any, refusal: Callable[[], DerivativeError], spread: fl
     def vjp(nums, ans, block):
         def pull(g):
             if isbox(g):
-                return (anp.diag(_without_derivative(g, refusal)),)
+                return (anp.diag(without_derivative(g, refusal)),)
             if np.max(g) - np.min(g) > tolerance * np.max(np.abs(g)):
                 raise refusal()
             return (np.diag(np.asarray(g, float)),)
@@ -599,7 +607,7 @@ def member_vectors(vectors: Any, refusal: Callable[[], DerivativeError]) -> Any:
     def vjp(nums, ans, vectors):
         def pull(g):
             if isbox(g):
-                return (_without_derivative(g, refusal),)
+                return (without_derivative(g, refusal),)
             flat = np.reshape(g, (len(g), -1))
             fields = np.reshape(plain(ans), (len(g), -1))
             products = flat @ fields.T
@@ -621,7 +629,7 @@ def _member_rule(forward, vjp, refusal):
     return Rule("eigenpairs", forward, vjp, jvp)
 
 
-def _without_derivative(g, refusal):
+def without_derivative(g: Any, refusal: Callable[[], DerivativeError]) -> Any:
     """Return zeros for a cotangent that must be 0.
 
     A traced cotangent may be 0 because the function does not use these values, as in ``pairs.values[0]**2``. So its

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp._utils.base_classes import Frozen
 from sparsedp._utils.html import table
-from sparsedp._utils.pytree import leaves
+from sparsedp._utils.pytree import keys, leaves, mapped, paired
 from sparsedp._utils.validation import (
     check_choice,
     check_finite,
@@ -26,9 +25,9 @@ from sparsedp._utils.validation import (
 )
 from sparsedp.autodiff.backend import require_arrays
 from sparsedp.autodiff.program_trace import recording_trace
-from sparsedp.autodiff.tape import Rule, isbox, plain
+from sparsedp.autodiff.tape import isbox, plain
 from sparsedp.errors import DerivativeError, JitError, NonFiniteError, ShapeError
-from sparsedp.grid.space import fits
+from sparsedp.grid.space import Space, fits
 from sparsedp.operators.given import check_operator
 from sparsedp.operators.operator import Operator
 from sparsedp.solvers.eigen_rules import (
@@ -40,15 +39,15 @@ from sparsedp.solvers.eigen_rules import (
     member_values,
     member_vectors,
 )
-from sparsedp.solvers.eigensolver import METHODS, EigenSettings, general_values
+from sparsedp.solvers.eigensolver import METHODS, ROUNDING, EigenSettings
+from sparsedp.solvers.general_eigenpairs import GeneralEigenpairs, GeneralEigenProblem, JacobianMember
 from sparsedp.solvers.parametric import ParametricSolver
+from sparsedp.solvers.roots import Root
 
 if TYPE_CHECKING:
     from sparsedp._utils.html import Markup
 
 __all__ = ["Eigenpairs", "eigenpairs"]
-
-ROUNDING = 1e-12  # eigenvalues that differ by this share of the size of the operator are equal
 
 
 def eigenpairs(
@@ -68,8 +67,10 @@ def eigenpairs(
 
     Parameters
     ----------
-    op : Operator, or a solver of `elliptic_solver` or `matrix_solver`
-        A, of shape (n, n). A solver stands for the operator that it inverts, with these `coefficients`.
+    op : Operator, a solver of `elliptic_solver` or `matrix_solver`, or a function
+        A, of shape (n, n). A solver stands for the operator that it inverts, with these `coefficients`. A residual
+        ``f(x, *params)`` as in `steady`, or the function that `implicit` returns, stands for its Jacobian df/dx at
+        ``coefficients=(x, *params)``, with symmetric=False. The function of `implicit` keeps the sparsity pattern.
     k : int
         Number of pairs, 1 <= k <= n.
     which : "smallest", "largest" or float
@@ -77,14 +78,17 @@ def eigenpairs(
         eigenvalues.
     mass : None, number, array, Operator or a solver of `matrix_solver`, optional
         M, symmetric and positive definite. None is the identity. A number or an array of the shape of the domain is a
-        diagonal matrix, such as a density. An Operator or a solver is any mass matrix of shape (n, n).
+        diagonal matrix, such as a density. An Operator or a solver is any mass matrix of shape (n, n). With
+        symmetric=False any M is allowed; a singular one needs a number as `which`. For a residual whose state is a tree
+        the mass is a tree of arrays and numbers, such as ``{"v": free(ones), "p": 0.0}`` for a flow.
     coefficients : array, number, or tuple of them
-        The coefficients of the solver `op`: k or (k, shift) of `elliptic_solver`, the entries of `matrix_solver`.
+        The coefficients of the solver `op`: k or (k, shift) of `elliptic_solver`, the entries of `matrix_solver`. For a
+        residual the tuple (x, *params), whose entries may be trees.
     mass_coefficients : array
         The coefficients of the solver `mass`.
     symmetric : bool
-        If True, an operator that is not symmetric is refused. If False, the result has values only, which are complex
-        in general and have no derivatives.
+        If True, an operator that is not symmetric is refused. If False, A need not be symmetric: the values are
+        complex, and each right vector has a left one, as `scipy.linalg.eig` has them beside `scipy.linalg.eigh`.
     cluster : float
         Neighbouring eigenvalues whose relative difference is smaller form a cluster; see Notes.
     method : "auto", "dense", "arpack" or "lobpcg"
@@ -105,6 +109,9 @@ def eigenpairs(
         returns columns. ``value, vector = pairs[i]``. `.clusters` lists the ranges of equal eigenvalues;
         ``.sum(start, stop)`` and ``.project(u, start, stop)`` are their differentiable functions. Differentiable in
         `coefficients`, `mass` and `mass_coefficients`, to every order.
+    GeneralEigenpairs
+        With symmetric=False: `.values`, complex, in ascending order of the real parts, with first and second
+        derivatives; `.vectors` and `.left_vectors`, without derivatives, which are computed when they are read.
 
     Raises
     ------
@@ -119,13 +126,13 @@ def eigenpairs(
     ConvergenceError
         If iterations end without the pairs, or the residual of a pair is too large.
     DerivativeError
-        When a derivative is computed that does not exist: of a single member of a cluster.
+        When a derivative is computed that does not exist: of a single member of a cluster, of a multiple eigenvalue.
     JitError
         While `dp.jit` records: the computation depends on the values.
 
     See Also
     --------
-    inverse, elliptic_solver, matrix_solver, matrix_function
+    inverse, elliptic_solver, matrix_solver, matrix_function, steady, continuation
 
     Notes
     -----
@@ -160,6 +167,16 @@ def eigenpairs(
 
     **Multiple eigenvalues** are complete: iterations are repeated in the complement of the pairs that are known.
 
+    **Operators that are not symmetric.** With right vectors v of norm 1 and left vectors w, w^H A = lambda w^H M,
+    scaled so that w^H M v = 1, a simple eigenvalue changes by ::
+
+        dlambda = w^H (dA - lambda dM) v .
+
+    The vectors take one sparse LU factorisation for each eigenvalue. Near a number `which` ARPACK iterates with the LU
+    factors of A - which M, in complex arithmetic if `which` is complex. A singular M has infinite eigenvalues; they are
+    not found. So with the Jacobian of a flow, whose constraint div v = 0 has no mass, the eigenvalues are the growth
+    rates of small perturbations of the steady state (linear stability), and their imaginary parts the frequencies.
+
     References
     ----------
     R. B. Nelson, Simplified calculation of eigenvector derivatives, AIAA J. 14, 1976; J. R. Magnus, On differentiating
@@ -184,23 +201,61 @@ def eigenpairs(
         raise JitError("dp.jit cannot record eigenpairs, which decides by values; call the function without dp.jit")
     require_arrays("eigenpairs", map(plain, differentiable))
     settings = _checked_settings(k, which, symmetric, cluster, method, rtol, maxiter)
+    if not symmetric and (isinstance(op, Root) or not isinstance(op, (Operator, ParametricSolver)) and callable(op)):
+        return _of_residual(op, coefficients, mass, mass_coefficients, settings)
     stiffness = _pencil_member("op", op, coefficients, "coefficients")
     domain, codomain = _spaces(op)
     if not fits(domain, codomain):
         raise ShapeError(f"eigenpairs takes a square operator, got one from {domain} to {codomain}; write op.T @ op")
-    problem = EigenProblem(stiffness, _mass_member(mass, mass_coefficients, domain), settings)
+    mass = _mass_member(mass, mass_coefficients, domain, symmetric)
+    problem = (EigenProblem if symmetric else GeneralEigenProblem)(stiffness, mass, settings)
     pencil = problem.pencil([plain(value) for value in problem.coefficients])
     _check_count(settings.k, pencil)
-    if not settings.symmetric:
-        return _general(problem, pencil)
+    if isinstance(problem, GeneralEigenProblem):
+        _check_real(pencil, problem)
+        general: Any = GeneralEigenpairs(problem, None)
+        return general
     if pencil.weights is None or not pencil.mass_is_symmetric:
         raise _not_symmetric(pencil, isinstance(op, ParametricSolver))
+    _check_real(pencil, problem)
+    return Eigenpairs(problem, domain)
+
+
+def _of_residual(residual, coefficients, mass, mass_coefficients, settings):
+    """Return the eigenvalues of the Jacobian of a residual F(x, *params) at coefficients = (x, *params)."""
+    if not (isinstance(coefficients, tuple) and coefficients):
+        raise TypeError(
+            "eigenpairs of a residual needs the state and the parameters of its Jacobian, got "
+            f"{type(coefficients).__name__}; write coefficients=(x, *params)"
+        )
+    state, *params = coefficients
+    stiffness = JacobianMember(residual, state, tuple(params))
+    unknowns = stiffness.unknowns
+    domain = Space(unknowns.size)
+    if not (mass is None or isinstance(mass, (Operator, ParametricSolver))):
+        masses = [mass] * len(unknowns.shapes)
+        if keys(mass) is not None:
+            masses = paired(mass, state, "mass", advice="; give a mass like the state")
+        parts = [anp.ravel(leaf * np.ones(shape)) for leaf, shape in zip(masses, unknowns.shapes, strict=True)]
+        mass = anp.concatenate(parts)
+    problem = GeneralEigenProblem(stiffness, _mass_member(mass, mass_coefficients, domain, False), settings)
+    pencil = problem.pencil([plain(value) for value in problem.coefficients])
+    _check_count(settings.k, pencil)
+
+    def split(rows):
+        trees = [unknowns.split(row) for row in rows]
+        return mapped(lambda *fields: anp.array(fields), *trees)
+
+    return GeneralEigenpairs(problem, split)
+
+
+def _check_real(pencil, problem):
+    """Raise DerivativeError for derivatives with complex operators."""
     if pencil.complex and any(map(isbox, problem.coefficients)):
         raise DerivativeError(
             "eigenpairs of complex operators have no derivatives; write the real symmetric operator of real and "
             "imaginary parts"
         )
-    return Eigenpairs(problem, domain)
 
 
 def _checked_settings(k, which, symmetric, cluster, method, rtol, maxiter):
@@ -257,7 +312,7 @@ def _pencil_member(name, op, coefficients, coefficients_name):
     return ConstantOperator(op)
 
 
-def _mass_member(mass, coefficients, domain):
+def _mass_member(mass, coefficients, domain, symmetric):
     """Return M with its coefficients."""
     if mass is None:
         return IdentityMass()
@@ -275,7 +330,7 @@ def _mass_member(mass, coefficients, domain):
             f"the mass of eigenpairs is a number or a field on {domain.described}, got an array of shape {values.shape}"
         )
     check_finite("the mass of eigenpairs", values)
-    if np.any(values <= 0):
+    if symmetric and np.any(values <= 0):
         where = place(int(np.argmin(values)), values.shape or (1,))
         raise ValueError(f"the mass of eigenpairs must be > 0, got {np.min(values):g} at {where}")
     return DiagonalMass(mass if isbox(mass) else values.astype(np.result_type(values, float)))
@@ -299,40 +354,6 @@ def _not_symmetric(pencil, has_coefficients):
     return TypeError(
         f"eigenpairs takes a symmetric operator, and {name} is not; write symmetric=False for its eigenvalues{advice}"
     )
-
-
-def _general(problem, pencil):
-    """Return the eigenvalues of an operator that need not be symmetric."""
-    values = general_values(pencil, problem.settings)
-
-    def forward(*coefficients):
-        return values
-
-    def refused(*args):
-        raise DerivativeError(
-            "eigenpairs with symmetric=False has no derivatives; a symmetric operator has them with symmetric=True"
-        )
-
-    return GeneralEigenvalues(Rule("eigenpairs", forward, refused, refused)(*problem.coefficients))
-
-
-class GeneralEigenvalues(Frozen):
-    """The eigenvalues of an operator that need not be symmetric.
-
-    Attributes
-    ----------
-    values : array, shape (k,)
-        Complex in general, in ascending order of their real parts.
-    """
-
-    values: Any
-    attribute_suggestions = {"vectors": "eigenpairs(op, k) of a symmetric operator: symmetric=False gives values only"}
-
-    def __init__(self, values: Any) -> None:
-        super().__init__(values=values)
-
-    def __repr__(self) -> str:
-        return f"<{len(self.values)} eigenvalues>"
 
 
 class Eigenpairs:

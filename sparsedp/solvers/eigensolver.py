@@ -47,7 +47,18 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["DENSE_UP_TO", "METHODS", "EigenSettings", "Pencil", "Spectrum", "general_values", "symmetric_pairs"]
+__all__ = [
+    "AT_ROUNDOFF",
+    "DENSE_UP_TO",
+    "METHODS",
+    "ROUNDING",
+    "EigenSettings",
+    "Pencil",
+    "Spectrum",
+    "general_values",
+    "symmetric_pairs",
+    "with_fixed_sign",
+]
 
 METHODS = ("auto", "dense", "arpack", "lobpcg")
 DENSE_UP_TO = 512  # unknowns for which "auto" takes LAPACK: 0.1 s
@@ -63,6 +74,9 @@ CLEARANCE = 1e-3  # smallest distance of the first shift below negative eigenval
 OFFSET_OF_SHIFT = 1e-11  # distance from a shift of the user, which may be an eigenvalue, relative to the mean size
 SYMMETRIC = 1e-12  # two products that should be equal may differ by this share of their sizes
 LARGEST_EXPONENT = 200  # an operator or a mass beyond this power of two is scaled
+ROUNDING = 1e-12  # eigenvalues that differ by this share of the size of the operator are equal
+SINGULAR_MASS = 1e12  # condition number beyond which a mass counts as singular
+LARGEST_FINITE = 1e3  # in units of the largest row of A over the mean of M: a larger eigenvalue is one at infinity
 AT_ROUNDOFF = 128 * EPS  # residuals below this share of the terms are rounding errors
 ZERO_AT_ROUNDOFF = 4 * EPS  # lambda M v below this share of the terms of A v is 0
 LARGE_CONTRAST = 1e6  # of the mass; beyond it, errors name it as the reason
@@ -488,7 +502,7 @@ def symmetric_pairs(pencil: Pencil, settings: EigenSettings) -> Spectrum:
     order = _distances(values, scaled_which).argsort(kind="stable")
     chosen = order[:k][np.argsort(values[order[:k]], kind="stable")]
     beyond = values[order[k : k + 1]]
-    vectors = np.array([_with_fixed_sign(vector) for vector in vectors[chosen]])
+    vectors = np.array([with_fixed_sign(vector) for vector in vectors[chosen]])
     residuals = [PairResidual.of(pencil, *pair) for pair in zip(values[chosen], vectors, strict=True)]
     _check_residuals(residuals, pencil, method)
     is_zero = np.array([residual.is_zero for residual in residuals], bool)
@@ -877,7 +891,7 @@ def _advice(pencil, method):
     return "write method='arpack', or a larger rtol"
 
 
-def _with_fixed_sign(vector):
+def with_fixed_sign(vector: NDArray[Any]) -> NDArray[Any]:
     """Return a vector times a number of magnitude 1, such that its first large entry is positive."""
     sizes = np.abs(vector)
     first = vector[np.argmax(sizes > 0.5 * np.max(sizes, initial=0.0))] if vector.size else 1.0
@@ -913,21 +927,55 @@ def general_values(pencil: Pencil, settings: EigenSettings) -> NDArray[Any]:
     n = pencil.unknowns
     is_small = n <= GENERAL_DENSE_UP_TO or DENSE_SHARE * (k + 2) > n
     if settings.method == "dense" or (settings.method == "auto" and is_small):
-        values = _general_dense(pencil)
+        values = _general_dense(pencil, which)
     else:
         values = _general_by_arpack(pencil, k, which, settings.maxiter)
     nearest = _distances(values.real if isinstance(which, str) else values, which).argsort(kind="stable")
-    return _in_given_units(pencil, np.sort_complex(values[nearest[:k]]))
+    _check_finite_ones(pencil, values[nearest[:k]])
+    return _in_given_units(pencil, _sorted(values[nearest[:k]].astype(complex)))
 
 
-def _general_dense(pencil):
-    """Return all eigenvalues, by LAPACK."""
+def _sorted(values):
+    """Return eigenvalues in ascending order of their real parts; those with equal ones in that of the imaginary parts.
+
+    The real parts of a conjugate pair may differ by rounding.
+    """
+    values = values[np.argsort(values.real, kind="stable")]
+    is_next = np.diff(values.real, prepend=-np.inf) > TIE * np.max(np.abs(values), initial=0.0)
+    return values[np.lexsort((values.imag, np.cumsum(is_next)))]
+
+
+def _general_dense(pencil, which):
+    """Return all eigenvalues, by LAPACK; with a singular mass the finite ones, from the inverse of A - sigma M."""
     if pencil.unknowns > DENSE_AT_MOST:
         raise _too_large(pencil.unknowns)
     stiffness, mass = (matrix.toarray() for matrix in pencil.matrices)
     if pencil.mass is None:
         return la.eigvals(stiffness)
-    return la.eigvals(stiffness, mass)
+    if np.linalg.cond(mass) < SINGULAR_MASS:
+        return la.eigvals(stiffness, mass)
+    if isinstance(which, str):
+        raise ValueError(f"a singular mass needs a shift, got which={which!r}; write a number as which")
+    sigma = which - OFFSET_OF_SHIFT * pencil.scale
+    if which.imag == 0:
+        sigma = sigma.real
+    with np.errstate(all="ignore"):
+        return sigma + 1.0 / la.eigvals(la.solve(stiffness - sigma * mass, mass))
+
+
+def _check_finite_ones(pencil, values):
+    """Raise ValueError for eigenvalues at infinity, which a singular mass has."""
+    if pencil.mass is None:
+        return
+    diagonal = np.abs(pencil.matrices[1].diagonal())
+    contrast = float(np.mean(diagonal)) / float(np.min(diagonal[diagonal > 0], initial=np.inf))
+    largest = LARGEST_FINITE * max(contrast, 1.0) * float(np.max(pencil._row_sums, initial=0.0))
+    count = int(np.count_nonzero(np.abs(values) <= largest))
+    if count < values.size:
+        raise ValueError(
+            f"eigenpairs got k={values.size}, but {pencil.name} with this mass has {count} finite eigenvalues near "
+            "the number given as which; write a smaller k"
+        )
 
 
 def _general_by_arpack(pencil, k, which, maxiter):
@@ -936,14 +984,12 @@ def _general_by_arpack(pencil, k, which, maxiter):
 
     shape = pencil.size, pencil.size
     dtype = pencil.dtype
-    options: dict[str, Any] = {"which": {"smallest": "SR", "largest": "LR"}.get(str(which), "LM")}
     if not isinstance(which, str):
         sigma = which.real if which.imag == 0 else which
         sigma = sigma - OFFSET_OF_SHIFT * pencil.scale
         solve = pencil.shifted_inverse(sigma, INNER_RTOL, False)
         if isinstance(sigma, complex):
             dtype = complex
-        options.update(sigma=sigma, OPinv=LinearOperator(shape, solve, dtype=dtype))
     elif pencil.mass is not None:
         raise ValueError(
             "method arpack for an operator that is not symmetric, with a mass, needs a shift, got "
@@ -959,23 +1005,22 @@ def _general_by_arpack(pencil, k, which, maxiter):
 
         with _arpack_errors(k):
             act_op = LinearOperator(shape, act, dtype=dtype)
-            values, vectors = eigs(act_op, k, v0=pencil.start, maxiter=maxiter, **options)
+            end = {"smallest": "SR", "largest": "LR"}[which]
+            values, vectors = eigs(act_op, k, v0=pencil.start, maxiter=maxiter, which=end)
         value_of = partial(np.add, -offset)
         return _with_missing_values(pencil, k, which, maxiter, value_of(values), vectors, act, value_of)
-    mass_op = None if pencil.mass is None else LinearOperator(shape, pencil.apply_mass, dtype=dtype)
-    with _arpack_errors(k):
-        values, vectors = eigs(
-            LinearOperator(shape, pencil.apply_stiffness, dtype=dtype),
-            k,
-            mass_op,
-            v0=pencil.start,
-            maxiter=maxiter,
-            **options,
-        )
 
     def inverse(x):
         return solve(pencil.apply_mass(x))
 
+    start = pencil.start
+    if pencil.mass is not None:
+        start = inverse(inverse(start))  # has no part in the space of eigenvalues at infinity
+    with _arpack_errors(k):
+        act_op = LinearOperator(shape, inverse, dtype=dtype)
+        numbers, vectors = eigs(act_op, k, v0=start, maxiter=maxiter, which="LM")
+    with np.errstate(all="ignore"):
+        values = sigma + 1.0 / numbers
     return _with_missing_values(pencil, k, which, maxiter, values, vectors, inverse, lambda mu: sigma + 1.0 / mu)
 
 

@@ -27,6 +27,7 @@ from sparsedp.solvers.direct import DENSE_UP_TO
 from sparsedp.solvers.inverse import Inverse, Solution, build, build_dense
 from sparsedp.solvers.records import failure
 from sparsedp.solvers.sparsity import ColouredPattern, dense_pattern, find_pattern, pattern_like, stencil_pattern
+from sparsedp.solvers.system import System
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -59,14 +60,14 @@ class Linearisation:
 
     Parameters
     ----------
-    solver : Solver
+    solver : Solver, or Unfactored for products only
         Of J.
     point : Point
     checked : bool
         Whether J is known to be the derivative of the residual.
     """
 
-    def __init__(self, solver: Solver, point: Point, checked: bool) -> None:
+    def __init__(self, solver: Any, point: Point, checked: bool) -> None:
         self.solver = solver
         self.point = point
         self.checked = checked
@@ -149,6 +150,17 @@ class Linearisation:
         differences = np.abs(self.product(v) - expected) / np.where(size > 0, size, 1.0)
         row = int(np.argmax(differences)) if differences.size else 0
         return float(np.max(differences, initial=0.0)), row
+
+
+class Unfactored(NamedTuple):
+    """An Operator in the place of its Solver, for products."""
+
+    op: Operator
+
+    @property
+    def system(self) -> System:
+        """The system of the Operator."""
+        return System(self.op)
 
 
 class KnownPattern(NamedTuple):
@@ -257,6 +269,14 @@ class Jacobians:
         if self.complete_pattern(linearisation):
             return self.evaluate(equation, x, leaves)
         return linearisation
+
+    def operator(self, equation: Any, x: Any, leaves: Sequence[Any]) -> Operator:
+        """Return the Jacobian at a point as an Operator, compared with the residual, without a set-up for solves."""
+        op, is_exact = self._operator(equation, x, leaves)
+        unfactored = Linearisation(Unfactored(op), Point(equation, *copied((x, leaves))), is_exact)
+        if self.complete_pattern(unfactored):
+            op, _ = self._operator(equation, x, leaves)
+        return op
 
     def relaxed_solver(
         self, equation: Any, x: Any, leaves: Sequence[Any], time_step: float, near: Engine | None

@@ -189,7 +189,7 @@ def steady(residual: Callable[..., Any], guess: Any, *params: Any, **options: An
 
     See Also
     --------
-    implicit, continuation
+    implicit, continuation, eigenpairs
 
     Notes
     -----

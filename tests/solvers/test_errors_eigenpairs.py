@@ -19,6 +19,8 @@ SOLVE = dp.elliptic_solver(dp.divergence(GRID), dp.gradient(GRID, dp.dirichlet))
 L = -dp.laplacian(GRID, dp.dirichlet)
 TWO = dp.from_matrix(np.eye(2), name="one")
 WIND = dp.from_matrix([[1.0, 2.0], [0.0, 1.0]], name="wind")
+REGULAR = dp.from_matrix([[1.0, 2.0], [0.5, 3.0]])
+DOUBLE = dp.from_matrix(2 * np.eye(3))
 HERMITIAN = dp.from_matrix([[2.0, 1j], [-1j, 2.0]], name="hermitian")
 LINE = dp.from_functions(lambda u: 2 * u, lambda u: 2 * u, 600, 600, name="line")
 LONG = dp.upwind(dp.Grid(40, periodic=True), 0, 1)
@@ -185,15 +187,43 @@ TABLE = [
         "eigenpairs found 0 of 3 pairs; increase maxiter, or write a number near them as which",
     ),
     (
-        lambda: dp.eigenpairs(WIND, symmetric=False).vectors,
-        AttributeError,
-        "GeneralEigenvalues has no attribute 'vectors'; write eigenpairs(op, k) of a symmetric operator: "
-        "symmetric=False gives values only",
+        lambda: grad(lambda m: anp.real(dp.eigenpairs(REGULAR, mass=m, symmetric=False).vectors[0, 0]))(1.0),
+        DERIVATIVE,
+        "the vectors of eigenpairs with symmetric=False have no derivatives; differentiate functions of pairs.values",
+    ),
+    (
+        lambda: grad(grad(grad(lambda m: anp.real(dp.eigenpairs(REGULAR, mass=m, symmetric=False).values[0]))))(1.0),
+        DERIVATIVE,
+        "eigenvalues of eigenpairs with symmetric=False have first and second derivatives, no third ones",
+    ),
+    (
+        lambda: dp.eigenpairs(DOUBLE, symmetric=False, which=2.0).vectors,
+        FAILED,
+        "eigenpairs found no vectors for eigenvalue 0, which may be a multiple one: the matrix is singular; write a "
+        "number near it as which",
+    ),
+    (
+        lambda: dp.eigenpairs(REGULAR, symmetric=False, mass=np.array([1.0, 0.0])),
+        VALUE,
+        "a singular mass needs a shift, got which='smallest'; write a number as which",
+    ),
+    (
+        lambda: dp.eigenpairs(REGULAR, 2, 1.5, symmetric=False, mass=np.array([1.0, 0.0])),
+        VALUE,
+        "eigenpairs got k=2, but matrix with this mass has 1 finite eigenvalues near the number given as "
+        "which; write a smaller k",
+    ),
+    (
+        lambda: dp.eigenpairs(lambda x, p: p * x, symmetric=False, coefficients=np.ones(2)),
+        TypeError,
+        "eigenpairs of a residual needs the state and the parameters of its Jacobian, got ndarray; write "
+        "coefficients=(x, *params)",
     ),
     (
         lambda: grad(lambda m: anp.real(dp.eigenpairs(WIND, mass=m, symmetric=False).values[0]))(1.0),
         DERIVATIVE,
-        "eigenpairs with symmetric=False has no derivatives; a symmetric operator has them with symmetric=True",
+        "eigenvalue 0 of eigenpairs, 1+0j, has no derivative: it is a multiple one, or another one is at a distance of "
+        "0.0e+00",
     ),
     (
         lambda: grad(lambda m: dp.eigenpairs(HERMITIAN, mass=m).values[0])(1.0),
