@@ -316,8 +316,8 @@ class Adaptive(Scheme):
         _, params, t, h = untraced(starts[0])
         slopes = self._length_slopes(path, params, t, h, event)
         return [
-            self._replayed(path, slopes, less, event, *start)
-            for less, start in zip(WEIGHT_REDUCTIONS, starts, strict=True)
+            self._replayed(path, slopes, weight_reduction, event, *start)
+            for weight_reduction, start in zip(WEIGHT_REDUCTIONS, starts, strict=True)
         ]
 
     def tree(self, u: Any) -> Any:
@@ -531,14 +531,14 @@ class Adaptive(Scheme):
         start = FlatDeviation(arguments, has_derivative, sizes)
         end = FlatDeviation(path[-1].new, is_variable, self.sizes(path[0].u, path[-1].new))
         perturb, evaluate = linear(f"{self.name}.variation", *self.perturbed_solutions(len(path), arguments))
-        entered = perturb(start.deviation(arguments))
-        return end.tree(evaluate(self._deviations_at_end(path, plain_arguments, start, end, entered)))
+        initial_deviations = perturb(start.deviation(arguments))
+        return end.tree(evaluate(self._deviations_at_end(path, plain_arguments, start, end, initial_deviations)))
 
     def _deviations_at_end(
-        self, path: list, arguments: tuple, start: FlatDeviation, end: FlatDeviation, entered: Any
+        self, path: list, arguments: tuple, start: FlatDeviation, end: FlatDeviation, initial_deviations: Any
     ) -> Any:
         """Return the deviations of the three solutions at the end, from those at the start."""
-        ends = self.replay(path, [start.tree(x) for x in entered], None)
+        ends = self.replay(path, [start.tree(x) for x in initial_deviations], None)
         return anp.array([end.deviation(new) for new, _ in ends])
 
     def section(self, u: Any, rates: Sequence, half: float) -> tuple[list, float]:
@@ -580,11 +580,19 @@ class Adaptive(Scheme):
         return rows[:turn] + [None] * (len(path) - turn), rest[turn]
 
     def _replayed(
-        self, path: list, slopes: tuple, less: float, event: Event | None, u: Any, params: Any, t: Any, h: Any
+        self,
+        path: list,
+        slopes: tuple,
+        weight_reduction: float,
+        event: Event | None,
+        u: Any,
+        params: Any,
+        t: Any,
+        h: Any,
     ) -> tuple[Any, Any]:
         """Run the accepted steps again, with derivatives; return the last state and the time of the event or None.
 
-        Each new state gets the value of the accepted step. `less` reduces the weight of the extrapolation.
+        Each new state gets the value of the accepted step. `weight_reduction` reduces the weight of the extrapolation.
         """
         rows, rest = slopes
         shift: Any = 0.0  # the sum of all d
@@ -593,8 +601,8 @@ class Adaptive(Scheme):
             half = 0.5 * step.length * h
             start = time_after(time_after(t, step.done * h), shift)
             if event and step is path[-1]:
-                advance = partial(self._advanced, step, self.weight - less)
-                return self._state_at_event(event, step, less, u, params, start, half, advance)
+                advance = partial(self._advanced, step, self.weight - weight_reduction)
+                return self._state_at_event(event, step, weight_reduction, u, params, start, half, advance)
             if row:
                 first = length_shift(u, row[0])
             else:
@@ -606,7 +614,7 @@ class Adaptive(Scheme):
                 second = -returned * plain(half)
             fine = self.scheme(middle, params, time_after(time_after(start, half), first), half + second)
             whole = self.scheme(u, params, start, half + first + (half + second))
-            u = with_values(self.extrapolated(fine, whole, self.weight - less), step.new)
+            u = with_values(self.extrapolated(fine, whole, self.weight - weight_reduction), step.new)
             shift = shift + first + second
             if row:
                 returned = shift / rest
@@ -624,7 +632,7 @@ class Adaptive(Scheme):
         self,
         event: Event,
         step: AcceptedStep,
-        less: float,
+        weight_reduction: float,
         u: Any,
         params: Any,
         t: Any,
@@ -649,7 +657,7 @@ class Adaptive(Scheme):
         point = u, params, t
         plain_point = untraced(point)
         slope = float(push(lambda change: 1.0 * value(plain_point, change), 0.0, [1.0])[1])
-        if not less:
+        if not weight_reduction:
             self._check_transversal(event, step, plain_point, slope, 2.0 * half)
         change: Any = 0.0
         for _ in traces_of(leaves(point)):  # each Newton iteration makes the derivatives of one more order exact

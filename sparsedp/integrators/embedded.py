@@ -10,6 +10,7 @@ rate at its end is not used, as it contains large errors of stiff components.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from copy import copy
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -30,6 +31,7 @@ from sparsedp.integrators.adaptive import (
     FlatDeviation,
     length_shift,
     relative_sizes,
+    with_values,
 )
 from sparsedp.integrators.discontinuities import RateInspector
 from sparsedp.integrators.jacobians import jacobians_of
@@ -43,7 +45,7 @@ if TYPE_CHECKING:
     from sparsedp.integrators.events import Event
     from sparsedp.integrators.problem import Problem
 
-__all__ = ["EVALUATION_ERRORS", "Embedded", "FlatProblem", "norm"]
+__all__ = ["EVALUATION_ERRORS", "Embedded", "FlatProblem", "RecordedStep", "norm"]
 
 EVALUATION_ERRORS = UnstableStepError, NonFiniteError, ConvergenceError  # exceptions of a rate outside its domain
 
@@ -113,10 +115,7 @@ class Embedded(Adaptive):
     params, moving : tree, list of bool
         Plain params of an interval, and for each leaf whether it is traced. Each interval uses a copy of this object.
     record : callable
-        ``record(step, t, h)`` returns the record of an accepted step of the interval: an object with the attributes
-        `step`, `section` (the derivative of the change d of its length) and the method
-        ``state_after(less, v, params, t, length)``, which returns the state after the step, with derivatives; `less` is
-        the weight of the error of the embedded formula in them.
+        ``record(step, t, h)`` returns the `RecordedStep` of an accepted step of the interval.
     """
 
     window = 10 * WINDOW  # a jump with a small tolerance takes thousands of steps
@@ -188,8 +187,8 @@ class Embedded(Adaptive):
             end = FlatDeviation((last.new, time), is_variable, [*sizes, arguments[3]])
         else:
             end = FlatDeviation(last.new, is_variable, sizes)
-        entered = anp.array([start.deviation(one) for one in flat_starts])
-        deviations = run._deviations_at_end(path, arguments, start, end, entered, event)
+        initial_deviations = anp.array([start.deviation(one) for one in flat_starts])
+        deviations = run._deviations_at_end(path, arguments, start, end, initial_deviations, event)
         ends = []
         for number in range(len(starts)):
             new = end.tree(deviations[number])
@@ -256,16 +255,17 @@ class Embedded(Adaptive):
         arguments: tuple,
         start: FlatDeviation,
         end: FlatDeviation,
-        entered: Any,
+        initial_deviations: Any,
         event: Event | None,
     ) -> Any:
         """Return what `_deviations_at_end` returns, with a record of each step, for derivatives of every order."""
         *_, t, h = arguments
         records = [self.record(step, t, h) for step in path]
         ends = []
-        for less, deviation in zip(WEIGHT_REDUCTIONS, entered, strict=False):  # one solution without error control
+        # There is one solution without error control.
+        for error_weight, deviation in zip(WEIGHT_REDUCTIONS, initial_deviations, strict=False):
             v, moving, *times = start.tree(deviation)
-            new, time = self._recorded_end(records, less, event, v, self.with_moving(moving), *times)
+            new, time = self._recorded_end(records, error_weight, event, v, moving, *times)
             ends.append(end.deviation((new, time) if event else new))
         return anp.array(ends)
 
@@ -277,27 +277,89 @@ class Embedded(Adaptive):
         return rebuild([next(replacements) if moves else leaf for leaf, moves in zip(entries, is_moving, strict=True)])
 
     def _recorded_end(
-        self, records: list, less: float, event: Event | None, v: Any, params: Any, t: Any, h: Any
+        self, records: list[RecordedStep], error_weight: float, event: Event | None, v: Any, moving: Any, t: Any, h: Any
     ) -> tuple[Any, Any]:
         """Record the accepted steps; return the last state and the time of the event or None.
 
-        `less` is the weight of the error in the derivative of each new state.
+        `error_weight` is the weight of the error in the derivative of each new state.
         """
         shift: Any = 0.0  # the sum of all d
-        for record in records:
-            length = record.step.length * h
-            start = t + record.step.done * h + shift
-            if record is not records[-1]:
-                change = length_shift(v, [record.section])
-                v = record.state_after(less, v, params, start, length + change)
-                shift = shift + change
-            elif event:
-                advance = partial(record.state_after, less)
-                half = 0.5 * plain(length)
-                return self._state_at_event(event, record.step, less, v, params, start, half, advance)
-            else:
-                v = record.state_after(less, v, params, start, length - shift)
-        return v, None
+        for record in records[:-1]:
+            v, shift = record.after((v, moving, t, h, shift), error_weight)
+        point = v, moving, t, h, shift
+        if event:
+            return records[-1].until_event(event, error_weight, point)
+        return records[-1].after_last(point, error_weight)[0], None
+
+
+class RecordedStep(ABC):
+    """Records an accepted step of a method on the tape.
+
+    Its functions `after`, `after_last` and `until_event` take one point (u, moving params, t, h, sum of all d).
+
+    Parameters
+    ----------
+    parent : Embedded
+        For one interval.
+    step : AcceptedStep
+    t, h : float
+        Start and length of the interval.
+
+    Attributes
+    ----------
+    section : array
+        The derivative of the change d of the step length.
+    """
+
+    section: Any
+
+    def __init__(self, parent: Any, step: AcceptedStep, t: float, h: float) -> None:
+        self.parent = parent
+        self.step = step
+
+    @abstractmethod
+    def stages(self, v: Any, params: Any, t: Any, h: Any) -> Any:
+        """Return the stages of the step, with derivatives."""
+
+    @abstractmethod
+    def new_state(self, v: Any, stages: Any) -> Any:
+        """Return the state after the step."""
+
+    @abstractmethod
+    def embedded_error(self, v: Any, params: Any, t: Any, h: Any, stages: Any) -> Any:
+        """Return the error of the embedded formula."""
+
+    def state_after(self, error_weight: float, v: Any, params: Any, t: Any, h: Any) -> Any:
+        """Return the state after the step. Its derivative contains the weighted error of the embedded formula."""
+        stages = self.stages(v, params, t, h)
+        new = self.new_state(v, stages)
+        if error_weight:
+            new = new + error_weight * self.embedded_error(v, params, t, h, stages)
+        return with_values(new, self.step.new)
+
+    def after(self, point: tuple, error_weight: float = 0.0) -> tuple:
+        """Return the state after the step, and the sum of all d."""
+        v, moving, t, h, shift = point
+        change = length_shift(v, [self.section])
+        start = t + self.step.done * h + shift
+        length = self.step.length * h + change
+        return self.state_after(error_weight, v, self.parent.with_moving(moving), start, length), shift + change
+
+    def after_last(self, point: tuple, error_weight: float = 0.0) -> tuple:
+        """Return the same for the last step, which subtracts the sum of all d."""
+        v, moving, t, h, shift = point
+        start = t + self.step.done * h + shift
+        length = self.step.length * h - shift
+        return self.state_after(error_weight, v, self.parent.with_moving(moving), start, length), 0.0 * shift
+
+    def until_event(self, event: Event, error_weight: float, point: tuple) -> tuple:
+        """Return the state and the time at the end of a step that an event ends."""
+        v, moving, t, h, shift = point
+        start = t + self.step.done * h + shift
+        half = 0.5 * plain(self.step.length * h)
+        params = self.parent.with_moving(moving)
+        advance = partial(self.state_after, error_weight)
+        return self.parent._state_at_event(event, self.step, error_weight, v, params, start, half, advance)
 
 
 def norm(x: np.ndarray) -> float:

@@ -156,8 +156,8 @@ class Interrupted(Scheme):
         end = FlatDeviation((new, time), is_variable, [*Adaptive.sizes(scheme, u, new), h])
         count = sum(len(segment.path) for segment in segments)
         perturb, evaluate = linear(f"{self.name}.variation", *scheme.perturbed_solutions(count, arguments))
-        entered = perturb(start.deviation(arguments))
-        runs = [start.tree(entered[number]) for number in range(len(entered))]
+        initial_deviations = perturb(start.deviation(arguments))
+        runs = [start.tree(initial_deviations[number]) for number in range(len(initial_deviations))]
         continuous: set[int] = set()
         if callable(self.breaks) and len(traces_of(leaves(arguments))) == 1:
             continuous = self._continuous_breaks(segments, plain_arguments[1], h)

@@ -54,9 +54,8 @@ from sparsedp.integrators.adaptive import (
     WEIGHT_REDUCTIONS,
     AcceptedStep,
     FlatDeviation,
-    with_values,
 )
-from sparsedp.integrators.embedded import EVALUATION_ERRORS, Embedded, norm
+from sparsedp.integrators.embedded import EVALUATION_ERRORS, Embedded, RecordedStep, norm
 from sparsedp.integrators.jacobians import jacobians_of
 from sparsedp.integrators.problem import SidedParams, without_side
 from sparsedp.integrators.runge_kutta import as_matrix
@@ -304,7 +303,7 @@ class Radau(Embedded):
         arguments: tuple,
         start: FlatDeviation,
         end: FlatDeviation,
-        entered: Any,
+        initial_deviations: Any,
         event: Event | None = None,
     ) -> Any:
         """Return the deviations at the end, a linear map of the initial deviations of (u, moving params, t, h).
@@ -312,11 +311,11 @@ class Radau(Embedded):
         The vectors inside this function also contain the sum of all d so far, between u and the params. If an event
         ends the path, the deviation of its time is that of t plus the sum of all d.
         """
-        if len(traces_of([entered])) > 1:
-            return self._recorded_deviations(path, arguments, start, end, entered, event)
+        if len(traces_of([initial_deviations])) > 1:
+            return self._recorded_deviations(path, arguments, start, end, initial_deviations, event)
         *_, t, h = arguments
         n = self.problem.size
-        less = np.array(WEIGHT_REDUCTIONS[: len(entered)])
+        error_weights = np.array(WEIGHT_REDUCTIONS[: len(initial_deviations)])
         end_units = np.concatenate([*map(np.ravel, end.units)])
         start_units = np.concatenate([*map(np.ravel, start.units)])
         n_together = int(np.clip(ENTRIES / (9 * n * start_units.size), 1, BATCH_STEPS))
@@ -328,7 +327,7 @@ class Radau(Embedded):
             if x.any():  # the value that the tape records is 0 and needs no work
                 for group in groups:
                     for step, correction in self._linearised(group, path[-1], t, h, event):
-                        y[: n + 1] = step @ y + less * (correction @ y)
+                        y[: n + 1] = step @ y + error_weights * (correction @ y)
             if event:
                 y[n] += y[-2]  # its time: the start, and all d
             return y[: end_units.size].T / end_units
@@ -345,11 +344,11 @@ class Radau(Embedded):
                 for step, correction in self._linearised(group, path[-1], t, h, event)[::-1]:
                     head = y[: n + 1].copy()
                     y[: n + 1] = 0.0
-                    y += step.T @ head + correction.T @ (less * head)
+                    y += step.T @ head + correction.T @ (error_weights * head)
             y[-2] += of_time
             return np.delete(y, n, 0).T * start_units
 
-        return linear(f"{self.name}.steps", tangent, cotangent)[0](entered)
+        return linear(f"{self.name}.steps", tangent, cotangent)[0](initial_deviations)
 
     def _linearised(
         self, steps: list[AcceptedStep], end: AcceptedStep, t: float, h: float, event: Event | None
@@ -460,26 +459,11 @@ class Radau(Embedded):
         return _RecordedStep(self, step, t, h)
 
 
-class _RecordedStep:
-    """Records an accepted step on the tape.
-
-    Parameters
-    ----------
-    parent : Radau
-        For one interval.
-    step : AcceptedStep
-    t, h : float
-        Start and length of the interval.
-
-    Attributes
-    ----------
-    section : array
-        The derivative of the change d of the step length.
-    """
+class _RecordedStep(RecordedStep):
+    """Records an accepted step on the tape: see `RecordedStep`."""
 
     def __init__(self, parent: Radau, step: AcceptedStep, t: float, h: float) -> None:
-        self.parent = parent
-        self.step = step
+        super().__init__(parent, step, t, h)
         n = parent.problem.size
         start = t + step.done * h
         length = step.length * h
@@ -492,8 +476,8 @@ class _RecordedStep:
         self._error_solve = _constant_solve(f"{parent.name}.error", REAL / length * np.eye(n) - jacobians[0])
         self.section = parent.section(step.u, rates[:1], length)[0][0]
 
-    def state_after(self, less: float, v: Any, params: Any, t: Any, h: Any) -> Any:
-        """Return the state after the step, with derivatives; `less` is the weight of the error in them."""
+    def stages(self, v: Any, params: Any, t: Any, h: Any) -> Any:
+        """Return the stages of the step: see `RecordedStep`."""
         problem = self.parent.problem
         z: Any = self.step.middle
         for _ in traces_of([v, *leaves(params), t, h]):
@@ -501,11 +485,15 @@ class _RecordedStep:
             residual = z - h * anp.dot(A, rates)
             residual = anp.ravel(residual - plain(residual))
             z = z - anp.reshape(self._stage_solve(residual), z.shape)
-        new = v + z[2]
-        if less:
-            error = problem(v, params, t) + anp.dot(E, z) / h
-            new = new + less * self._error_solve(error)
-        return with_values(new, self.step.new)
+        return z
+
+    def new_state(self, v: Any, stages: Any) -> Any:
+        """Return the state after the step: see `RecordedStep`."""
+        return v + stages[2]
+
+    def embedded_error(self, v: Any, params: Any, t: Any, h: Any, stages: Any) -> Any:
+        """Return the error of the embedded formula: see `RecordedStep`."""
+        return self._error_solve(self.parent.problem(v, params, t) + anp.dot(E, stages) / h)
 
 
 def _constant_solve(name: str, matrix: np.ndarray) -> Callable:

@@ -39,10 +39,10 @@ import scipy.sparse as sp
 
 from sparsedp._utils.pytree import leaves
 from sparsedp.autodiff.derivative import push, taped
-from sparsedp.autodiff.tape import linear, plain, traces_of
+from sparsedp.autodiff.tape import linear, traces_of
 from sparsedp.errors import ConvergenceError
-from sparsedp.integrators.adaptive import WEIGHT_REDUCTIONS, AcceptedStep, FlatDeviation, length_shift, with_values
-from sparsedp.integrators.embedded import EVALUATION_ERRORS, Embedded, norm
+from sparsedp.integrators.adaptive import WEIGHT_REDUCTIONS, AcceptedStep, FlatDeviation
+from sparsedp.integrators.embedded import EVALUATION_ERRORS, Embedded, RecordedStep, norm
 from sparsedp.integrators.problem import SidedParams, combine, without_side
 from sparsedp.integrators.runge_kutta import as_matrix
 from sparsedp.solvers.adjoint import solve_rule
@@ -343,43 +343,39 @@ class Rosenbrock(Embedded):
         arguments: tuple,
         start: FlatDeviation,
         end: FlatDeviation,
-        entered: Any,
+        initial_deviations: Any,
         event: Event | None = None,
     ) -> Any:
         """Return the deviations at the end, a linear map of the initial deviations of (u, moving params, t, h)."""
-        if len(traces_of([entered])) > 1:
-            return self._recorded_deviations(path, arguments, start, end, entered, event)
+        if len(traces_of([initial_deviations])) > 1:
+            return self._recorded_deviations(path, arguments, start, end, initial_deviations, event)
         _, moving, t, h = arguments
         start_units = np.concatenate([*map(np.ravel, start.units)])
         end_units = np.concatenate([*map(np.ravel, end.units)])
         records = [self.record(step, t, h) for step in path]
-        reductions = WEIGHT_REDUCTIONS[: len(entered)]
+        reductions = WEIGHT_REDUCTIONS[: len(initial_deviations)]
 
-        def end_of(record: _RecordedStep, less: float = 0.0) -> Callable:
-            """Return the function of (u, moving, t, h, sum of all d) for a step: see `_RecordedStep`."""
+        def end_of(record: _RecordedStep, error_weight: float) -> Callable:
+            """Return the function of (u, moving, t, h, sum of all d) for a step: see `RecordedStep`."""
             if record is not records[-1]:
-                return record.after
+                return partial(record.after, error_weight=error_weight)
             if event:
-                return partial(record.until_event, event, less)
-            return record.after_last
+                return partial(record.until_event, event, error_weight)
+            return partial(record.after_last, error_weight=error_weight)
 
         def tangent(x: np.ndarray) -> np.ndarray:
             """Return the tangents at the end for tangents at the start, both divided by the units of deviations."""
             ends = np.zeros((len(reductions), end_units.size))
             if not x.any():  # the value that the tape records is 0 and needs no work
                 return ends
-            for number, less in enumerate(reductions):
+            for number, error_weight in enumerate(reductions):
                 of_state, *others = start.space.split(x[number] * start_units)
-                parts = [of_state]
-                shift: Any = 0.0
+                second: Any = 0.0  # of the sum of all d, at an event of the time
                 for record in records:
                     point = record.step.u, moving, t, h, 0.0
-                    of_state, *parts = push(end_of(record, less), point, [of_state, *others, shift])[1]
-                    if not (event and record is records[-1]):
-                        error, shift = parts
-                        of_state = of_state + less * error
-                        parts = []
-                ends[number] = np.concatenate([*map(np.ravel, [of_state, *parts])]) / end_units
+                    of_state, second = push(end_of(record, error_weight), point, [of_state, *others, second])[1]
+                parts = [of_state, second] if event else [of_state]
+                ends[number] = np.concatenate([*map(np.ravel, parts)]) / end_units
             return ends
 
         def cotangent(g: np.ndarray) -> np.ndarray:
@@ -394,64 +390,28 @@ class Rosenbrock(Embedded):
                     record.pull(sums, reductions, moving, t, h, record is records[-1])
             return np.concatenate([sums.state, sums.rest], 1) * start_units
 
-        return linear(f"{self.name}.steps", tangent, cotangent)[0](entered)
+        return linear(f"{self.name}.steps", tangent, cotangent)[0](initial_deviations)
 
 
-class _RecordedStep:
-    """Records an accepted step on the tape.
-
-    Its functions `after`, `after_last` and `until_event` take one point (u, moving params, t, h, sum of all d).
-
-    Parameters
-    ----------
-    parent : Rosenbrock
-        For one interval.
-    step : AcceptedStep
-    t, h : float
-        Start and length of the interval.
-
-    Attributes
-    ----------
-    section : array
-        The derivative of the change d of the step length.
-    """
+class _RecordedStep(RecordedStep):
+    """Records an accepted step on the tape: see `RecordedStep`; and transposes it."""
 
     def __init__(self, parent: Rosenbrock, step: AcceptedStep, t: float, h: float) -> None:
-        self.parent = parent
-        self.step = step
+        super().__init__(parent, step, t, h)
         rate = parent.problem(step.u, parent.params, t + step.done * h)
         self.section = parent.section(step.u, [rate], step.length * h)[0][0]
 
-    def after(self, point: tuple) -> tuple:
-        """Return the state after the step, the error of the embedded formula, and the sum of all d."""
-        v, moving, t, h, shift = point
-        change = length_shift(v, [self.section])
-        length = self.step.length * h + change
-        new, error = self._end(v, self.parent.with_moving(moving), t + self.step.done * h + shift, length)
-        return new, error, shift + change
+    def stages(self, v: Any, params: Any, t: Any, h: Any) -> list:
+        """Return the stages of the step: see `RecordedStep`."""
+        return self.parent.stages(v, params, t, h, self.step.middle)
 
-    def after_last(self, point: tuple) -> tuple:
-        """Return the same for the last step, which subtracts the sum of all d."""
-        v, moving, t, h, shift = point
-        length = self.step.length * h - shift
-        new, error = self._end(v, self.parent.with_moving(moving), t + self.step.done * h + shift, length)
-        return new, error, 0.0 * shift
+    def new_state(self, v: Any, stages: list) -> Any:
+        """Return the state after the step: see `RecordedStep`."""
+        return combined(v, B, stages)
 
-    def until_event(self, event: Event, less: float, point: tuple) -> tuple:
-        """Return the state and the time at the end of a step that an event ends."""
-        v, moving, t, h, shift = point
-        start = t + self.step.done * h + shift
-        half = 0.5 * plain(self.step.length * h)
-        params = self.parent.with_moving(moving)
-        advance = partial(self.state_after, less)
-        return self.parent._state_at_event(event, self.step, less, v, params, start, half, advance)
-
-    def state_after(self, less: float, v: Any, params: Any, t: Any, h: Any) -> Any:
-        """Return the state after the step, with derivatives; `less` is the weight of the error in them."""
-        new, error = self._end(v, params, t, h)
-        if less:
-            return with_values(new + less * error, self.step.new)
-        return new
+    def embedded_error(self, v: Any, params: Any, t: Any, h: Any, stages: list) -> Any:
+        """Return the last stage: see `RecordedStep`."""
+        return stages[-1]
 
     # ------------------------------------------------------------ the transpose of a step
 
@@ -521,19 +481,14 @@ class _RecordedStep:
         """Replace cotangents of state and time at an event by those before the last step."""
         point = self.step.u, moving, t, h, 0.0
         rows = []
-        for less, of_state, of_time in zip(WEIGHT_REDUCTIONS, sums.state, of_times):
-            tape = taped(end_of(self, less), point, [True] * (len(moving) + 4))
+        for error_weight, of_state, of_time in zip(WEIGHT_REDUCTIONS, sums.state, of_times):
+            tape = taped(end_of(self, error_weight), point, [True] * (len(moving) + 4))
             rows.append([0.0 if part is None else part for part in tape.pull([of_state, of_time])])
         parts = joined(rows, point)
         n = self.step.u.size
         sums.state = parts[:, :n]
         sums.shift = parts[:, -1]
         sums.rest += parts[:, n:-1]
-
-    def _end(self, v: Any, params: Any, t: Any, h: Any) -> tuple:
-        """Return the state after the step and the error of the embedded formula, with derivatives."""
-        stages = self.parent.stages(v, params, t, h, self.step.middle)
-        return with_values(combined(v, B, stages), self.step.new), stages[-1]
 
 
 @dataclass

@@ -7,6 +7,7 @@ import autograd.numpy as anp
 import numpy as np
 import pytest
 import scipy.linalg
+from step_methods import METHODS
 
 import sparsedp as dp
 from sparsedp._utils.counters import recording
@@ -20,19 +21,6 @@ U, V, W = np.random.default_rng(3).standard_normal((3, 4, 3))
 STATE = {"u": U, "v": V, "w": W}
 PARAMS = {"D": 0.3, "F": 0.7, "dt": 0.02}
 LINEAR = {"w": None, "v": (-1e-3 * M @ M, lambda p: 0.5 * p["D"]), "u": (L, lambda p: p["D"])}  # in another order
-METHODS = [
-    "euler",
-    "heun",
-    "ssprk3",
-    "rk4",
-    "backward_euler",
-    "crank_nicolson",
-    "tr_bdf2",
-    "radau",
-    "rodas5p",
-    "imex",
-    "etdrk4",
-]
 
 
 def react(x, p):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import scipy.sparse as sp
+from step_methods import METHODS
 
 import sparsedp as dp
 from sparsedp._utils.counters import recording
@@ -118,20 +119,6 @@ def test_derivatives_of_functions():
 
 
 # ---- linear steps, against the dense matrix, in loops --------------------------------------------------------------
-
-METHODS = [
-    "euler",
-    "heun",
-    "ssprk3",
-    "rk4",
-    "backward_euler",
-    "crank_nicolson",
-    "tr_bdf2",
-    "radau",
-    "rodas5p",
-    "imex",
-    "etdrk4",
-]
 
 
 @pytest.mark.parametrize("method", METHODS)
