@@ -6,6 +6,7 @@ They are caught by what runs by default. All of it:  python -m pytest -m slow te
 import itertools
 import os
 import shutil
+from functools import cache
 from typing import NamedTuple
 
 import pytest
@@ -1432,11 +1433,17 @@ BUGS = {
 }
 
 
+@cache
+def text_of(path, time):
+    """Return the text of a file that was written at a time."""
+    return path.read_text(encoding="utf-8")
+
+
 def planted(folder, bug):
     """Return the file of a copy of the package that holds the bug, and its text with the bug."""
     place = folder / "sparsedp" / bug.place
     files = [place] if place.is_file() else sorted(place.rglob("*.py"))
-    found = [(path, text) for path in files for text in [path.read_text(encoding="utf-8")] if bug.right in text]
+    found = [(path, text) for path in files for text in [text_of(path, path.stat().st_mtime_ns)] if bug.right in text]
     count = sum(text.count(bug.right) for _, text in found)
     assert count == 1, f"{count} times in {bug.place}, once is needed: {bug.right}"
     return next((path, text.replace(bug.right, bug.wrong)) for path, text in found)

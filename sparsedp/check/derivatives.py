@@ -283,23 +283,19 @@ def gradient_as_vjp(
     gradient: Any,
     x: Any,
     *,
-    directions: int = 1,
-    steps: Sequence[float] | None = None,
-    rng: int | np.random.Generator | None = None,
-    grid: Any = None,
-    noise: float = 0.0,
     convention: str | None = None,
     beside: bool = True,
     stages: Sequence[Any] | None = None,
+    **options: Any,
 ) -> DerivativeCheck:
-    """Check the gradient of a loss of another library as its VJP, g * gradient(x)."""
+    """Check the gradient of a loss of another library as its VJP, g * gradient(x), with the options of `check.vjp`."""
 
     def pull(x: Any, g: Any) -> Any:
         slopes = gradient(x) if callable(gradient) else gradient
         return mapped(lambda slope: g * slope, slopes)
 
-    options = _options("check.gradient", directions, steps, rng, grid, noise, beside and callable(gradient))
-    result = _checked_with_stages("vjp", f, {"vjp": pull}, x, options, convention, stages, "gradient(x)")
+    checked = _options("check.gradient", beside=beside and callable(gradient), **options)
+    result = _checked_with_stages("vjp", f, {"vjp": pull}, x, checked, convention, stages, "gradient(x)")
     return _changed(result, kind="gradient")
 
 
@@ -428,12 +424,12 @@ def _needed_arguments(function: Any) -> int | None:
 
 def _options(
     name: str,
-    directions: int,
-    steps: Sequence[float] | None,
-    rng: int | np.random.Generator | None,
-    grid: Any,
-    noise: float,
-    beside: bool,
+    directions: int = 1,
+    steps: Sequence[float] | None = None,
+    rng: int | np.random.Generator | None = None,
+    grid: Any = None,
+    noise: float = 0.0,
+    beside: bool = True,
 ) -> Options:
     """Return the checked options of an audit."""
     check_number(f"noise of {name}", noise, ">= 0")

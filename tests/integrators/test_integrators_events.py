@@ -253,8 +253,15 @@ def test_an_event_at_the_start_does_not_count():
     assert np.array_equal(rest((np.zeros(2), 0.0), 9.81)[0], np.zeros(2))
 
 
-@pytest.mark.parametrize("method", [pytest.param("heun", marks=pytest.mark.whole), "radau"])
-def test_events_at_the_ends_of_intervals(method):
+@pytest.mark.parametrize(
+    ("method", "counts"),
+    [
+        pytest.param("heun", (1, 2, 3, 4), marks=pytest.mark.whole),
+        ("radau", (1, 3)),
+        pytest.param("radau", (2, 4), marks=pytest.mark.whole),
+    ],
+)
+def test_events_at_the_ends_of_intervals(method, counts):
     """Two balls land at t = count dt to rounding, each once, and the gravity of one moves its bounce alone."""
     rate = lambda u, g, t: {"a": falling(u["a"], 10.0, t), "b": falling(u["b"], g, t)}
     events = [
@@ -262,7 +269,7 @@ def test_events_at_the_ends_of_intervals(method):
         (lambda u, g: u["b"][0], lambda u, g: {**u, "b": bounce(u["b"], g)}),
     ]
     step = dp.stepper(method, rate, 0.25, tolerance=1e-3, events=events)
-    for count in (1, 2, 3, 4):
+    for count in counts:
         time = 0.25 * count
         start = {name: np.array([5.0 * time**2, 0.0]) for name in "ab"}
         loss = lambda g: dp.rollout(step, (start, 0.0), g, count + 1)[0]["b"][0]
