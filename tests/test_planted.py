@@ -67,6 +67,12 @@ BUGS = {
         '        return self._solve(-self.divergence(v), nullspace="project")\n',
         "tests/flow/test_cut_projection.py::test_without_a_wall_it_is_the_projection_of_the_grid",
     ),
+    "two walls in a gap whose values are taken as equal": Bug(
+        "operators/cut_wall_slope.py",
+        "        differences = self.of_difference * (",
+        "        differences = 0.0 * self.of_difference * (",
+        "tests/operators/test_cut_operators.py::test_linear_fields_in_gaps_are_exact",
+    ),
     "a wall in a gap at the distance of its whole width": Bug(
         "operators/cut_wall_slope.py",
         "anp.sqrt((thickness / 3.0) ** 2 + ",

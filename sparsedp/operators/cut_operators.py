@@ -188,7 +188,7 @@ class CutOperators(CutGrid):
             return values / self.solid_boundary.b + 0.0 * self._in_cut_cells(u)  # of the shape of a batch
         slope = self._wall_slope
         terms = slope.coefficients * self._flat(u)[..., slope.cells]
-        return self._sum_of_pairs(terms) + slope.of_value * values
+        return self._sum_of_pairs(terms) + slope.terms_of_values(values)
 
     @cached_property
     def _wall_slope(self) -> WallSlope:
@@ -257,7 +257,7 @@ class CutOperators(CutGrid):
         """Return the part of the flux through the wall that does not depend on u, for each cut cell."""
         values = self._wall_values(values)
         if self.solid_boundary.a:
-            slopes = self._wall_slope.of_value * values
+            slopes = self._wall_slope.terms_of_values(values)
         else:
             slopes = values / self.solid_boundary.b
         return self._geometry.areas * self._wall_coefficient(k, wall_k) * slopes

@@ -10,7 +10,14 @@ then gives
 Gaps. In a gap that is narrower than about a cell, the cells in front lie behind the opposite wall. There the slope is
 that of a parabola between two walls: u is taken as the mean over the fluid of the cell, and du/dn = -(u - u_w) / (L/3),
 where L = V / A is half of the width of the gap: the fluid volume around the wall, divided by the area of the walls.
-Both slopes are mixed for L between 0.6 and 0.9 cells, smoothly, so that derivatives in the level exist.
+Where the values at the walls around differ, u and u_w are deviations from a linear function l through the value at the
+wall, which is fitted to the values at the other walls:
+
+    du/dn = dl/dn - (u - l(centre of the cell)) / (L/3).
+
+The differences of the values at the walls are those of the condition, (g_j - g_i) / a, times a L / (a L + b): the share
+that falls off between the walls. So linear fields are exact, and so are sources between walls with one value. Between
+L = 0.6 and 0.9 cells the slope goes over to that of the fit, smoothly, so that derivatives in the level exist.
 """
 
 from __future__ import annotations
@@ -43,6 +50,9 @@ REACH = 3  # number of cells on each side of a cut cell that may be within this 
 # cells around do not determine them.
 SLOPE_DAMPING = 1e-10
 CURVATURE_DAMPING = 1e-3
+# The same for the slopes of a linear function through the values at walls, times (L / 3 / cell width)^2: the distance
+# of two walls in a gap counts, the curvature of one wall does not.
+VALUE_DAMPING = 1e-4
 # The weighted sum of squared distances of cells in front from the wall, in cell widths, from which on the fit alone is
 # used.
 ENOUGH = 0.4
@@ -54,7 +64,10 @@ THINNEST = 1e-3  # half of the width of a gap below which the slope does not bec
 
 
 class WallSlope(NamedTuple):
-    """The slope at the wall, out of the fluid: sum of coefficients * u[cells], plus `of_value` times the given value.
+    """The slope at the wall, out of the fluid, as a linear function of a field u and of the values of the condition.
+
+    It is the sum of coefficients * u[cells] over the pairs of a wall, plus of_value * value, plus the sum of
+    of_difference * (value[others] - value[gap_walls]) over the pairs of walls in gaps.
 
     Attributes
     ----------
@@ -63,12 +76,23 @@ class WallSlope(NamedTuple):
     coefficients : array, shape (pairs,)
     of_value : array, shape (m,)
         For each cut cell.
+    gap_walls, others : int arrays, shape (pairs of walls,)
+        Numbers of two cut cells.
+    of_difference : array, shape (pairs of walls,)
     """
 
     walls: NDArray[np.int64]
     cells: NDArray[np.int64]
     coefficients: Any
     of_value: Any
+    gap_walls: NDArray[np.int64]
+    others: NDArray[np.int64]
+    of_difference: Any
+
+    def terms_of_values(self, values: Any) -> Any:
+        """Return the part of the slopes that the values of the condition add, shape (..., m)."""
+        differences = self.of_difference * (values[..., self.others] - values[..., self.gap_walls])
+        return self.of_value * values + sum_at_places(self.gap_walls, np.shape(self.of_value)[0])(differences)
 
 
 class Pairs(NamedTuple):
@@ -120,7 +144,18 @@ def wall_slope(grid: Grid, geometry: CutGeometry, condition: Any) -> WallSlope:
     slopes = anp.concatenate([of_fit[pairs.walls] * coefficients, slopes_in_gaps])
     of_u = sum_at_places(walls, cut.size)(slopes)
     denominator = condition.a - condition.b * of_u
-    return WallSlope(walls, cells, slopes * (condition.a / denominator)[walls], -of_u / denominator)
+    gap_walls, others, of_difference = _slopes_of_differences(grid, geometry, pairs, widths, distance)
+    inside_gap = condition.a * 3.0 * distance / (condition.a * 3.0 * distance + condition.b)
+    of_difference = of_difference * ((1.0 - of_fit) * inside_gap / denominator)[gap_walls]
+    return WallSlope(
+        walls,
+        cells,
+        slopes * (condition.a / denominator)[walls],
+        -of_u / denominator,
+        gap_walls,
+        others,
+        of_difference,
+    )
 
 
 def _pairs(grid, geometry, widths) -> Pairs:
@@ -177,6 +212,49 @@ def _fitted_slopes(geometry, pairs, widths):
     solution = solve_definite(matrix, outward + [0.0] * (len(basis) - len(outward)))
     coefficients = weights * reduce(add, [z[walls] * term for z, term in zip(solution, basis, strict=True)])
     return coefficients, gather(weights * ahead**2)
+
+
+def _slopes_of_differences(grid, geometry, pairs, widths, distance):
+    """Return what differences between the values at two walls add to the slopes: dl/dn + (l(centre) - u_w) / (L/3).
+
+    Parameters
+    ----------
+    grid, geometry, pairs, widths
+        As above.
+    distance : array, shape (m,)
+        L/3 for each cut cell.
+
+    Returns
+    -------
+    walls, others : int arrays, shape (pairs of walls,)
+    coefficients : array, shape (pairs of walls,)
+    """
+    cut = geometry.cut
+    axes = range(grid.dim)
+    numbers = np.full(grid.cells.size, -1)
+    numbers[cut] = np.arange(cut.size)
+    is_pair = (numbers[pairs.cells] >= 0) & (cut[pairs.walls] != pairs.cells)
+    walls = pairs.walls[is_pair]
+    others = numbers[pairs.cells[is_pair]]
+    centres = [centre.reshape(-1) for centre in grid.centres()]
+    # From the wall to the centroid of the other wall, which may be that of an image across a periodic side.
+    steps = [
+        pairs.offsets[a][is_pair] + (geometry.centroids[a][others] - centres[a][cut[others]]) / widths[a][walls]
+        for a in axes
+    ]
+    to_centre = [(centres[a][cut] - geometry.centroids[a]) / widths[a] for a in axes]
+    weights = geometry.areas[others] * anp.maximum(1.0 - reduce(add, [x**2 for x in steps]) / RADIUS**2, 0.0) ** 2
+    gather = sum_at_places(walls, cut.size)
+    total = gather(weights)
+    total = total + (np.asarray(sample(total)) == 0)
+    matrix = []
+    for i in axes:
+        row = [gather(weights * steps[i] * steps[j]) for j in range(i + 1)]
+        row[i] = row[i] + VALUE_DAMPING * (distance / widths[i]) ** 2 * total
+        matrix.append(row)
+    right = [-geometry.normals[a] / widths[a] + to_centre[a] / distance for a in axes]
+    solution = solve_definite(matrix, right)
+    return walls, others, weights * reduce(add, [z[walls] * step for z, step in zip(solution, steps, strict=True)])
 
 
 def _thickness(grid, geometry, pairs):

@@ -35,6 +35,24 @@ def test_solutions_in_gaps_of_one_cell(half, tolerance):
     assert np.allclose(uniform[gap.is_fluid], 0.7, rtol=1e-9)
 
 
+@pytest.mark.parametrize("condition", [dp.dirichlet, dp.robin(1.0, 0.2)], ids=repr)
+@pytest.mark.parametrize("half", [0.1, 0.3, 0.5, 0.7, 1.0])
+def test_linear_fields_in_gaps_are_exact(half, condition):
+    """The flux from one wall to the other, and the solution: values differ along the walls and across the gap."""
+    grid = dp.Grid((7, 12))
+    sides = {"x": dp.dirichlet}
+    gap = dp.cut_cells(grid, lambda x, y: half - abs(y - 6.0), sides, condition)
+    x, y = gap.centroids
+    slope = np.where(y > 6.0, 3.0, -3.0)
+    values = condition.a * (1.0 + 2.0 * x + 3.0 * y) + condition.b * slope
+    x, y = grid.centres()
+    exact = 1.0 + 2.0 * x + 3.0 * y
+    walls = dp.lift(grid, sides).domain.join(1.0 + 3.0 * y[:1], 15.0 + 3.0 * y[:1], 0.0, 0.0)
+    u = gap.solve(np.zeros(grid.shape), values, walls)
+    assert np.allclose(u, exact * gap.is_fluid, atol=1e-4)
+    assert np.allclose(gap.slopes(u, values), slope * (gap.areas > 0), atol=1e-3)
+
+
 def test_the_slope_in_a_gap_has_derivatives():
     def size(half):
         gap = dp.cut_cells(dp.Grid((2, 8)), lambda x, y: half - abs(y - 4.0), solid_boundary=dp.dirichlet)
