@@ -369,6 +369,18 @@ def test_helmholtz():
     assert "gradient in 4096 speeds: agrees" in printed
 
 
+@example("drag_of_a_shape.py")
+def test_drag_of_a_shape():
+    """10 cells a diameter: published drag and lift, a shape gradient, a shape with less drag."""
+    printed = run("drag_of_a_shape.py")
+    drag, lift = map(float, re.findall(r"published \S+, (\S+)% off", printed))
+    assert drag < 0.5 and lift < 2
+    slope, difference = map(float, re.search(r"slope (\S+), by differences (\S+)", printed).groups())
+    assert slope == pytest.approx(difference, rel=1e-4)
+    before, after = map(float, re.search(r"grid (\S+) -> (\S+) with", printed).groups())
+    assert after < 0.93 * before
+
+
 @example("curved_walls.py")
 def test_curved_walls():
     """Order 2 for cut cells, 1 for a staircase; the charge to 0.5 % on 64^2 cells."""

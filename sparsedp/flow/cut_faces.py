@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ComponentGeometry", "Walls", "cut_faces"]
 
-SMALLEST_AREA = 1e-9  # walls with less than this share of the width of the smallest cell are left out
+SMALLEST_AREA = 1e-12  # in widths of the smallest cell: a wall with less is a point
 
 
 class Walls(NamedTuple):
@@ -55,7 +55,8 @@ class ComponentGeometry(NamedTuple):
     Attributes
     ----------
     apertures, centres : arrays, shape (axis of the component, other axis)
-        Open fraction of each face, and the coordinate of the centre of its open part along the other axis.
+        Open fraction of each face, and the coordinate of the centre of its open part along the other axis; in closed
+        faces, of the place that opens first.
     middle_areas, middle_centres : arrays, shape (cells, other axis)
         Open length of the sides across the axis of the component, and the coordinate of its centre.
     outer_areas : array, shape (axis of the component, nodes of the other axis)
@@ -79,8 +80,8 @@ def cut_faces(grid: Grid, level: Any) -> tuple[list[ComponentGeometry], Walls]:
     fine_level = anp.reshape(from_matrix(refine)(anp.reshape(level, (-1,))), fine.nodes.shape)
     geometry = cut_geometry(fine, fine_level)
     centres = [_open_centres(fine, axis, fine_level, geometry.apertures) for axis in (0, 1)]
-    components = [_component(grid, fine, geometry, centres, component) for component in (0, 1)]
-    return components, _joined_walls(grid, fine, geometry, None)
+    components = [_component(grid, fine, fine_level, geometry, centres, component) for component in (0, 1)]
+    return components, _joined_walls(grid, fine, fine_level, geometry, None)
 
 
 def _midpoint_interpolation(grid, axis):
@@ -128,7 +129,7 @@ def _part(grid, axis, faces):
     return faces[first : first + int(np.prod(grid.face_shape(axis)))]
 
 
-def _component(grid, fine, geometry, centres, component):
+def _component(grid, fine, level, geometry, centres, component):
     """Return the geometry of one component; arrays have the axis of the component first."""
     other = 1 - component
     numbers = [np.arange(np.prod(fine.face_shape(axis))).reshape(fine.face_shape(axis)) for axis in (0, 1)]
@@ -136,6 +137,7 @@ def _component(grid, fine, geometry, centres, component):
     pairs = along.reshape(along.shape[0], grid.shape[other], 2)
     apertures = _part(fine, component, geometry.apertures)
     own, own_centres = _joined(apertures, centres[component], pairs[::2])
+    own_centres = anp.where(np.asarray(sample(own)) > 0, own_centres, _nearest_to_fluid(grid, fine, level, component))
     middle, middle_centres = _joined(apertures, centres[component], pairs[1::2])
 
     sides = np.moveaxis(numbers[other], component, 0)[:, ::2]
@@ -146,7 +148,7 @@ def _component(grid, fine, geometry, centres, component):
     else:
         none = np.zeros((1, sides.shape[1]))
         outer = anp.concatenate([open_lengths[0::2], none]) + anp.concatenate([none, open_lengths[1::2]])
-    walls = _joined_walls(grid, fine, geometry, component)
+    walls = _joined_walls(grid, fine, level, geometry, component)
     return ComponentGeometry(own, own_centres, middle * grid.widths[other], middle_centres, outer, walls)
 
 
@@ -161,15 +163,39 @@ def _joined(apertures, centres, pairs):
     return 0.5 * total, anp.where(is_open, moment / anp.where(is_open, total, 1.0), middle)
 
 
-def _joined_walls(grid, fine, geometry, component):
+def _nearest_to_fluid(grid, fine, level, component):
+    """Return the coordinate, along the other axis, of the place in closed faces that opens first.
+
+    It is a mean of the ends and the middle of the face. The weight of each is the product of the other two levels, so
+    that the place is a continuous function of the level when the face opens.
+    """
+    other = 1 - component
+    level = anp.transpose(level) if component else level
+    level = level[::2]
+    count = grid.shape[other]
+    lower, middle = level[:, 0 : 2 * count : 2], level[:, 1 : 2 * count : 2]
+    upper = level[:, (2 * np.arange(count) + 2) % level.shape[1]]
+    weights = [middle * upper, lower * upper, lower * middle]
+    total = reduce(add, weights)
+    is_known = np.asarray(sample(total)) > 0
+    places = grid.coordinates(other)
+    shift = anp.where(is_known, (weights[2] - weights[0]) / anp.where(is_known, total, 1.0), 0.0)
+    return places + 0.5 * grid.widths[other] * shift
+
+
+def _joined_walls(grid, fine, level, geometry, component):
     """Return the walls of the control volumes of a component, numbered as its faces; of cells, if it is None."""
     smallest = min(float(np.min(widths)) for widths in fine.widths)
-    kept = np.flatnonzero(np.asarray(sample(geometry.areas)) > SMALLEST_AREA * smallest)
-    cells = np.array(np.unravel_index(geometry.cut[kept], fine.shape))
+    is_point = np.asarray(sample(geometry.areas)) <= SMALLEST_AREA * smallest
+    cells = np.array(np.unravel_index(geometry.cut, fine.shape))
     volumes = cells // 2
     shape = grid.shape
-    areas = geometry.areas[kept]
-    points = [centroid[kept] for centroid in geometry.centroids]
+    areas = geometry.areas
+    points = list(geometry.centroids)
+    normals = [
+        anp.where(is_point, of_level, normal)
+        for of_level, normal in zip(_directions(fine, level, cells), geometry.normals, strict=True)
+    ]
     if component is not None:
         volumes[component] = (cells[component] + 1) // 2
         shape = grid.face_shape(component)
@@ -179,11 +205,31 @@ def _joined_walls(grid, fine, geometry, component):
             points[component] = points[component] - turns * grid.size[component]
     flat = np.ravel_multi_index(tuple(volumes), shape)
     places, group = np.unique(flat, return_inverse=True)
-    gather = sum_at_places(group.reshape(-1), places.size)
+    group = group.reshape(-1)
+    gather = sum_at_places(group, places.size)
     total = gather(areas)
-    vectors = [gather(areas * normal[kept]) for normal in geometry.normals]
+    # Walls that are a point have no area, but their area has a derivative.
+    is_empty = np.asarray(sample(total)) <= SMALLEST_AREA * smallest
+    weights = areas + is_empty[group] * smallest
+    vectors = [gather(weights * normal) for normal in normals]
     squares = reduce(add, [vector**2 for vector in vectors])
     is_flat = np.asarray(sample(squares)) > 0
     length = anp.sqrt(anp.where(is_flat, squares, 2.0))
-    normals = [anp.where(is_flat, vector, 1.0) / length for vector in vectors]
-    return Walls(places, total, normals, [gather(areas * point) / total for point in points])
+    joined_normals = [anp.where(is_flat, vector, 1.0) / length for vector in vectors]
+    sums = gather(weights)
+    return Walls(places, total, joined_normals, [gather(weights * point) / sums for point in points])
+
+
+def _directions(fine, level, cells):
+    """Return the unit vector along which the level increases in cells; the components one after the other."""
+    levels = np.asarray(sample(level))
+    corners = {}
+    for shift in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        corners[shift] = levels[tuple((cells[a] + shift[a]) % levels.shape[a] for a in (0, 1))]
+    along_x = corners[1, 0] + corners[1, 1] - corners[0, 0] - corners[0, 1]
+    along_y = corners[0, 1] + corners[1, 1] - corners[0, 0] - corners[1, 0]
+    along_x = along_x / fine.widths[0][cells[0]]
+    along_y = along_y / fine.widths[1][cells[1]]
+    length = np.hypot(along_x, along_y)
+    length[length == 0] = 1.0
+    return along_x / length, along_y / length

@@ -10,8 +10,8 @@ volumes V of whole cells,
 The mass is exact, the gradient of the pressure is the transpose of the divergence, and the momentum fluxes are those
 of `convection` for the velocity A v. The stress on a side is the difference of two velocities. Along the axis of the
 component the centres of two cut faces are not on a line across the side: each value is moved to this line with the
-slope at the wall. The stress at the wall is that of `wall_fit`. Faces without an open part have no unknown; the stress
-on a side towards such a face is that at the wall behind it.
+slope at the wall. The stress at the wall is that of `wall_fit`. A closed face whose control volume holds fluid has an
+unknown too, the continuation of the velocity, which no mass follows: otherwise the equations would jump when it opens.
 
 What the fluid loses at the walls is the force on the body. Its sum equals the balance over any control volume around
 the body, because all fluxes are conservative. Where the wall cuts cells, the truncation error is of first order or
@@ -62,6 +62,7 @@ if TYPE_CHECKING:
 
 __all__ = ["CutFlow", "cut_flow"]
 
+SHORTEST = 1e-3  # distance of two faces below which their difference is not divided by it, in the smallest cell width
 LARGEST_IMBALANCE = 1e-6  # relative imbalance of the given velocities around a region without an outflow
 LARGEST_WALL_IMBALANCE = 0.1  # the same of the velocity of the body, on a wall that is a polygon
 
@@ -119,8 +120,8 @@ def cut_flow(
     Notes
     -----
     **Derivatives.** In the viscosity, the given velocities, the level and the velocity of the body, forward and
-    reverse, to every order: the derivative of the force in the shape of the body. As functions of the level, velocity
-    and force are continuous, with kinks where the wall passes a node or a centre of the grid.
+    reverse, to every order: the derivative of the force in the shape of the body. Where the wall passes a node or a
+    centre of the grid, the derivative in the level is that of one side, and the force may jump by about 1e-4 of it.
 
     **Order.** 2 for the velocity and the force. The pressure in cut cells has order 1; the force has its sum only.
 
@@ -152,8 +153,9 @@ def cut_flow(
 class CutFlow(Reconstructible):
     """Steady flow around a body with a curved wall, as `cut_flow` returns it.
 
-    A flow is ``{"v": faces, "p": cells}``: the mean velocity through the open part of each face, 0 on closed faces, and
-    the pressure divided by the density, 0 in cells without fluid.
+    A flow is ``{"v": faces, "p": cells}``: the mean velocity through the open part of each face, and the pressure
+    divided by the density. On closed faces next to the fluid, v is the smooth continuation of the velocity;
+    elsewhere in the body, velocity and pressure are 0.
 
     Parameters
     ----------
@@ -165,9 +167,10 @@ class CutFlow(Reconstructible):
     apertures : array, shape (faces.size,)
         Fluid fraction of each face.
     face_positions : tuple of arrays, shape (faces.size,)
-        Coordinates of the centre of the open part of each face, to which its velocity belongs.
+        Coordinates of the centre of the open part of each face, to which its velocity belongs; of closed faces, of the
+        place that opens first.
     is_free : bool array, shape (faces.size,)
-        Whether the velocity of a face is an unknown. On other faces it is given, or 0 on faces without fluid.
+        Whether the velocity of a face is an unknown. On other faces it is given, or 0 in the body.
     info : SolveLog
         Records of the last solves.
     """
@@ -192,7 +195,9 @@ class CutFlow(Reconstructible):
         ]
         self.apertures = anp.concatenate(apertures)
         is_open = np.asarray(sample(self.apertures)) > 0
-        self.is_free: NDArray[np.bool_] = free_face_mask(grid, self._sides, None).reshape(-1) & is_open
+        self._has_fluid = [_has_fluid(grid, c, geometries[c]) for c in (0, 1)]
+        has_fluid = np.concatenate(self._has_fluid)
+        self.is_free: NDArray[np.bool_] = free_face_mask(grid, self._sides, None).reshape(-1) & has_fluid
         self._is_open = is_open
 
         parts = [self._component(c, geometries[c], apertures[c]) for c in (0, 1)]
@@ -311,12 +316,15 @@ class CutFlow(Reconstructible):
             Both components [length^3 / time^2 in 2-D].
         """
         v = self._field("v", x["v"])
-        stress = self._at_wall(self._wall_terms(self._weights, v, self._solid))
-        closed_sides = self.apertures * self._pressure_force(x["p"])
-        if self._convection:  # momentum that enters control volumes of closed faces
+        at_wall = self._at_wall(self._wall_terms(self._weights, v, self._solid))
+        pressure = self._sum_of_components(self.apertures * self._pressure_force(x["p"]))
+        # What enters control volumes of closed faces without an equation is taken by the body, too.
+        entering = viscosity * self._stress(self._weights, v, self._solid, np.zeros(self._walls_space.size))
+        if self._convection:
             gain = self._gain(self._fluxes.carried(v) * self._fluxes.carrier(self.apertures * v))
-            closed_sides = closed_sides + ~self._is_open * self.grid.faces.volumes * gain
-        return -viscosity * stress - self._sum_of_components(closed_sides)
+            entering = entering - self.grid.faces.volumes * gain
+        entering = self._sum_of_components((~self._is_open & ~self.is_free) * entering)
+        return entering - viscosity * at_wall - pressure
 
     # ------------------------------------------------------------ the equations
 
@@ -394,13 +402,14 @@ class CutFlow(Reconstructible):
         shape = grid.face_shape(component)
         numbers = np.moveaxis(np.arange(apertures.size).reshape(shape), component, 0)  # of the faces, own axis first
         flat = np.argsort(numbers.reshape(-1))
-        is_open = np.asarray(sample(apertures)) > 0
+        is_open = self._has_fluid[component]
         centres = anp.reshape(geometry.centres, (-1,))[flat]
         walls = geometry.walls
         fit = wall_fit(grid, component, walls, apertures, centres)
         wall_of = np.full(apertures.size, -1)
         wall_of[walls.places] = np.arange(walls.places.size)
         own = np.flatnonzero(is_open[walls.places])
+        shortest = min(float(np.min(widths)) for widths in grid.widths)
         terms = [(walls.places[own], own, walls.areas[own], np.zeros(own.size))]
         tangent = (-walls.normals[1], walls.normals[0])
         corrections = []
@@ -410,7 +419,7 @@ class CutFlow(Reconstructible):
             lower, upper, areas, distances, side_centres = self._pairs(component, axis, geometry, numbers, centres)
             has_area = np.asarray(sample(areas)) > 0
             both = np.flatnonzero(is_open[lower] & is_open[upper] & has_area)
-            conductance = areas[both] / distances[both]
+            conductance = areas[both] / anp.maximum(distances[both], SHORTEST * shortest)
             lowers.append(lower[both])
             uppers.append(upper[both])
             conductances.append(conductance)
@@ -424,11 +433,6 @@ class CutFlow(Reconstructible):
                     by_tangent = moved * tangent[other][wall]
                     corrections.append((lower[both[cut]], wall, by_slope, by_tangent))
                     corrections.append((upper[both[cut]], wall, -by_slope, -by_tangent))
-            for here, there, sign in ((lower, upper, 1.0), (upper, lower, -1.0)):
-                closed = np.flatnonzero(is_open[here] & ~is_open[there] & has_area & (wall_of[there] >= 0))
-                wall = wall_of[there[closed]]
-                area = sign * areas[closed]
-                terms.append((here[closed], wall, -area * walls.normals[axis][wall], area * tangent[axis][wall]))
 
         return {
             "lower": np.concatenate(lowers),
@@ -547,9 +551,10 @@ class CutFlow(Reconstructible):
         component = np.repeat([0, 1], [int(np.prod(part)) for part in grid.faces.parts])
         self._sum_of_components = from_matrix(_selection(component, 2).T, name="sum of components")
 
-        touching = abs(outflow) @ sp.diags_array(self.is_free.astype(float))
+        through = self.is_free & self._is_open
+        touching = abs(outflow) @ sp.diags_array(through.astype(float))
         count, region = connected_components(touching @ touching.T, directed=False)
-        through_ends = np.flatnonzero(self.is_free & (np.asarray((touching > 0).sum(axis=0)).reshape(-1) == 1))
+        through_ends = np.flatnonzero(through & (np.asarray((touching > 0).sum(axis=0)).reshape(-1) == 1))
         has_end = np.zeros(count, bool)
         has_end[region[(touching[:, through_ends]).nonzero()[0]]] = True
         pin = np.zeros(grid.cells.size)
@@ -616,6 +621,21 @@ class CutFlow(Reconstructible):
     def __repr__(self) -> str:
         counts = f"{np.count_nonzero(self._is_open)} of {self._is_open.size} faces are open"
         return f"<cut_flow: {counts}, {self._walls_of_pairs.domain.size} control volumes are cut>"
+
+
+def _has_fluid(grid, component, geometry):
+    """Return the mask of the faces, flat, that are open or whose control volume has an open side."""
+    middle = np.asarray(sample(geometry.middle_areas)) > 0
+    outer = np.asarray(sample(geometry.outer_areas)) > 0
+    if grid.periodic[component]:
+        at_middle = middle | np.roll(middle, 1, 0)
+    else:
+        none = np.zeros((1, middle.shape[1]), bool)
+        at_middle = np.concatenate([middle, none]) | np.concatenate([none, middle])
+    upper = np.roll(outer, -1, 1) if grid.periodic[1 - component] else outer[:, 1:]
+    at_outer = outer[:, : upper.shape[1]] | upper
+    found = (np.asarray(sample(geometry.apertures)) > 0) | at_middle | at_outer
+    return (found.T if component else found).reshape(-1)
 
 
 def _checked_level(grid, level):

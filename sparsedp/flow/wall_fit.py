@@ -91,8 +91,7 @@ def wall_fit(grid: Grid, component: int, walls: Walls, apertures: Any, centres: 
     information = gather(weights * ahead**2)
     blind = anp.maximum(1.0 - information / ENOUGH, 0.0) ** 2
     slopes = slopes * (1.0 - blind)[number]
-    is_open = np.asarray(sample(apertures))[walls.places] > 0
-    own = np.flatnonzero((np.asarray(sample(blind)) > 0) & is_open)
+    own = np.flatnonzero(np.asarray(sample(blind)) > 0)
     smallest = np.minimum(*widths)
     return WallFit(
         np.concatenate([number, own]),

@@ -81,9 +81,10 @@ def cut_geometry(grid: Grid, level: Any) -> CutGeometry:
     volume, areas, vectors, moments = _wall(corners, widths)
     fractions = (counts == len(nodes)).astype(float) + sum_at_places(cut, counts.size)(volume)
 
-    length = anp.sqrt(reduce(add, [v**2 for v in vectors]))
-    is_flat = np.asarray(sample(length)) > 0
-    normals = [anp.where(is_flat, v, 1.0) / anp.where(is_flat, length, np.sqrt(dim)) for v in vectors]
+    squares = reduce(add, [v**2 for v in vectors])
+    is_flat = np.asarray(sample(squares)) > 0
+    length = anp.sqrt(anp.where(is_flat, squares, float(dim)))
+    normals = [anp.where(is_flat, v, 1.0) / length for v in vectors]
     has_area = np.asarray(sample(areas)) > 0
     lowest = np.argmin(np.asarray(sample(corners)), axis=0)
     corner_bits = np.array(list(product((0, 1), repeat=dim)))

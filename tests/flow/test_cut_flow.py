@@ -44,7 +44,7 @@ def test_flow_between_a_plane_wall_of_the_body_and_a_moving_wall(axis, side):
     along = along if axis else ~along
     distance = sign * (flow.face_positions[1 - axis] - place) / (height - place if side else place)
     exact = np.where(along & (flow.apertures > 0), 2.0 * distance, 0.0)
-    assert np.max(abs(x["v"] - exact)) < 1e-7 and np.max(abs(x["p"])) < 1e-7
+    assert np.max(abs(x["v"] - exact)[flow.apertures > 0]) < 1e-7 and np.max(abs(x["p"])) < 1e-7
     shear = 0.1 * 2.0 / (height - place if side else place)
     expected = np.zeros(2)
     expected[axis] = shear * grid.size[axis]
@@ -72,11 +72,11 @@ def between_cylinders(n, convection=True):
     a = -b / OUTER**2
     is_x = np.arange(r.size) < grid.faces.offsets[1]
     exact = (a + b / r**2) * np.where(is_x, CENTRE[1] - py, px - CENTRE[0]) * (flow.apertures > 0)
-    error = x["v"] - exact
+    error = (x["v"] - exact) * (flow.apertures > 0)
     r = radius(*grid.centres())
     inside = (r > INNER + 0.1) & (r < OUTER - 0.1)
     pressure = x["p"] - convection * (a * a * r * r / 2 + 2 * a * b * np.log(r) - b * b / 2 / r**2)
-    assert np.max(abs(flow.force(x, 0.5))) < 1e-10  # of both walls: nothing else takes momentum
+    assert np.max(abs(flow.force(x, 0.5))) < 1e-8  # of both walls: nothing else takes momentum
     volumes = flow.apertures * grid.faces.volumes
     return np.array([np.sqrt(np.sum(volumes * error**2)), np.max(abs(error)), np.std(pressure[inside])])
 
@@ -223,6 +223,20 @@ def test_the_derivative_in_the_level_is_that_of_its_parameter():
     slope = dp.grad(drag)(level)
     difference = (drag(level - 1e-6) - drag(level + 1e-6)) / 2e-6
     assert np.isclose(-np.sum(slope), difference, rtol=1e-6) and difference > 0
+
+
+def test_derivatives_where_the_wall_touches_nodes():
+    """The wall touches nodes at four points, where some cells hold a wall without an area."""
+    grid = dp.Grid((24, 16), size=(3.0, 2.0))
+
+    def drag(radius):
+        flow = dp.cut_flow(grid, disc(1.0, 1.0, radius), CHANNEL)
+        return flow.force(flow.steady(0.15, parabola(grid)), 0.15)[0]
+
+    slope = dp.grad(drag)(0.375)
+    step = 1e-5
+    below, above = ((drag(0.375 + side * step) - drag(0.375)) / (side * step) for side in (-1, 1))
+    assert np.allclose([below, above], slope, rtol=1e-3)
 
 
 def test_a_wrong_derivative_is_caught(monkeypatch):

@@ -57,6 +57,7 @@ SMALL = {
     "pylops_exchange.py": "32",
     "pendulums.py": "10",
     "curved_walls.py": "64",
+    "drag_of_a_shape.py": "10",
 }  # cells, the end time, or gradients; the others run with 16
 NEEDS = {
     "torch_training.py": ["torch"],
