@@ -1,7 +1,9 @@
-"""Folds of the Bratu problem by continuation, and the steady flow in a cube, beside exact and published figures.
+"""Folds by continuation, and steady flows over a step and in a cube, beside exact and published figures.
 
 Run ``python -m benchmarks.branches [cells]`` in the root of the repository: cells an axis of the cube, 16 by default.
 A row of a fold: the parameter on two grids extrapolated (order 2), the exact one, by how much it is off, seconds.
+A row of the step: cells a step height across the channel, the reattachment length in step heights at Reynolds numbers
+300, 400, 600 and 800, seconds; then the lengths extrapolated (order 2), and the published ones.
 A row of the cube at Re 100: least u on x = z = 1/2, largest and least v on y = z = 1/2, seconds from rest, seconds of a
 gradient at the solution, the largest memory of the process. Then the verdicts of `check.gradient` on small grids.
 """
@@ -15,6 +17,8 @@ import autograd.numpy as np
 import sparsedp as dp
 
 FOLDS = {1: 3.513830719, 2: 6.808124423}  # of the Bratu problem on a unit line and square
+# Reattachment lengths by E. Erturk, Computers and Fluids 37 (2008), 633-655.
+LENGTHS = {300: 6.751, 400: 8.237, 600: 10.349, 800: 11.834}
 
 
 def bratu(n, dim):
@@ -35,6 +39,69 @@ def folds():
         seconds = perf_counter() - clock
         ours = (4 * fine - coarse) / 3
         print(f"{2 * n:4}^{dim}    {ours:12.8f} {FOLDS[dim]:12.8f} {abs(ours / FOLDS[dim] - 1):9.1e} {seconds:8.1f}")
+
+
+def growing(h, length, ratio, widest):
+    """Return widths that grow from h by a ratio up to the widest one, and sum to a length."""
+    widths = np.minimum(h * ratio ** np.arange(1, round(length / h)), widest)
+    widths = widths[: np.argmax(np.cumsum(widths) >= length) + 1]
+    return widths * length / np.sum(widths)
+
+
+class Step:
+    """A channel whose height doubles at a step: 12 cells a step height along x, longer far from the vortex."""
+
+    def __init__(self, n, along=12):
+        h = 1.0 / along
+        widths = np.concatenate(
+            [growing(h, 3.0, 1.05, 0.25)[::-1], np.full(14 * along, h), growing(h, 21.0, 1.03, 0.5)]
+        )
+        self.grid = grid = dp.Grid((widths.size, 2 * n), spacing=[widths, 1.0 / n], origin=(-3.0, 0.0))
+        x, y = grid.centres()
+        self.solid = solid = (x < 0) & (y < 1)
+        sides = {"x": (dp.inflow, dp.outflow)}
+        self.D, self.G = dp.divergence(grid), dp.gradient(grid, {"x": (dp.neumann, dp.dirichlet)})
+        self.L, self.convect = dp.face_laplacian(grid, sides, solid), dp.convection(grid, sides, solid)
+        self.free = dp.free_faces(grid, sides, solid)
+        at, height = grid.face_centres(0)
+        parabola = np.where((at == -3.0) & (height > 1), 6 * (height - 1) * (2 - height), 0.0)
+        self.entering = grid.join(parabola, 0.0)
+        self.rest = {"v": self.entering, "p": np.zeros(grid.shape)}
+
+    def __call__(self, state, reynolds):
+        v, p = state["v"], state["p"]
+        momentum = 2.0 / reynolds * self.L(v) - self.convect(v, v) - self.G(p)
+        given = v - self.entering
+        return {"v": self.free(momentum) + given - self.free(given), "p": self.D(v) + self.solid * p}
+
+    def reattachment(self, state):
+        """Return the last zero of u next to the lower wall."""
+        u = self.grid.split(state["v"])[0][:, 0]
+        x = self.grid.face_centres(0)[0][:, 0]
+        last = np.flatnonzero(u < 0)[-1]
+        return x[last] + u[last] / (u[last] - u[last + 1]) * (x[last + 1] - x[last])
+
+
+def steps():
+    """Print the rows of the step."""
+    print("step           " + "  ".join(f"Re {reynolds:4}" for reynolds in LENGTHS) + "  seconds")
+    found = []
+    for n in (24, 36):
+        clock = perf_counter()
+        scene = Step(n)
+        root = dp.implicit(scene, method="direct")
+        x, lengths = scene.rest, []
+        for reynolds in (100, 200, 300, 400, 500, 600, 700, 800):
+            x = root(x, float(reynolds))
+            if reynolds in LENGTHS:
+                lengths.append(scene.reattachment(x))
+        found.append(np.array(lengths))
+        print(
+            f"{n:4} cells     " + "  ".join(f"{length:7.3f}" for length in lengths) + f"{perf_counter() - clock:9.1f}"
+        )
+    extrapolated = (36**2 * found[1] - 24**2 * found[0]) / (36**2 - 24**2)
+    print("extrapolated   " + "  ".join(f"{length:7.3f}" for length in extrapolated))
+    print("published      " + "  ".join(f"{length:7.3f}" for length in LENGTHS.values()))
 
 
 class Cube:
@@ -93,6 +160,11 @@ def verdicts():
     branch = dp.continuation(bratu(16, 1), np.zeros(16), 1.0, 4.0, rtol=1e-13)
     loss = lambda lam: np.sum(branch.solve(-1, lam) ** 2)
     print(f"gradient on the upper branch: {dp.check.gradient(loss, 1.05).verdict}")
+    scene = Step(6, 4)
+    root = dp.implicit(scene, method="direct", rtol=1e-13)
+    x = root(scene.rest, 100.0)
+    length = lambda re: scene.reattachment(root(x, re))
+    print(f"gradient of the step: {dp.check.gradient(length, 100.0).verdict}")
     scene = Cube(4)
     root = dp.implicit(scene, method="schur", rtol=1e-13)
     x = root(scene.rest, 20.0)
@@ -105,5 +177,6 @@ if __name__ == "__main__":
     cells = parser.parse_args().cells
     dp.set_threads(1)
     folds()
+    steps()
     cube(cells)
     verdicts()
