@@ -20,6 +20,7 @@ __all__ = [
     "NonFiniteError",
     "NonFiniteGradientWarning",
     "PosteriorWarning",
+    "RangeWarning",
     "ShapeError",
     "SparsedpError",
     "UnstableStepError",
@@ -72,6 +73,10 @@ class NonFiniteGradientWarning(UserWarning):
     `grad`, `value_and_grad`, `vjp`, `jvp` and `hvp` issue this warning. To raise an error instead, call
     ``warnings.filterwarnings("error", category=sparsedp.errors.NonFiniteGradientWarning)``.
     """
+
+
+class RangeWarning(UserWarning):
+    """An input of a network is outside the range of the training data; see `network.training_range`."""
 
 
 class PosteriorWarning(UserWarning):

@@ -6,6 +6,7 @@ Its parameters are these dicts, nested in dicts, lists or tuples; `minimize` acc
 
 from sparsedp._utils.calls import describe_module
 from sparsedp.network.convolution_layer import convolution
+from sparsedp.network.input_range import training_range
 from sparsedp.network.layers import dense, relu, residual_block, softplus, tanh
 from sparsedp.network.weights import convolution_weights, dense_weights, load, residual_weights, save
 
@@ -21,6 +22,7 @@ __all__ = [
     "save",
     "softplus",
     "tanh",
+    "training_range",
 ]
 
 describe_module(__name__, "dp.network.dense(p, x)")

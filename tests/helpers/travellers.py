@@ -313,6 +313,7 @@ def travellers():
     x = numbers((2, 2, 9))
     p = net.residual_weights(np.random.default_rng(0), 2, 3)
     yield "network", "residual_block", net.residual_block, lambda f: [f(p, x).tobytes()]
+    yield "network", "training_range", net.training_range(x), lambda f: bits(f, x)
     for layer in (net.tanh, net.relu, net.softplus):
         yield "network", layer.__name__, layer, lambda f: bits(f, x)
 

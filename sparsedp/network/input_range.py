@@ -1,0 +1,173 @@
+"""A warning for networks in a time loop whose inputs leave the range of the training data."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sparsedp._utils.base_classes import Reconstructible
+from sparsedp._utils.calls import frames_inside
+from sparsedp._utils.validation import check_finite, check_number
+from sparsedp.autodiff.program_trace import check_values
+from sparsedp.errors import RangeWarning, ShapeError
+
+__all__ = ["TrainingRange", "training_range"]
+
+
+def training_range(inputs: ArrayLike, axis: int | None = None, margin: float = 0.1) -> TrainingRange:
+    """Return a function that returns its argument, and warns when values leave the range of the training inputs.
+
+    Parameters
+    ----------
+    inputs : array
+        The inputs of a network in training, with any leading axes, such as samples and times.
+    axis : int < 0, optional
+        The axis of features or channels, counted from the end: -1 for `dense`, -2 or -3 for `convolution` in one or two
+        dimensions. Each has its own range. Default: one range for all values.
+    margin : float >= 0, optional
+        How far beyond the least and the largest value of training a value may be, as a share of the range.
+
+    Returns
+    -------
+    TrainingRange
+        ``guarded(x)`` returns x, with the derivative 1. The first x with a value outside the range, or NaN, issues a
+        `RangeWarning`. ``guarded.outside(x)`` returns where values are outside.
+
+    Raises
+    ------
+    NonFiniteError
+        If `inputs` contains NaN or infinity.
+    ShapeError
+        If `inputs` is empty or does not have the axis; on use, if x has another number of features.
+    ValueError
+        If `margin` is negative, or `axis` is not negative.
+
+    See Also
+    --------
+    network.dense, network.convolution, rollout
+
+    Notes
+    -----
+    A network that corrects a solver in each time step is trained on states near those of the data. Its own errors lead
+    it to other states, for which it was not trained, and there they may grow without bound. The range is necessary for
+    a state to be like those of training, not sufficient. To raise an error instead of the warning, call
+    ``warnings.filterwarnings("error", category=sparsedp.errors.RangeWarning)``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> guarded = training_range(np.array([[0.0, 10.0], [1.0, 30.0]]), axis=-1)
+    >>> guarded(np.array([1.1, 20.0]))
+    array([ 1.1, 20. ])
+    >>> guarded.outside(np.array([[1.2, 20.0], [0.5, 7.0]]))
+    array([[ True, False],
+           [False,  True]])
+    """
+    inputs = np.asarray(inputs)
+    check_finite("inputs of training_range", inputs)
+    check_number("margin of training_range", margin, ">= 0", "; the default is 0.1")
+    if axis is not None and not (isinstance(axis, (int, np.integer)) and axis < 0):
+        raise ValueError(f"axis of training_range must be a negative integer, got {axis!r}; write -1 for the last axis")
+    if inputs.size == 0 or (axis is not None and inputs.ndim < -axis):
+        raise ShapeError(f"training_range needs inputs with values and with axis {axis}, got shape {inputs.shape}")
+    others = None
+    if axis is not None:
+        others = tuple(number for number in range(inputs.ndim) if number != inputs.ndim + axis)
+    least = np.min(inputs, axis=others)
+    largest = np.max(inputs, axis=others)
+    slack = margin * (largest - least)
+    return TrainingRange(least - slack, largest + slack, axis)
+
+
+class TrainingRange(Reconstructible):
+    """The range of the inputs of a network in training; see `training_range`.
+
+    Parameters
+    ----------
+    lower, upper : arrays
+        The least and the largest value, one number or one for each feature.
+    axis : int or None
+        The axis of the features.
+
+    Attributes
+    ----------
+    has_warned : bool
+        Whether a warning has been issued. Set it to False for another one.
+    """
+
+    name = "training_range"
+
+    def __init__(self, lower: NDArray, upper: NDArray, axis: int | None) -> None:
+        self.lower = lower
+        self.upper = upper
+        self.axis = axis
+        self.has_warned = False
+
+    def recipe(self) -> tuple:
+        """Return the call that builds an equal object, for pickling and copying."""
+        return TrainingRange, (self.lower, self.upper, self.axis)
+
+    def __call__(self, x: Any) -> Any:
+        """Return x, and warn if a value is outside the range.
+
+        Parameters
+        ----------
+        x : array
+
+        Returns
+        -------
+        array
+        """
+        check_values(self._warn, x)
+        return x
+
+    def outside(self, x: Any) -> NDArray:
+        """Return where values of an array are outside the range, or NaN.
+
+        Parameters
+        ----------
+        x : array
+
+        Returns
+        -------
+        bool array like x
+        """
+        x = np.asarray(x)
+        lower, upper = self.lower, self.upper
+        if self.axis is not None:
+            if x.ndim < -self.axis or x.shape[self.axis] != lower.size:
+                raise ShapeError(
+                    f"training_range needs {lower.size} features along axis {self.axis}, got shape {x.shape}"
+                )
+            shape = (-1, *[1] * (-1 - self.axis))
+            lower, upper = lower.reshape(shape), upper.reshape(shape)
+        return ~((x >= lower) & (x <= upper))
+
+    def _warn(self, x: Any) -> None:
+        if self.has_warned:
+            return
+        outside = self.outside(x)
+        if not np.any(outside):
+            return
+        self.has_warned = True
+        first = np.unravel_index(int(np.argmax(outside)), outside.shape)
+        lower, upper = self.lower, self.upper
+        of_feature = ""
+        if self.axis is not None:
+            feature = int(first[self.axis])
+            lower, upper = lower[feature], upper[feature]
+            of_feature = f" of feature {feature}"
+        warnings.warn(
+            RangeWarning(
+                f"{np.count_nonzero(outside)} of {outside.size} inputs of a network are outside the range of training, "
+                f"the first is {np.asarray(x)[first]:.6g}{of_feature}, beside {lower:.6g} to {upper:.6g}; its results "
+                "there are not supported by data: train on longer rollouts or on more states"
+            ),
+            stacklevel=frames_inside() + 1,
+        )
+
+    def __repr__(self) -> str:
+        return f"<training_range of {self.lower.size} features>"
