@@ -60,7 +60,7 @@ def convolution(p: dict[str, Any], x: Any, padding: str = "periodic") -> Any:
 
     See Also
     --------
-    network.dense, network.convolution_weights, network.residual_block
+    network.dense, network.convolution_weights, network.residual_block, network.training_range
 
     Examples
     --------

@@ -47,7 +47,7 @@ def training_range(inputs: ArrayLike, axis: int | None = None, margin: float = 0
 
     See Also
     --------
-    network.dense, network.convolution, rollout
+    network.dense, network.convolution
 
     Notes
     -----

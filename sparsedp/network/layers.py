@@ -36,7 +36,7 @@ def dense(p: dict[str, Any], x: Any) -> Any:
 
     See Also
     --------
-    network.dense_weights, network.convolution
+    network.dense_weights, network.convolution, network.training_range
 
     Examples
     --------
