@@ -30,6 +30,7 @@ def test_speeds_in_a_channel_between_solid_rows():
     np.testing.assert_allclose(speeds, [0, 0.10862927, 0.2104785, 0.2104785, 0.10862927, 0], rtol=1e-7)
 
 
+@pytest.mark.sampled(1)
 @IN_SOLIDS
 @pytest.mark.parametrize("implicit", [False, True])
 def test_viscosity_in_solids(in_solids, implicit, rng):

@@ -268,6 +268,7 @@ GROUNDS = {
 }
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("scheme", ["upwind", "van_leer"])
 @pytest.mark.parametrize("ground", GROUNDS.values(), ids=GROUNDS)
 @pytest.mark.parametrize("spacing", [None, [0.1, 0.2, 0.3, 0.15, 0.2, 0.2, 0.1]], ids=["even", "uneven"])

@@ -73,7 +73,7 @@ def test_runs_are_counted_and_kept_for_the_last_two_points(rng):
 def test_as_the_jacobian_of_implicit(rng):
     """A backward step of foreign code."""
     step = dp.from_blackbox(reaction)
-    start = rng.random((2, 4, 4))
+    start = rng.random((2, 3, 3))
     root = dp.implicit(lambda x, b: 1.1 * x - 0.1 * step(x) - b)
     x = root(start, start)
     assert np.allclose(1.1 * x - 0.1 * reaction(x), start)
