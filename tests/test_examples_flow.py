@@ -117,6 +117,18 @@ def test_backward_step():
     assert slopes[1] == pytest.approx((lengths[2][1] - lengths[0][1]) / 200, rel=0.05)
 
 
+@example("wake_onset.py")
+def test_wake_onset():
+    """6 cells a diameter: Newton's method on the growth rate converges, and its derivative is that of differences."""
+    printed = run("wake_onset.py")
+    rates = [row[1] for row in rows(printed, r"^ +(\S+) +(\S+) +(\S+)$")]
+    assert len(rates) == 3
+    assert abs(rates[2]) < 1e-5 < abs(rates[0])
+    assert rows(printed, r"^onset at Re (\S+), published 46 to 47")[0][0] == pytest.approx(46.5, rel=0.03)
+    slope, difference = rows(printed, r"^derivative (\S+), by differences (\S+)$")[0]
+    assert slope == pytest.approx(difference, rel=1e-3)
+
+
 @example("room.py")
 def test_room():
     """Air that enters leaves, walls are closed, the gradient is right and lowers the loss."""

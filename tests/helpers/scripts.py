@@ -32,6 +32,7 @@ SMALL = {
     "cylinder.py": "10",
     "steady_states.py": "24",
     "backward_step.py": "8",
+    "wake_onset.py": "6",
     "stiff_and_extreme.py": "8",
     "obstacle.py": "10",
     "shape.py": "12",
