@@ -236,6 +236,12 @@ def _of_residual(residual, coefficients, mass, mass_coefficients, settings):
         masses = [mass] * len(unknowns.shapes)
         if keys(mass) is not None:
             masses = paired(mass, state, "mass", advice="; give a mass like the state")
+        for leaf, shape in zip(masses, unknowns.shapes, strict=True):
+            if np.shape(leaf) not in ((), shape):
+                raise ShapeError(
+                    f"the mass of eigenpairs is a number or an array like the state, of shape {shape}, got one of "
+                    f"shape {np.shape(leaf)}"
+                )
         parts = [anp.ravel(leaf * np.ones(shape)) for leaf, shape in zip(masses, unknowns.shapes, strict=True)]
         mass = anp.concatenate(parts)
     problem = GeneralEigenProblem(stiffness, _mass_member(mass, mass_coefficients, domain, False), settings)

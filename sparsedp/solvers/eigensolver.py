@@ -279,11 +279,25 @@ class Pencil:
     def _row_sums(self):
         """Sums of magnitudes in the rows of the unknowns of A, divided by the mean of M."""
         sums = self.weights * self.masked(self.system.magnitude(self.masked(np.ones(self.size))))
-        signs = self.start
-        mass = float(np.real(np.vdot(signs, self.apply_mass(signs)))) / float(np.real(np.vdot(signs, signs)))
+        if self._symmetric:
+            signs = self.start
+            mass = float(np.real(np.vdot(signs, self.apply_mass(signs)))) / float(np.real(np.vdot(signs, signs)))
+        else:
+            mass = self._mean_of_mass
         if self.active is not None:
             sums = sums[self.active]
         return sums / mass if mass > 0 else 0.0 * sums
+
+    @property
+    def _mean_of_mass(self):
+        """Mean sum of magnitudes in the rows of M: a mass that is not symmetric may be of both signs."""
+        if self.mass is None:
+            return 1.0
+        if isinstance(self.mass, Operator):
+            sums = self.masked(self.mass.structure.magnitude()(self.masked(np.ones(self.size))))
+        else:
+            sums = self.masked(np.abs(self.mass.reshape(-1)))
+        return float(np.sum(sums)) / max(self.unknowns, 1)
 
     @cached_property
     def start(self) -> NDArray[Any]:

@@ -214,6 +214,11 @@ TABLE = [
         "which; write a smaller k",
     ),
     (
+        lambda: dp.eigenpairs(lambda x: x, symmetric=False, coefficients=(np.ones(2),), mass=np.ones(3)),
+        SHAPE,
+        "the mass of eigenpairs is a number or an array like the state, of shape (2,), got one of shape (3,)",
+    ),
+    (
         lambda: dp.eigenpairs(lambda x, p: p * x, symmetric=False, coefficients=np.ones(2)),
         TypeError,
         "eigenpairs of a residual needs the state and the parameters of its Jacobian, got ndarray; write "

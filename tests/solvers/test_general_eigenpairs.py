@@ -208,6 +208,31 @@ def test_the_gradient_of_a_growth_rate_agrees():
     assert curvature == pytest.approx((above - below) / 2, rel=1e-5)
 
 
+def test_a_mass_of_both_signs():
+    a, m = random_pencil()
+    m = np.where(np.arange(N) % 2, m, -m)
+    pairs = dp.eigenpairs(FULL, 3, 0.5, coefficients=a, mass=m, symmetric=False)
+    expected = la.eigvals(a.reshape(N, N) / m[:, None])
+    for value in pairs.values:
+        assert np.min(np.abs(expected - value)) < 1e-12
+    opposite = dp.eigenpairs(FULL, 3, -0.5, coefficients=a, mass=-m, symmetric=False)
+    for value in opposite.values:
+        assert np.min(np.abs(pairs.values + value)) < 1e-12
+
+
+@pytest.mark.parametrize(("of_matrix", "of_mass"), [(2.0**300, 1.0), (2.0**-300, 2.0**200), (1.0, 2.0**-300)])
+def test_units_do_not_matter(of_matrix, of_mass):
+    def slope(s, t):
+        def loss(a):
+            pairs = dp.eigenpairs(FULL, 2, (0.3 + 0.5j) * s / t, m * t, a, symmetric=False)
+            return anp.imag(pairs.values[0])
+
+        return dp.grad(loss)(a * s)
+
+    a, m = random_pencil()
+    np.testing.assert_allclose(slope(of_matrix, of_mass) * of_mass, slope(1.0, 1.0), rtol=1e-11, atol=1e-14)
+
+
 # ---- what has no derivative ------------------------------------------------------------------------------------------
 
 
