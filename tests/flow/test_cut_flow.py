@@ -245,9 +245,9 @@ def test_a_wrong_derivative_is_caught(monkeypatch):
 
     right = CutFlow._jacobian
 
-    def wrong(self, x, weights, *rest, **options):
+    def wrong(self, convection, x, weights, *rest):
         doubled = {**weights, "sides": 2.0 * weights["sides"]}
-        return right(self, x, doubled, *rest, **options)
+        return right(self, convection, x, doubled, *rest)
 
     monkeypatch.setattr(CutFlow, "_jacobian", wrong)
     with pytest.raises((dp.errors.DerivativeError, ConvergenceError)):
