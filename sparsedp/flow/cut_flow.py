@@ -248,7 +248,7 @@ class CutFlow(Reconstructible):
         Raises
         ------
         IncompatibleError
-            If more enters a region without an outflow than leaves it.
+            If inflow and outflow of a region without an outflow boundary differ.
         ConvergenceError
             If Newton's method does not find a steady flow; a `guess` for a larger viscosity may help.
         """
@@ -608,8 +608,8 @@ class CutFlow(Reconstructible):
         size = self._closed_regions @ (abs(self._divergence.matrix) @ abs(given))
         if np.any(abs(left) > LARGEST_IMBALANCE * size):
             raise IncompatibleError(
-                "cut_flow: more enters a region through its walls than leaves it; make the given velocity balance, or "
-                "open a wall with dp.outflow"
+                "cut_flow: inflow and outflow through the walls of a region differ; make the given velocity balance, "
+                "or open a wall with dp.outflow"
             )
 
     def _field(self, name, value):

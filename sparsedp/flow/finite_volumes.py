@@ -336,7 +336,7 @@ class FiniteVolumes(Reconstructible):
             )
 
     def _checked_rate(self, u: Any, params: Any, rate_of: Callable | None = None) -> Any:
-        """Return the rate of change of a state, after and before checks; `rate_of` computes it in place of `_rate`."""
+        """Check the state, return its rate of change by `_rate` or `rate_of`, and check that the rate is finite."""
         u = self._checked_state(u)
         self._check_states(u, params)
         rate = (rate_of or self._rate)(u, params)
@@ -426,6 +426,13 @@ class FiniteVolumes(Reconstructible):
         -------
         float [time]
             Infinite if all speeds are 0. Not differentiated.
+
+        Raises
+        ------
+        ValueError
+            If cfl is not > 0, or a speed is negative.
+        ShapeError, NonFiniteError, UnstableStepError
+            As the call.
         """
         check_number("cfl of time_step", cfl, "> 0", "; write cfl=0.4")
         u = plain(self._checked_state(u))
@@ -496,7 +503,7 @@ class ConservationLaw(FiniteVolumes):
         ----------
         u : array, shape (fields, *grid.shape) or grid.shape
         params : tree, optional
-            Passed to flux, speed and source.
+            Passed to flux, speed, source, inflow, equilibrium and the functions of positive, where these are functions.
 
         Returns
         -------

@@ -14,7 +14,7 @@ depths are
 
     h_lower* = max(0, h_lower - max(0, z_upper - z_lower)),   h_upper* = max(0, h_upper - max(0, z_lower - z_upper)),
 
-and F is the flux of Harten, Lax and van Leer for the states (h*, h* v). The cell below feels F, and the
+and F is the flux of Harten, Lax and van Leer for the states (h*, h* v). The rate of the cell below contains F, and the
 pressure g (h_lower^2 - h_lower*^2) / 2 of the step of the ground. Inside the cell the weight of the water on the slope
 is g h (z_upper_end - z_lower_end). Since the sum of the depths at both ends is 2 h, all terms that do not vanish at
 rest add up to
@@ -143,7 +143,9 @@ def shallow_water(
 
     Notes
     -----
-    Water at rest stays at rest to rounding, beside islands too, and water that is lost by no boundary is conserved.
+    Water at rest stays at rest to rounding, beside islands too, and the volume changes only by fluxes through the
+    boundary.
+
     Depths stay >= 0 in an Euler step, and therefore in one of "ssprk3", if dt <= ``law.time_step(u, params, cfl=0.5)``
     in each stage. Water that runs onto dry ground becomes up to twice as fast as the waves of the first state: take a
     smaller cfl, or compute dt again after some steps. A source is not part of this bound.
@@ -336,7 +338,7 @@ class ShallowWater(FiniteVolumes):
         check_values(partial(check_finite, self._what(name)), value)
         return value
 
-    def _pull(self, params: Any) -> Any:
+    def _gravity_at(self, params: Any) -> Any:
         """Return gravity."""
         if not callable(self.gravity):
             return self.gravity
@@ -358,7 +360,7 @@ class ShallowWater(FiniteVolumes):
         return rate - self.friction_rate(u, params) * u
 
     def _rate_without_friction(self, u: Any, params: Any) -> Any:
-        g = self._pull(params)
+        g = self._gravity_at(params)
         ground = self.ground(params)
         total = self._source_term(u, params)
         for axis in self.axes:
@@ -393,7 +395,7 @@ class ShallowWater(FiniteVolumes):
         square = anp.sum(self._velocity(_not_negative(u[:1], u[:1]), u[1 : 1 + self.grid.dim]) ** 2, axis=0)
         moves = square > 0.0
         speed = anp.where(moves, anp.sqrt(anp.where(moves, square, 1.0)), 0.0)  # sqrt has no derivative at 0
-        return is_discharge * (self._pull(params) * roughness**2 * speed / depth ** (4 / 3))
+        return is_discharge * (self._gravity_at(params) * roughness**2 * speed / depth ** (4 / 3))
 
     def _velocity(self, depth: Any, discharge: Any) -> Any:
         """Return discharge / depth, reduced for depths below `dry`, and without overflow."""
@@ -472,7 +474,7 @@ class ShallowWater(FiniteVolumes):
         return anp.concatenate([depth_change, change]) / axis.widths
 
     def _fastest_waves(self, axis: AxisFluxes, u: NDArray, params: Any) -> NDArray:
-        faces, _ = self._faces(axis, u, self._pull(params), self.ground(params), params)
+        faces, _ = self._faces(axis, u, self._gravity_at(params), self.ground(params), params)
         at_faces = np.maximum(-plain(faces.slowest), plain(faces.fastest))[0]
         return np.maximum(axis.part(at_faces, 0, -1), axis.part(at_faces, 1))
 

@@ -162,8 +162,8 @@ def stepper(
         its sparsity pattern. radau computes it from one tape by default, and uses it only in Newton's method. That of
         rodas5p must be exact: its order depends on it.
     damping : pair, optional
-        For leapfrog: the decay rates [1 / time] of the two fields, for example the pair that `sponge` returns. Default:
-        no damping.
+        For leapfrog: the decay rates [1 / time] of the two fields, for example the pair that `sponge` returns, or
+        ``matched_layer(...).damping`` for the state ((p_x, p_y, ...), v). Default: no damping.
     solver, rtol, maxiter, **options
         `method`, tolerance and options of `inverse` (linear problems) or `implicit` (nonlinear problems).
 

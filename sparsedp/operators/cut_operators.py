@@ -43,7 +43,7 @@ __all__ = ["CutOperators", "in_dtype_of"]
 class CutOperators(CutGrid):
     """Operators on the fluid cells around a body with a curved wall.
 
-    All fields may have leading axes, which are a batch. Values in cells and on faces without fluid are not used, and
+    Fields may have leading axes, which are a batch. Values in cells and on faces without fluid are not used, and
     may be NaN; their derivatives are 0.
 
     Parameters
@@ -143,7 +143,9 @@ class CutOperators(CutGrid):
         return in_dtype_of(u, self._at_walls(slopes))
 
     def flux(self, u: Any, values: Any = 0.0, k: Any = 1.0, wall_k: Any = None) -> Any:
-        """Return the integral of k du/dn over the wall in each cell; its sum is the flux into the body.
+        """Return the integral of k du/dn over the wall in each cell; its sum is what enters the fluid through the wall.
+
+        The diffusive flux into the body is minus this sum.
 
         Parameters
         ----------
@@ -267,13 +269,13 @@ class CutOperators(CutGrid):
     def advection(self, u: Any, v: Any, inflow: Any = 0.0, order: int = 1) -> Any:
         """Return -div(v u) by upwind fluxes, redistributed: the rate of an explicit step.
 
-        The sum of ``volumes * advection(u, v)`` is the flux through the walls of the grid, up to rounding.
+        The sum of ``volumes * advection(u, v)`` is the net inflow through the walls of the grid, up to rounding.
 
         Parameters
         ----------
         u : array, a field on the cells; real for order 2
         v : array, a field on the faces, real
-            For example of `project`: its apertures-weighted divergence should be 0.
+            A velocity whose `divergence` is 0, such as the result of `project`.
         inflow : number, or array, a field on the faces
             The value of u that enters through the walls of the grid.
         order : 1 or 2
@@ -326,7 +328,7 @@ class CutOperators(CutGrid):
         return self.is_fluid * leaving / anp.maximum(self.volumes, 0.5 * self.grid.volumes)
 
     def redistribute(self, rate: Any) -> Any:
-        """Return a rate without the step limit of small cells: what a small cell cannot take goes to its neighbours.
+        """Return a rate without the step limit of small cells, whose excess is distributed to their neighbours.
 
         A cell with a fluid fraction f below 1/2 keeps the share 2 f of its rate; the rest becomes the mean over the
         cell and those behind its open faces. The difference is given to all of these, so that the sum of

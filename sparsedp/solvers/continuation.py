@@ -28,6 +28,7 @@ E. L. Allgower, K. Georg, Numerical Continuation Methods, Springer, 1990.
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from functools import cached_property
 from time import perf_counter
@@ -114,13 +115,13 @@ def continuation(
         "arclength" follows the branch around folds, where p turns back (pseudo-arclength continuation). "natural"
         gives p a new value in each step; it raises ConvergenceError at a fold.
     step : float, optional
-        Length of the first step in p. Default: a twentieth of the range.
+        Length of the first step, in units of p: see Notes; at most `largest_step`. Default: a twentieth of the range.
     largest_step : float, optional
-        Largest length of a step, in units of p: see Notes. Default: a tenth of the range.
+        Largest length of a step, in units of p. Default: a tenth of the range, or `step` if that is longer.
     maxsteps : int
         Largest number of steps.
     **options
-        Options of `implicit`: rtol, maxiter, jacobian, sparsity and those of the linear solves.
+        Options of `implicit`: rtol, maxiter (of the first point), jacobian, sparsity and those of the linear solves.
 
     Returns
     -------
@@ -136,7 +137,7 @@ def continuation(
         If `stop` equals `start` up to rounding, or a setting is out of range.
     ConvergenceError
         If there is no steady state at `start` near the guess, or steps become too short. `error.best` is the last
-        steady state that was found.
+        steady state that was found; at `start`, the best iterate of Newton's method.
     NonFiniteError, ShapeError, DerivativeError
         As `steady`. Also DerivativeError if an argument is traced by a derivative: see `Branch.solve`.
     JitError
@@ -206,10 +207,14 @@ def continuation(
         )
     span = abs(stop - start)
     step = FIRST_STEP * span if step is None else check_number("step", step, "> 0")
-    largest_step = LARGEST_STEP * span if largest_step is None else check_number("largest_step", largest_step, "> 0")
+    if largest_step is None:
+        largest_step = max(LARGEST_STEP * span, step)
+    else:
+        largest_step = check_number("largest_step", largest_step, "> 0")
     maxsteps = check_whole("maxsteps", maxsteps, 1)
     root = BranchRoot(*implicit(residual, **options).recipe()[1])
-    check_takes("continuation", residual, 2 + len(params), "lambda x, p: ...")
+    names = ["p", *(f"param_{number}" for number in range(len(params)))]
+    check_takes("continuation", residual, 2 + len(params), f"lambda x, {', '.join(names)}: ...")
     curve = Curve(root, guess, params)
     steps = Steps(start, stop, min(step, largest_step) / span, largest_step / span, maxsteps)
     return Follower(curve, steps, method == "natural").follow(root, guess, params)
@@ -294,9 +299,10 @@ class Branch(Frozen):
         TypeError
             If the index is not an integer, p not a number, or the number of parameters another one.
         """
-        number = check_integer("index of branch.solve", index, -len(self))
-        if number >= len(self):
-            raise IndexError(f"index of branch.solve must be less than {len(self)}, the number of points, got {number}")
+        number = check_integer("index of branch.solve", index, -sys.maxsize)
+        count = len(self)
+        if not -count <= number < count:
+            raise IndexError(f"index of branch.solve must be from {-count} to {count - 1}, got {number}")
         check_number("p of branch.solve", plain(p))
         if len(params) != self.params:
             raise TypeError(
@@ -819,7 +825,10 @@ class Follower:
         return ""
 
     def _add_part(self, point, following):
-        """Do this for two points with at most one fold between them."""
+        """Append `following`, and the fold before it if there is one.
+
+        Return the status word, or "" if the branch continues.
+        """
         if point.tangent[-1] * following.tangent[-1] < 0 and not self.is_natural:
             fold = self._fold(point, following)
             status = self._end_at(fold)
@@ -885,7 +894,8 @@ class Follower:
         """If the range ends between two points, add the point there, and return the status word."""
         start, stop = self.steps.start, self.steps.stop
         direction = np.sign(stop - start)
-        if direction * (following.z[-1] - stop) >= 0:
+        tolerance = self.curve.root.rtol * abs(stop - start)
+        if direction * (following.z[-1] - stop) >= -tolerance:
             limit, status = stop, "reached_stop"
         elif direction * (following.z[-1] - start) <= 0:
             limit, status = start, "returned_to_start"

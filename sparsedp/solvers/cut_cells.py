@@ -92,7 +92,7 @@ def cut_cells(
     Notes
     -----
     **Geometry.** The level is linear in each of the 4 triangles (24 tetrahedra in 3-D) between the centre of a cell and
-    its edges, so that plane walls are exact. Parts of a body that are thinner than a cell are not seen. In gaps
+    its edges, so that plane walls are exact. Parts of a body that are thinner than a cell are not resolved. In gaps
     narrower than about 1.5 cells, u is the mean over the fluid of the cell, and the slope at the wall is that of a
     parabola between two walls.
 
@@ -197,18 +197,33 @@ class CutCells(CutOperators):
         k : number or array, a field on the faces, >= 0
         shift : number or array, a field on the cells
         wall_k : number or array of the shape of the grid, >= 0, optional
-            k at the wall. Default: the mean of k over the open faces of the cell, weighted by their open areas.
+            k at the wall. Default: the mean of k over the open faces of the cell, weighted by their open areas. k,
+            shift and wall_k are the same for a whole batch.
 
         Returns
         -------
         array of the shape and dtype of b; 0 in cells without fluid
             With the leading axes of `values` or `walls` if these have some.
 
+        Raises
+        ------
+        ShapeError
+            If an argument has the wrong shape, or k, shift or wall_k leading axes.
+        ValueError
+            If k or wall_k is negative.
+        NonFiniteError
+            If an argument contains NaN or infinity where it is used.
+        IncompatibleError
+            If all conditions are neumann, there is no shift, and sources and fluxes of a connected region do not
+            balance, unless nullspace="project".
+        ConvergenceError
+            If an iterative solver does not reach rtol.
+
         Notes
         -----
-        If no condition and no shift fixes the level of the solution (only neumann), the sum of ``volumes * u`` is 0 on
-        each connected part of the fluid, as for `inverse`. With nullspace="project" the mean over this part of the
-        fluid is subtracted from the right-hand side.
+        If no condition and no shift determines the constant of the solution (only neumann), the sum of ``volumes * u``
+        is 0 on each connected part of the fluid, as for `inverse`. With nullspace="project" the mean over this part of
+        the fluid is subtracted from the right-hand side.
         """
         return self._solve(b, values, walls, k, shift, wall_k, self._settings.nullspace)
 
@@ -279,7 +294,7 @@ class CutCells(CutOperators):
         ValueError
             If `solid_boundary` is not neumann, or the density is not > 0.
         IncompatibleError
-            If more enters a region through neumann walls than leaves it.
+            If inflow and outflow through the neumann walls of a connected region differ.
         """
         mobility = self._mobility(density)
         field = self._face_field("v", v)
@@ -340,6 +355,6 @@ def _check_balance(dim, outflow, size):
     remainder = np.max(np.abs(outflow), axis=cells, initial=0.0)
     if np.any(remainder > LARGEST_IMBALANCE * np.max(np.abs(size), axis=cells, initial=0.0)):
         raise IncompatibleError(
-            "project of cut_cells: more enters a region through the walls of the grid than leaves it; make the "
+            "project of cut_cells: inflow and outflow through the walls of a connected region differ; make the "
             "velocity on the walls balance, or open a wall with boundary=dp.dirichlet"
         )

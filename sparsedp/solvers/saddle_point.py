@@ -91,7 +91,9 @@ def schur_engine(system: System) -> SchurComplement:
         With status "setup_failed", if a field cannot be coarsened.
     """
     if not system.op.structure.has_entries:
-        raise ValueError(f"schur needs the entries, {system.unscaled} has only products; write method='krylov'")
+        raise ValueError(
+            f"schur needs the entries of a matrix, but {system.unscaled} is matrix-free; write method='krylov'"
+        )
     is_multiplier = find_multipliers(system)
     if not is_multiplier.any():
         raise ValueError(
@@ -206,7 +208,7 @@ class Constants:
         return cls(multipliers[kept], region[kept], weights[kept], scale)
 
     def amount(self, r: NDArray[Any], transposed: bool) -> NDArray[Any]:
-        """Return for each region the multiple of its vector that a residual asks for."""
+        """Return for each region the multiple of its vector that makes a residual orthogonal to its left vector."""
         residual = r[self.multipliers]
         if not transposed:
             residual = residual * self.weights
@@ -417,7 +419,7 @@ def _block(system, own, places):
     coarsest = levels[-1].A.shape[0]
     if coarsest > DENSE_UP_TO:
         raise ConvergenceError(
-            f"schur on {system.unscaled} ends at a level of {coarsest} unknowns, and it may have {DENSE_UP_TO}; "
+            f"the coarsest level of schur on {system.unscaled} has {coarsest} unknowns, the limit is {DENSE_UP_TO}; "
             "write method='direct'",
             info=failure("setup_failed"),
         )

@@ -48,7 +48,7 @@ def test_given_velocities():
     with refused(ValueError, "the viscosity of cut_flow must be > 0, got -1"):
         flow.steady(-1.0)
     message = (
-        "cut_flow: more enters a region through its walls than leaves it; make the given velocity balance, or open a "
+        "cut_flow: inflow and outflow through the walls of a region differ; make the given velocity balance, or open a "
         "wall with dp.outflow"
     )
     with refused(IncompatibleError, message):

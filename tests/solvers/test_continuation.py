@@ -315,9 +315,9 @@ def test_wrong_arguments_of_solve_are_refused():
     branch = dp.continuation(cubic, -3.0, -4.0, -3.0, 1.0)
     n = len(branch)
     assert branch.solve(-n, -4.0, 1.0) == pytest.approx(branch.states[0])
-    with pytest.raises(IndexError, match=r"index of branch\.solve must be less than .*, the number of points, got .*"):
+    with pytest.raises(IndexError, match=r"^index of branch\.solve must be from .* to .*, got .*$"):
         branch.solve(n, -4.0, 1.0)
-    with pytest.raises(ValueError, match=f"index of branch.solve must be an integer >= -{n}, got -{n + 1}"):
+    with pytest.raises(IndexError, match=f"index of branch.solve must be from -{n} to {n - 1}, got -{n + 1}"):
         branch.solve(-n - 1, -4.0, 1.0)
     with pytest.raises(TypeError, match=r"index of branch\.solve must be an integer, got 1\.0"):
         branch.solve(1.0, -4.0, 1.0)
@@ -328,3 +328,13 @@ def test_wrong_arguments_of_solve_are_refused():
         match=r"branch\.solve takes an index, p and 1 other parameters, as many as continuation got, got 0",
     ):
         branch.solve(0, -4.0)
+
+
+def test_the_first_step_and_the_last_one():
+    """`step` is taken as given where `largest_step` is not; a point within rounding of `stop` is the last one."""
+    line = dp.continuation(lambda x, p: x - p, 0.0, 0.0, 1.0, method="natural", step=0.5)
+    assert line.parameter[1] == 0.5
+    line = dp.continuation(lambda x, p: x - p, 0.0, 0.0, 1.0, method="natural", step=0.1, largest_step=0.1)
+    assert len(line) == 11 and line.parameter[-1] == 1.0
+    with pytest.raises(TypeError, match="takes 2; write lambda x, p, param_0: ..."):
+        dp.continuation(lambda x, p: x - p, 0.0, 0.0, 1.0, 2.0)

@@ -482,7 +482,7 @@ def test_projection_around_a_body():
     assert np.isclose(np.sum(weights * body.project(w) * (w - body.project(w))), 0.0, atol=1e-9)
     with pytest.raises(
         IncompatibleError,
-        match="^project of cut_cells: more enters a region through the walls of the grid than leaves it; make the "
+        match="^project of cut_cells: inflow and outflow through the walls of a connected region differ; make the "
         "velocity on the walls balance, or open a wall with boundary=dp.dirichlet$",
     ):
         body.project(entering * (grid.join(grid.face_centres(0)[0], grid.face_centres(1)[0]) < 1.9))

@@ -158,7 +158,9 @@ def test_what_schur_does_not_solve():
         "write method='direct' or 'multigrid'",
     ):
         dp.inverse(line, "schur")
-    with pytest.raises(ValueError, match="schur needs the entries, .* has only products; write method='krylov'"):
+    with pytest.raises(
+        ValueError, match="schur needs the entries of a matrix, but .* is matrix-free; write method='krylov'"
+    ):
         dp.inverse(dp.from_functions(lambda x: x, lambda x: x, 3, 3), "schur")
 
 
@@ -198,6 +200,6 @@ def test_a_field_that_cannot_be_coarsened_is_refused(monkeypatch):
     A[0, 3] = A[3, 0] = 1.0
     with pytest.raises(
         ConvergenceError,
-        match="schur on .* ends at a level of 3 unknowns, and it may have 2; write method='direct'",
+        match="the coarsest level of schur on .* has 3 unknowns, the limit is 2; write method='direct'",
     ):
         dp.inverse(dp.from_matrix(A), "schur")
