@@ -115,7 +115,7 @@ TABLE = [
     (
         lambda: law(boundary=dp.free_slip),
         VALUE,
-        "conservation_law at a free_slip wall needs momentum, the number of a field for each "
+        "momentum of conservation_law, needed at free_slip walls, must be the number of a field for each "
         "axis, got None; write for example momentum=(1,)",
     ),
     (
@@ -339,6 +339,11 @@ TABLE = [
         lambda: dp.stepper("leapfrog", RATES, 0.1, damping=1.0),
         TYPE,
         "damping, for both fields of the state, must be a pair, got float; write (s, None)",
+    ),
+    (
+        lambda: dp.stepper("leapfrog", RATES, 0.1, damping=dp.matched_layer(dp.Grid(20), 8, 1.0)),
+        TYPE,
+        "damping, for both fields of the state, must be a pair, got MatchedLayer; write layer.damping",
     ),
     (
         lambda: dp.stepper("leapfrog", RATES, 0.1, damping=(-1.0, 0.0)),

@@ -223,7 +223,7 @@ def conservation_law(
         check_function("conservation_law, as source,", source, "lambda u, params: ...", 2)
     quantities = _checked_quantities(positive)
     sides = sides_of("conservation_law", grid, boundary, inflow)
-    if any(free_slip in (pair or ()) for pair in sides):
+    if momentum is not None or any(free_slip in (pair or ()) for pair in sides):
         fields = _momentum_fields(grid, momentum)
     else:
         fields = None
@@ -272,7 +272,7 @@ def _momentum_fields(grid: Grid, momentum: Any) -> tuple[int, ...]:
     numbers = {field for field in fields if field is not None and is_whole(field, 0)}
     if not len(fields) == len(numbers) == grid.dim:
         raise ValueError(
-            f"conservation_law at a free_slip wall needs momentum, the number of a field for each axis, "
+            f"momentum of conservation_law, needed at free_slip walls, must be the number of a field for each axis, "
             f"got {momentum!r}; write for example momentum={tuple(range(1, grid.dim + 1))}"
         )
     return tuple(map(int, fields))

@@ -27,6 +27,7 @@ K. S. Yee, IEEE Trans. Antennas Propag. 14 (1966) 302-307 (the scheme); J.-P. Be
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial, reduce
 from math import log
 from operator import mul as multiply
@@ -50,7 +51,7 @@ from sparsedp.integrators.runge_kutta import Scheme
 from sparsedp.solvers.cache import Cache
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     import numpy.typing as npt
 
@@ -95,7 +96,8 @@ class Leapfrog(Scheme):
         for rate in check_pair("the rates of leapfrog", rates, example):
             check_function("a rate of leapfrog", rate, "lambda field, params: ...", 2)
         if damping is not None:
-            check_pair("damping, for both fields of the state,", damping, "(s, None)")
+            example = "layer.damping" if isinstance(damping, MatchedLayer) else "(s, None)"
+            check_pair("damping, for both fields of the state,", damping, example)
         check_values(_check_damping, *leaves(damping))
         self.rates = rates
         self.damping = damping
@@ -420,7 +422,7 @@ def _check_layers(grid: Grid, axis: int, counts: tuple[int, int]) -> None:
 def _counts(name: str, grid: Grid, cells: Any) -> list[tuple[int, int]]:
     """Return the cells of the layers at both ends of each axis; `name` is the caller."""
     bounded = [axis for axis, periodic in zip(grid.axes, grid.periodic, strict=True) if not periodic]
-    depths: dict[str, Any] = dict(cells) if isinstance(cells, dict) else dict.fromkeys(bounded, cells)
+    depths: dict[str, Any] = dict(cells) if isinstance(cells, Mapping) else dict.fromkeys(bounded, cells)
     if set(depths) - set(bounded) or any(np.shape(deep) not in ((), (2,)) for deep in depths.values()):
         raise ValueError(f"{name} needs a number of cells or a pair for axes of {bounded}, got {cells!r}")
     counts = []

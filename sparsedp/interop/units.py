@@ -60,8 +60,8 @@ def with_units(function: Callable, arguments: Sequence[Any], result: Any) -> Sce
     Raises
     ------
     TypeError
-        If `function` is not callable, or `arguments` is no tuple. On use, if an argument is missing, has no unit, or
-        has one that is declared as None.
+        If `function` is not callable, or `arguments` is not a tuple or list. On use, if an argument is missing, has no
+        unit, or has one that is declared as None.
     ValueError
         If pint does not know a unit, or it has an offset. On use, if the dimension of an argument is another one.
 
@@ -368,8 +368,8 @@ class SceneWithUnits(Reconstructible):
         wanted = self._units[name]
         if _exponents(given) != wanted.exponents:
             raise ValueError(
-                f"{place} of {self.name} must have a unit like {wanted.name}, got {given.units}; convert it, or "
-                "declare another unit"
+                f"{place} of {self.name} must have the dimension of {wanted.name}, got {given.units}; give such a "
+                "quantity, or declare another unit"
             )
         value = given.to(wanted.base).magnitude
         if np.asarray(value).dtype.kind in "iu":

@@ -401,7 +401,7 @@ def carry(u, params, axis):
         (dict(boundary=dp.no_slip), "conservation_law takes outflow, free_slip or inflow, got no_slip"),
         (
             dict(boundary=dp.free_slip),
-            "needs momentum, the number of a field for each axis, got None; write for example",
+            "must be the number of a field for each axis, got None; write for example",
         ),
         (dict(boundary=dp.inflow), "side of dp.inflow without inflow="),
         (dict(inflow=1.0), "inflow= without such a side"),
@@ -490,7 +490,7 @@ def test_functions_cannot_write_into_their_arguments(name):
 
 
 def test_one_field_is_the_momentum_of_one_axis():
-    with pytest.raises(ValueError, match=r"needs momentum, the number of a field for each axis, got \(1, 1\); write"):
+    with pytest.raises(ValueError, match=r"must be the number of a field for each axis, got \(1, 1\); write"):
         dp.conservation_law(dp.Grid((3, 4)), carry, carry, boundary=dp.free_slip, momentum=(1, 1))
 
 

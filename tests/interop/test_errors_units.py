@@ -62,7 +62,8 @@ TABLE = [
     (
         lambda: AREA(Q(1.0, "m"), Q(2.0, "s")),
         ValueError,
-        "argument 1 of with_units(area) must have a unit like m, got second; convert it, or declare another unit",
+        "argument 1 of with_units(area) must have the dimension of m, got second; give such a quantity, or declare "
+        "another unit",
     ),
     (
         lambda: with_units(area, ("m", None), "m")(Q(1.0, "m"), Q(2, "s")),
