@@ -108,12 +108,18 @@ class WeightedProjection:
         return fluid.filled(density)
 
     def split(self, v: Any, density: Any) -> tuple[Any, Any]:
-        """Return the velocity without divergence, and the q of the module docstring."""
+        """Return the velocity without divergence, and the q of the module docstring.
+
+        They are computed in double precision and rounded once, because ratios of densities multiply rounding errors.
+        """
         check_values(self._setup.check_faces, v)  # on walls too, where the values are not used
-        v = self._open(v)
         check_values(_check_reciprocal, density)
+        v = self._open(v)
+        dtype = dtype_of(v)
+        v = cast(v, np.result_type(dtype, float))
+        density = cast(density, np.dtype(float))
         q = solved_in_batch(self.solver, 1.0 / density, self._divergence(v))
-        return v + self._gradient(q) / density, q
+        return cast(v + self._gradient(q) / density, dtype), cast(q, dtype)
 
 
 def _check_reciprocal(density):
