@@ -3,6 +3,7 @@
 Both ways run and give the same. The table counts lines of code of the user; it must not grow.
 """
 
+import sys
 import warnings
 from importlib.util import find_spec
 
@@ -278,6 +279,14 @@ LINES = {  # of the user: by hand, now
 
 def lines(code):
     return sum(bool(line.strip()) for line in code.splitlines())
+
+
+@pytest.fixture(autouse=True)
+def precision_of_jax():
+    """Programs below set it for the process, in which tests of its default follow."""
+    yield
+    if "jax" in sys.modules:
+        sys.modules["jax"].config.update("jax_enable_x64", False)
 
 
 @pytest.mark.parametrize("task", TASKS)
