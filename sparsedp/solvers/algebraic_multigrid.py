@@ -224,7 +224,7 @@ class Hierarchy:
     @cached_property
     def T(self) -> Hierarchy:
         """The hierarchy of the transposed cycle."""
-        levels = [Level(_transposed(level.A), _transposed(level.R), _transposed(level.P)) for level in self.levels]
+        levels = [_transposed(level) for level in self.levels]
         solve = self._coarse
 
         def coarse(b: np.ndarray, transposed: bool) -> np.ndarray:
@@ -276,11 +276,12 @@ def _mirrored(sweeps: Sweeps) -> Sweeps:
     return tuple(MIRRORED[sweep] for sweep in reversed(sweeps))
 
 
-def _transposed(matrix: csr_array | None) -> csr_array | None:
-    """Return the transpose of a matrix; return None if the argument is None."""
-    if matrix is None:
-        return None
-    return csr_array(matrix.T.tocsr())
+def _transposed(level: Level) -> Level:
+    """Return the level of the transposed hierarchy. Its P and R share the entries of R and P."""
+    A = csr_array(level.A.T.tocsr())  # sweeps need rows
+    if level.P is None:
+        return Level(A)
+    return Level(A, level.R.T, level.P.T)
 
 
 def ruge_stueben(matrix: csr_array, strength: float, levels: int, second_pass: bool = True) -> list[Level]:
@@ -344,7 +345,8 @@ def _without_residues(pyamg_levels: Sequence) -> list[Level]:
         if level is pyamg_levels[-1]:
             levels.append(Level(A))
         else:
-            levels.append(Level(A, csr_array(level.P), csr_array(level.R)))
+            P = csr_array(level.P)
+            levels.append(Level(A, P, P.T))  # R of PyAMG is a copy of P.T
     return levels
 
 

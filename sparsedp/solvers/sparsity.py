@@ -353,19 +353,21 @@ class ColouredPattern:
         # Ones of one byte, and short indices: large patterns are kept beside their matrices.
         ones = np.ones(pattern.nnz, dtype=np.int8)
         self.pattern = sp.csr_array((ones, pattern.indices, pattern.indptr), shape=pattern.shape)
-        row = rows_of(pattern).astype(np.int32)
-        colours = colours.astype(np.int32)
+        colours = colours.astype(np.min_scalar_type(_count_of(colours)))
         if self.by_rows:
-            self._places = colours[row], pattern.indices
+            self._entry_colours = colours[rows_of(pattern)]
         else:
-            self._places = colours[pattern.indices], row
+            self._entry_colours = colours[pattern.indices]
 
     def matrix(self, product: Product) -> sp.csr_array:
         """Return A on the pattern, given the function of products A v, or A^T v if `by_rows`."""
         table = np.empty((self.count, self.pattern.shape[int(self.by_rows)]))
         for number in range(self.count):
             table[number] = product((self.seeds == number).astype(float))
-        entries = table[self._places]
+        if self.by_rows:
+            entries = table[self._entry_colours, self.pattern.indices]
+        else:
+            entries = table[self._entry_colours, rows_of(self.pattern)]
         return sp.csr_array((entries, self.pattern.indices, self.pattern.indptr), shape=self.pattern.shape)
 
     def acts_as(self, product: Product, tolerance: float) -> bool:
