@@ -112,13 +112,20 @@ def cut_cells(
     --------
     A membrane over a disc, fixed at its edge; its largest deflection is R^2 / 4:
 
-    >>> import numpy as np
-    >>> from sparsedp import Grid, dirichlet
+    >>> import autograd.numpy as np
+    >>> from sparsedp import Grid, dirichlet, grad
     >>> grid = Grid((32, 32), size=2.0, origin=-1.0)
     >>> disc = cut_cells(grid, lambda x, y: 0.8 - np.sqrt(x**2 + y**2), solid_boundary=dirichlet)
     >>> u = disc.solve(np.ones(grid.shape))
     >>> print(np.round(np.max(u), 3), np.round(np.sum(disc.volumes), 2), np.round(-np.sum(disc.flux(u)), 2))
     0.159 2.01 2.01
+
+    The derivative of the area in the radius R, 2 pi R:
+
+    >>> def area(radius):
+    ...     return np.sum(cut_cells(grid, lambda x, y: radius - np.sqrt(x**2 + y**2)).volumes)
+    >>> print(np.round(grad(area)(0.8), 2))
+    5.03
     """
     check_grid("cut_cells", grid)
     return CutCells(grid, level, boundary, solid_boundary, check_settings(method, rtol, maxiter, nullspace, options))
