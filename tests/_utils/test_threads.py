@@ -160,6 +160,7 @@ OPERATORS = {
 }
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("name", OPERATORS)
 def test_inverses(check, name):
     method, op = OPERATORS[name]
@@ -254,6 +255,7 @@ def rate(u, p):
     return p * u * (1 - u)
 
 
+@pytest.mark.whole
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("tolerance", [None, 1e-2])
 @pytest.mark.parametrize(
@@ -546,6 +548,7 @@ sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
 
 
+@pytest.mark.whole
 @NUMBA
 @pytest.mark.parametrize("layer", ["workqueue", pytest.param("default", marks=pytest.mark.whole)])
 def test_teams_of_several_solvers_take_turns(layer):

@@ -111,6 +111,7 @@ def test_one_array_for_all_calls(name, place):
     same_as_fresh(name, place, "gradient")
 
 
+@pytest.mark.whole
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("way", [way for way in WAYS if way != "gradient"])
 @pytest.mark.parametrize(("name", "place"), list(places()))

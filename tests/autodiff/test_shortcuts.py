@@ -264,6 +264,7 @@ def test_small_steps_do_without_the_dispatch_of_autograd(monkeypatch):
     assert len(calls) < STEPS  # 17 functions for each of 4 rates, in each step
 
 
+@pytest.mark.whole
 def test_a_gradient_of_small_steps_takes_a_few_of_their_values():
     def seconds(act):
         times = []

@@ -39,6 +39,7 @@ def test_noise_is_reported_in_digits():
     assert AUDIT(lambda u: float(np.float32(np.sum(u**2))), X, gradient=lambda u: 2.02 * u).verdict == "disagrees"
 
 
+@pytest.mark.whole
 def test_staircase_losses_that_the_steps_of_the_sweep_cannot_see():
     """Powers of two meet a loss in single precision at one place of its stairs; the table of differences does not."""
     loss, x = noisy(6)

@@ -200,6 +200,7 @@ def test_inflow_with_and_without_an_equilibrium():
     np.testing.assert_allclose(*(dp.grad(loss)(wave) for loss in losses), rtol=0, atol=1e-9)
 
 
+@pytest.mark.whole
 def test_wave_of_euler_in_a_plane():
     """A wave of density is carried along the diagonal of a periodic box: order 2, and everything is conserved."""
     errors = []

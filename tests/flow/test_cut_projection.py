@@ -91,5 +91,8 @@ def test_errors(body):
         P(v, np.ones(GRID.shape))
     with pytest.raises(NonFiniteError, match="v of cut_cells must be finite"):
         P(np.nan * v)
-    with pytest.raises(IncompatibleError, match="^project of cut_cells: inflow and outflow through the walls of a connected region differ"):
+    with pytest.raises(
+        IncompatibleError,
+        match="^project of cut_cells: inflow and outflow through the walls of a connected region differ",
+    ):
         dp.projection(GRID, body, {"x": (dp.inflow, dp.no_slip)})(v)

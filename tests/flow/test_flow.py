@@ -236,6 +236,7 @@ def test_free_stream_passes_an_open_channel():
     np.testing.assert_allclose(state["v"], grid.join(1.0, 0.0), atol=1e-12)
 
 
+@pytest.mark.whole
 def test_viscosity_as_a_parameter():
     """The same bits as with the number, and the energy J of Taylor-Green vortices has dJ/dnu = -4 T J."""
     grid = dp.Grid((32, 32), size=2 * np.pi, periodic=True)

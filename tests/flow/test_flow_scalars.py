@@ -30,6 +30,7 @@ def heat_flow(n, implicit, dt):
     return np.mean(u[1:-1] * 0.5 * (heat[1:] + heat[:-1]) - np.diff(heat, axis=0) * n, axis=1)
 
 
+@pytest.mark.whole
 def test_natural_convection_in_one_call():
     """Published 2.243 at Ra 1e4; 20^2 cells are 2.8 % off, as in examples/convection.py."""
     flow = heat_flow(20, True, 1e-3)

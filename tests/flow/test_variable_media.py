@@ -374,6 +374,7 @@ def test_methods_as_other_arguments(argument, rng):
         end(**{argument: ambiguous})
 
 
+@pytest.mark.whole
 def test_lifted_walls_beside_a_viscosity_for_each_cell(rng):
     """The array of face_lift gives the step of the function that returns the velocities."""
     grid = dp.Grid((4, 3), spacing=[rng.uniform(0.5, 1, 4), rng.uniform(0.5, 1, 3)])

@@ -177,6 +177,7 @@ def layers(average):
 METHODS = ("auto", "direct", "multigrid", "structured", "separable", "krylov")
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("shape", SHAPES)
 def test_inverses(shape, grids, drawn, rng):
     """Every method that takes the operator: A x = b with the dense A, for the transpose too."""

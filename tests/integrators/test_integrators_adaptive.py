@@ -18,6 +18,7 @@ def robertson(u, p):
     return anp.array([back - slow, slow - back - fast, fast, u[2]])
 
 
+@pytest.mark.whole
 def test_robertson_and_its_gradient():
     """A6: G and every component of its gradient within 1e-3."""
     start = np.array([1.0, 0.0, 0.0, 0.0])

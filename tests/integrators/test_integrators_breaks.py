@@ -76,6 +76,7 @@ def test_a_break_at_the_end_of_a_step(off):
     assert pushforward(loss, off, 1.0)[1] == pytest.approx(slope, rel=1e-9)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("count", [10, pytest.param(100, marks=pytest.mark.whole)])
 def test_a_break_in_a_rollout_under_a_budget(count):
     """A break that a param declares, inside one of many steps: the same bits for every budget."""

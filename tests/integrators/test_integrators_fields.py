@@ -188,6 +188,7 @@ OPERATORS = [
 ]
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("op", OPERATORS, ids=[op.name for op in OPERATORS])
 def test_functions_of_an_operator(op):
     A = dense(op)

@@ -21,6 +21,7 @@ def test_values_across_a_jump_meet_the_tolerance(method, tolerance):
     assert step((np.zeros(1), 0.0))[0][0] == pytest.approx(0.98, abs=2 * tolerance)
 
 
+@pytest.mark.whole
 def test_values_across_a_jump_in_the_state_meet_the_tolerance():
     """An implicit step may land beyond the surface whole and in halves, and see no difference."""
     step = dp.stepper("backward_euler", lambda u, p: np.where(u < 0.5, 1.0, 2.0) * np.ones(1), 1.0, tolerance=1e-6)

@@ -66,6 +66,7 @@ def test_a_jacobian_that_does_not_contract_is_made_again(monkeypatch):
     assert cubic.info.forward.iterations > 2 * careful
 
 
+@pytest.mark.whole
 def test_nothing_outlives_a_step():
     """A step gives the same bits whatever was done before it, and so do gradients at any budget."""
     rate, u = allen_cahn((9, 8))

@@ -81,6 +81,7 @@ def test_prothero_robinson(stiffness, monkeypatch):
     assert errors[2] < errors[0] and all(e <= 2 * tol for e, tol in zip(errors, tolerances, strict=True))
 
 
+@pytest.mark.whole
 def test_published_values():
     """Robertson at 40 s (Hairer and Wanner), at 1e11 s and HIRES at 321.8122 s (IVP test set)."""
     step = dp.stepper("radau", robertson, 40.0, tolerance=1e-6, floor=SMALL["Robertson"])
@@ -103,6 +104,7 @@ def test_published_values():
     assert np.max(np.abs(new - wanted)) <= 1e-9 * np.max(wanted)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     "name",
     [
@@ -290,6 +292,7 @@ def test_an_audit_of_a_wrong_loss_blames_no_step(at_fault):
     assert found.verdict == "disagrees" and found.culprit == at_fault
 
 
+@pytest.mark.whole
 def test_long_oscillation():
     """The phase of the derivative in a frequency grows with time; right, or refused."""
     rate = lambda u, p: anp.array([p * u[1], -p * u[0]])

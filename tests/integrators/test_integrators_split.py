@@ -27,6 +27,7 @@ def run(step, state, params, n):
     return state
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(("method", "order"), [("imex", 2), ("etdrk4", 4)])
 def test_order_of_solution_and_gradient(method, order):
     """Bistable reaction and diffusion, stiff for every dt used; against steps eight times as fine."""

@@ -56,6 +56,7 @@ CHEAP = {("backward_euler", 0.0), ("crank_nicolson", 0.0), ("tr_bdf2", 0.0), ("i
 WALLS = list(product(ORDERS, (0.0, 1.0)))  # with a reaction, steps of many methods are Newton's
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     "method, reaction", [pytest.param(*row, marks=[pytest.mark.whole] * (row not in CHEAP)) for row in WALLS]
 )

@@ -99,6 +99,7 @@ def test_the_estimate_is_made_once_and_inputs_do_not_count():
     assert len(calls) - most == 4 < most
 
 
+@pytest.mark.whole
 def test_nothing_is_lost_in_ten_thousand_steps():
     grid, step = strings(32, 0.02)
     rng = np.random.default_rng(0)

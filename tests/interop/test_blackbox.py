@@ -70,6 +70,7 @@ def test_runs_are_counted_and_kept_for_the_last_two_points(rng):
     assert str(dp.from_blackbox(reaction)) == "reaction: no derivative asked for yet, 0 runs"
 
 
+@pytest.mark.whole
 def test_as_the_jacobian_of_implicit(rng):
     """A backward step of foreign code."""
     step = dp.from_blackbox(reaction)

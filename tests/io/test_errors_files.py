@@ -190,6 +190,7 @@ def test_no_room(tmp_path, name):
     assert after == before
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("room", [150, *(pytest.param(room, marks=pytest.mark.whole) for room in (5000, 12000))])
 def test_a_report_without_room(tmp_path, room):
     (tmp_path / "scene.py").write_text(SCENE, encoding="utf-8")
@@ -214,6 +215,7 @@ dp.check.gradient = lambda *_, **options: Verdict()
 """
 
 
+@pytest.mark.whole
 def test_a_demo_without_room(tmp_path):
     code = (
         LIMITED
@@ -235,6 +237,7 @@ def test_a_demo_without_room(tmp_path):
 COMMAND = "import sys\nfrom sparsedp.__main__ import main\nsys.exit(main(sys.argv[1:]))"
 
 
+@pytest.mark.whole
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="this system has no full device")
 @pytest.mark.parametrize("stream", ["stdout", "stderr"])
 def test_a_verdict_that_cannot_be_printed_is_none(tmp_path, stream):
@@ -252,6 +255,7 @@ def test_a_verdict_that_cannot_be_printed_is_none(tmp_path, stream):
         assert done.stderr == f"sparsedp: {sentence}\n"
 
 
+@pytest.mark.whole
 def test_a_reader_that_goes_away(tmp_path):
     (tmp_path / "scene.py").write_text(SCENE, encoding="utf-8")
     reader, writer = os.pipe()
@@ -263,6 +267,7 @@ def test_a_reader_that_goes_away(tmp_path):
     assert len(done.stderr.splitlines()) == 1
 
 
+@pytest.mark.whole
 def test_a_name_that_cannot_be_printed(tmp_path, monkeypatch, capsys):
     """A folder with a name that is no text: the report is there, the last line cannot be shown."""
     monkeypatch.chdir(tmp_path)
@@ -272,6 +277,7 @@ def test_a_name_that_cannot_be_printed(tmp_path, monkeypatch, capsys):
     assert "the output cannot be written: 'ascii' codec can't encode" in capsys.readouterr().err
 
 
+@pytest.mark.whole
 def test_a_file_that_came_during_the_demo_is_not_overwritten(tmp_path, monkeypatch, capsys):
     class Verdict:
         verdict = "agrees"

@@ -47,6 +47,7 @@ def test_compile_command_without_numba(tmp_path):
     assert "there is nothing to compile: numba is not installed or switched off" in answer.stderr
 
 
+@pytest.mark.whole
 def test_compile_command_lists_every_file_with_loops():
     def defines(path):
         functions = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)]

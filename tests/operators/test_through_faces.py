@@ -25,6 +25,7 @@ def chain(grid, k, boundary=dp.dirichlet):
     return -dp.divergence(grid) @ dp.diagonal(grid.faces, k) @ dp.gradient(grid, boundary)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("shape", SHAPES)
 def test_forward_and_transposed_against_the_entries(shape, rng):
     for periodic, boundary in product(product((False, True), repeat=len(shape)), (dp.neumann, dp.robin(1, 2))):

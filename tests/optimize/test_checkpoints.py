@@ -397,6 +397,7 @@ def test_an_interrupted_run_returns_its_best_point_and_is_resumed(tmp_path):
     assert again.resumed.startswith(f"resumed from iteration {last} in") and same(again, whole)
 
 
+@pytest.mark.whole
 def test_a_second_interrupt_stops_at_once(tmp_path):
     clock = time.perf_counter()
     out, err, code = pressed(["running", "waiting"], tmp_path, "slow")

@@ -69,6 +69,7 @@ def misfit(x, data):
     return anp.reshape((SENSORS(states(x)[1:]) - data) / NOISE, (-1,))
 
 
+@pytest.mark.whole
 def test_the_weak_constraint_is_the_kalman_smoother(scene):
     background, data = scene
     means, covariance = smoother(background, data, dense(COVARIANCES["pushes"]))

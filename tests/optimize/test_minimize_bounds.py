@@ -175,6 +175,7 @@ METHODS = [
 ]
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("method, options", METHODS)
 def test_random_bounded_problems_against_scipy(method, options):
     squares = method in ("gauss_newton", "levenberg_marquardt")

@@ -109,6 +109,7 @@ def test_files_as_strangers_write_them(tmp_path, monkeypatch, capsys, kind):
     assert code != 2 or (printed.out == "" and len(printed.err.splitlines()) == 1)
 
 
+@pytest.mark.whole
 def test_the_report(scene, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["report", str(scene), "--out", str(out)]) == 0
@@ -162,6 +163,7 @@ def test_what_a_report_leaves_out_and_what_is_degraded(tmp_path, capsys):
     assert (f"{degraded} stiff or extreme {cases} degraded, see below." in page) == (degraded > 0)
 
 
+@pytest.mark.whole
 def test_a_report_of_a_loss_that_does_not_run(scene, tmp_path, capsys):
     assert main(["report", f"{scene}:broken", "--out", str(tmp_path / "out")]) == 3
     assert "gradient: not audited, LookupError: no such well" in capsys.readouterr().out
@@ -409,6 +411,7 @@ def test_a_loss_that_raises_is_no_verdict(ending, capsys, end, after):
         assert place in text and ERRORS[end].strip() in text
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("end", [pytest.param("sys.exit(0)", marks=pytest.mark.whole), "os._exit(0)"])
 def test_an_exit_as_a_command(ending, tmp_path, end):
     ending(end)
@@ -461,6 +464,7 @@ def loss(u):
 """
 
 
+@pytest.mark.whole
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 @pytest.mark.parametrize(
     "command, top",

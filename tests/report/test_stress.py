@@ -56,6 +56,7 @@ def test_a_stable_step_passes(stable):
     assert ("growth in one step", "passed", "") in notes(stable, "as given")
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("d", [0.52, 0.6, 3.0])
 def test_a_diffusion_number_above_a_half_is_found(d):
     result = dp.stress(explicit, number(d), only=["as given"])

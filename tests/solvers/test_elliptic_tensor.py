@@ -67,6 +67,7 @@ def exact(dim, kind):
     return K, u, lambda *x: u(*x) - sum(elementwise_grad(flux(i), i)(*x) for i in range(dim))
 
 
+@pytest.mark.whole
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("kind", ["dirichlet", "periodic", "neumann"])
 @pytest.mark.parametrize("sizes", [(16, 32, 64), (6, 12, 24)], ids=["2-D", "3-D"])
@@ -341,6 +342,7 @@ def test_values_at_walls_beside_a_tensor():
     np.testing.assert_allclose(solve(k, D(solve.flux(k, values))), ramp(*grid.centres()), rtol=1e-9)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("method", ["imex", "backward_euler", "crank_nicolson", "tr_bdf2"])
 def test_steps_with_a_tensor(method, rng):
     """As the stiff part they are those of the matrix; as a rate they have a derivative in every entry."""

@@ -78,6 +78,7 @@ def test_a_kink_without_a_root_is_not_taken_for_rounding():
 # ---- products only -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("name", ["diffusion 2-D", "advection 1-D", "fields in one array"])
 def test_krylov_gives_the_same_derivatives(name):
     problem = PROBLEMS[name]()

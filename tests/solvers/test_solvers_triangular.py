@@ -104,6 +104,7 @@ def test_every_method_solves_the_coupled_unknowns(method, rng):
     np.testing.assert_allclose(inv.T(b), np.linalg.solve(matrix.toarray().T, b), rtol=1e-8)
 
 
+@pytest.mark.whole
 def test_a_long_chain(both):
     """A recursion with one call for each unknown would raise RecursionError."""
     size = 1_000_000 if kernels.compiled() else 52_000

@@ -33,6 +33,7 @@ def conditions(grid):
     return [side for side in SIDES if not (isinstance(side, dict) and grid.periodic[0])]
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("shape", [(7,), (1,), (2,), (3,), (8,), (4, 5), (1, 3), (2, 2), (3, 4, 5), (4, 1, 6)])
 def test_every_boundary_is_diagonalised(shape):
     """f(A) by transforms equals f of the dense matrix, forward and transposed, for f = 1 / x and exp."""
@@ -216,6 +217,7 @@ def test_combinations_of_different_operators_have_no_eigenbasis():
     assert find_eigenbasis(dp.diagonal(grid.cells, 1j * np.ones(grid.shape)).structure) is None
 
 
+@pytest.mark.whole
 def test_kuramoto_sivashinsky_in_a_plane():
     """u_t = -lap u - lap^2 u - |grad u|^2 / 2: waves grow as they should, and stay bounded where they meet."""
     grid = dp.Grid((32, 32), size=12 * np.pi, periodic=True)

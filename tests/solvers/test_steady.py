@@ -106,6 +106,7 @@ def test_bratu_in_one_dimension():
     assert np.all(np.log2(np.divide(*errors)) > 1.9) and np.max(errors[1]) < 2e-4
 
 
+@pytest.mark.whole
 def test_burgers_in_one_dimension():
     nu = 0.1
     errors = []
@@ -184,6 +185,7 @@ def test_gradients_of_flows(kind):
     assert result.verdict == "agrees" and "Hessian product: agrees" in str(result), str(result)
 
 
+@pytest.mark.whole
 def test_convection_at_32_needs_pseudo_time(monkeypatch):
     """Ra 1e5 from rest: Newton's method alone stalls."""
     scene = Flow(32)
@@ -314,6 +316,7 @@ def test_guesses_are_not_modified(rng):
         assert all(np.array_equal(x[name], want[name]) for name in want) and np.array_equal(p, before)
 
 
+@pytest.mark.whole
 def test_scaling_the_residual_by_a_power_of_two_keeps_all_bits():
     """At a Rayleigh number that takes pseudo-time."""
     scene = Flow(4)

@@ -92,6 +92,7 @@ def test_at_most_12_iterations_for_smooth_coefficients(shape, boundary, rng):
     assert inv.info.forward.status == "converged"
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("shape", [(96, 96), (28, 28, 28)])
 def test_inclusions_with_jumps_of_a_million(shape, rng):
     grid = dp.Grid(shape, size=1.0)
@@ -251,6 +252,7 @@ def test_gradients_that_overflow_raise():
         dp.value_and_grad(lambda k: 1e100 * anp.sum(solve(k, b)))(np.linspace(1.0, 2.0, grid.faces.size))
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("n", [16, 20, 24])
 def test_cells_linked_along_one_axis_do_not_count_as_weak(n, rng):
     """An axis of 16 to 32 cells gets one that is linked along it only; nearly all others are held equally."""

@@ -90,6 +90,7 @@ def left_over():
     return len(counters.active), *kept, set(tape.untraced)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("job", [gradient, product, twice])
 @pytest.mark.parametrize("name", LOOPS)
 def test_interrupted_at_any_call_of_the_step(name, job):

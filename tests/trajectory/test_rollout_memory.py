@@ -176,6 +176,7 @@ def test_peak_is_the_trajectory(step, keep, monkeypatch):
     assert used < (1.2 if keep == "last" else 3.3)
 
 
+@pytest.mark.whole
 @KINDS
 @pytest.mark.parametrize("states", [7, 12, *(pytest.param(states, marks=pytest.mark.whole) for states in (9, 24))])
 def test_peak_under_a_budget(step, states):
@@ -318,6 +319,7 @@ def test_constants_of_a_step_leave_its_tapes_where_they_are():
     assert calls["transport upwind", "forward"] == 5
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("given", ["16 MB", None])
 def test_tapes_of_large_steps_keep_to_their_room(given, monkeypatch):
     """A step that makes arrays far larger than the state, as between all pairs of bodies: few of them stay on tapes."""

@@ -88,6 +88,7 @@ KEPT = [
 ]
 
 
+@pytest.mark.whole
 @pytest.mark.sampled
 @pytest.mark.parametrize("options", KEPT, ids=["last", "last, truncated", "all", "each"])
 @pytest.mark.parametrize("order", ORDERS)

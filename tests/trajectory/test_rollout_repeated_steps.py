@@ -94,6 +94,7 @@ def test_refused_or_right(name, keep):
     assert refused == 0 if name == "pure" else refused > 5
 
 
+@pytest.mark.whole
 @pytest.mark.sampled(1)
 @pytest.mark.filterwarnings("ignore::sparsedp.errors.BudgetWarning")
 @pytest.mark.parametrize("keep", KEEPS)
