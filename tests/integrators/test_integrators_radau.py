@@ -104,7 +104,6 @@ def test_published_values():
     assert np.max(np.abs(new - wanted)) <= 1e-9 * np.max(wanted)
 
 
-@pytest.mark.whole
 @pytest.mark.parametrize(
     "name",
     [

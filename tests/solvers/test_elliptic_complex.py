@@ -199,7 +199,6 @@ def test_multigrid_refuses_waves():
         solve(1.0, np.ones(grid.shape), np.full(grid.shape, -4e3))
 
 
-@pytest.mark.whole
 def test_shifted_laplace_preconditions_waves_and_their_adjoint():
     solve, shift, b = waves(96)
     exact = waves(96, "direct")[0]

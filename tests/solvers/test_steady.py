@@ -185,7 +185,6 @@ def test_gradients_of_flows(kind):
     assert result.verdict == "agrees" and "Hessian product: agrees" in str(result), str(result)
 
 
-@pytest.mark.whole
 def test_convection_at_32_needs_pseudo_time(monkeypatch):
     """Ra 1e5 from rest: Newton's method alone stalls."""
     scene = Flow(32)
