@@ -631,7 +631,7 @@ class ConservationLaw(FiniteVolumes):
         return speeds
 
 
-def check_positive(what: str, values: Any, slack: float | None = None, argument: str = "") -> None:
+def check_positive(what: str, values: Any, slack: float | None = None, argument: str = "", advice: str = "") -> None:
     """Raise an error that names the quantity and the cell where it is not positive.
 
     Parameters
@@ -643,6 +643,8 @@ def check_positive(what: str, values: Any, slack: float | None = None, argument:
         If it is given, 0 is valid, and so are negative values of at most this size.
     argument : str, optional
         The argument of the law that the values come from, if they are not those of the state in the cells.
+    advice : str, optional
+        Further advice for values of the state.
     """
     check_finite(what, values)
     if slack is None:
@@ -662,7 +664,7 @@ def check_positive(what: str, values: Any, slack: float | None = None, argument:
             others = ""
         raise UnstableStepError(
             f"{what} must be {needs}, got {values.flat[first]:g} in cell {place(first, values.shape)}{others}; give a "
-            f"state without such cells, or take smaller steps, dt <= law.time_step(u, params)"
+            f"state without such cells, or take smaller steps, dt <= law.time_step(u, params){advice}"
         )
 
 

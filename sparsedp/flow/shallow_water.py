@@ -102,8 +102,9 @@ def shallow_water(
     scheme : str
         "van_leer" (limited slopes, second order) or "upwind" (first order).
     boundary : condition, or dict of conditions
-        outflow: waves leave the domain. free_slip: a wall. inflow: the state outside the boundary is given by
-        `inflow`, above the ground of the last cell.
+        outflow: waves leave the domain; it does not hold a depth. Where water flows out more slowly than its waves, as
+        in most rivers, give the state at this end by inflow. free_slip: a wall. inflow: the state outside the boundary
+        is given by `inflow`, above the ground of the last cell.
     inflow : number, array, or callable, optional
         The state outside inflow boundaries, as `conservation_law` takes it.
     source : callable, optional
@@ -347,7 +348,8 @@ class ShallowWater(FiniteVolumes):
         return g
 
     def _check_physical(self, u: Any, params: Any, argument: str = "", at: str = "") -> None:
-        check_values(partial(_check_depth, self._what("depth", argument) + at, argument), u[0])
+        advice = "" if self.manning is None else "; friction needs the implicit steps of law.stepper(dt)"
+        check_values(partial(_check_depth, self._what("depth", argument) + at, argument, advice), u[0])
 
     def _required_fields(self) -> str:
         shape = ", ".join(map(str, (1 + self.grid.dim, *self.grid.shape)))
@@ -516,10 +518,10 @@ def _limiter_with_shore(limiter, axis):
     return entrywise("limiter", slope, derivatives)
 
 
-def _check_depth(what, argument, depth):
+def _check_depth(what, argument, advice, depth):
     """Raise an error for a depth that is negative, and not only by rounding."""
     rounding = ROUNDING * np.finfo(depth.dtype).eps * np.max(np.abs(depth), initial=0.0)
-    check_positive(what, depth, rounding, argument)
+    check_positive(what, depth, rounding, argument, advice)
 
 
 class FrictionStep(Reconstructible):

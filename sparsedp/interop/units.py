@@ -359,7 +359,8 @@ class SceneWithUnits(Reconstructible):
                 f"{place} of {self.name} must be a Quantity with a unit like {name}, got {type(leaf).__name__}; write "
                 f"pint.Quantity(value, {name!r})"
             )
-        given = self._registry.Quantity(leaf.magnitude, str(leaf.units))  # it may belong to another registry
+        units = type(leaf.units._units)(dict(leaf.unit_items()))  # as text, an exponent of 1/3 would be rounded
+        given = self._registry.Quantity(leaf.magnitude, units)  # it may belong to another registry
         if name is None:
             raise TypeError(
                 f"{place} of {self.name} must have no unit, as declared by None, got {given.units}; declare its unit, "

@@ -163,7 +163,7 @@ class TrainingRange(Reconstructible):
         warnings.warn(
             RangeWarning(
                 f"{np.count_nonzero(outside)} of {outside.size} inputs of a network are outside the range of training, "
-                f"the first is {np.asarray(x)[first]:.6g}{of_feature}, beside {lower:.6g} to {upper:.6g}; its results "
+                f"the first is {np.asarray(x)[first]:.6g}{of_feature}, outside {lower:.6g} to {upper:.6g}; its results "
                 "there are not supported by data: train on longer rollouts or on more states"
             ),
             stacklevel=frames_inside() + 1,

@@ -39,6 +39,9 @@ __all__ = ["CutGeometry", "cut_geometry", "sum_at_places"]
 
 # A level below this share of the largest one around it is taken as 0, so that powers of fractions do not underflow.
 TINY = 1e-10
+# By how much the level sinks, relative to its values around, to find the normal of a wall that touches a cell in a
+# point.
+SINKING = 1e-6
 
 
 class CutGeometry(NamedTuple):
@@ -82,9 +85,10 @@ def cut_geometry(grid: Grid, level: Any) -> CutGeometry:
     fractions = (counts == len(nodes)).astype(float) + sum_at_places(cut, counts.size)(volume)
 
     squares = reduce(add, [v**2 for v in vectors])
-    is_flat = np.asarray(sample(squares)) > 0
-    length = anp.sqrt(anp.where(is_flat, squares, float(dim)))
-    normals = [anp.where(is_flat, v, 1.0) / length for v in vectors]
+    has_normal = np.asarray(sample(squares)) > 0
+    limits = _normals_of_points(np.asarray(sample(corners)), widths, has_normal)
+    length = anp.sqrt(anp.where(has_normal, squares, 1.0))
+    normals = [anp.where(has_normal, v / length, limit) for v, limit in zip(vectors, limits, strict=True)]
     has_area = np.asarray(sample(areas)) > 0
     lowest = np.argmin(np.asarray(sample(corners)), axis=0)
     corner_bits = np.array(list(product((0, 1), repeat=dim)))
@@ -95,6 +99,23 @@ def cut_geometry(grid: Grid, level: Any) -> CutGeometry:
         centroids.append(lower[axis] + in_cell + at_corner)
     apertures = [_apertures(grid, axis, level, positive) for axis in range(dim)]
     return CutGeometry(cut, fractions, anp.concatenate(apertures), areas, normals, centroids)
+
+
+def _normals_of_points(corners, widths, has_normal):
+    """Return the normals where the wall touches a cell in a point, those of the wall that appears if the level sinks.
+
+    The derivative of an integral over the wall is then one-sided. The other cells get the diagonal.
+    """
+    dim = len(widths)
+    normals = np.full((dim, has_normal.size), 1.0 / np.sqrt(dim))
+    points = np.flatnonzero(~has_normal)
+    if points.size:
+        touching = corners[:, points]
+        sunk = touching - SINKING * np.max(np.abs(touching), axis=0)
+        vectors = np.array(_wall(sunk, [h[points] for h in widths])[2])
+        length = np.sqrt(np.sum(vectors**2, axis=0))
+        normals[:, points] = np.where(length > 0, vectors / np.where(length > 0, length, 1.0), normals[:, points])
+    return normals
 
 
 def _scaled_level(grid, level):

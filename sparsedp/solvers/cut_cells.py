@@ -98,7 +98,8 @@ def cut_cells(
 
     **Derivatives.** In the level, the right-hand side, the wall values and the coefficients, forward and reverse, to
     every order. As a function of the level the solution is continuous, with kinks where the wall passes a node or a
-    centre of a cell. Weight sums by `volumes` or `areas`: the value in a tiny cell changes fast with the level.
+    centre of a cell; at a node, derivatives are those for a level that sinks. Weight sums by `volumes` or `areas`: the
+    value in a tiny cell changes fast with the level.
 
     **Order.** 2 in the L2 norm, and between 1.5 and 2 in the maximum norm, where the largest errors are in cells with a
     centre in the body. The slope at the wall has order 1 (dirichlet), its integral over the wall order 2.

@@ -307,7 +307,10 @@ def _pencil_member(name, op, coefficients, coefficients_name):
             )
         return CoefficientOperator(*op.of_coefficients(*coefficients))
     if callable(op) and not isinstance(op, Operator):
-        example = "dp.from_functions(f, f, n, n), or the solver of dp.elliptic_solver with coefficients="
+        example = (
+            "dp.from_functions(f, f, n, n), the solver of dp.elliptic_solver with coefficients=, or symmetric=False "
+            "for the Jacobian of a residual"
+        )
         check_type(f"eigenpairs, as {name},", op, Operator, "an Operator", example)
     check_operator("eigenpairs", op)
     if not (isinstance(coefficients, tuple) and not coefficients):

@@ -55,7 +55,7 @@ def test_a_value_outside_is_reported_once():
         warnings.simplefilter("error")
         assert guarded(inside) is inside
     message = (
-        "1 of 4 inputs of a network are outside the range of training, the first is 33 of feature 1, beside 8 to 32; "
+        "1 of 4 inputs of a network are outside the range of training, the first is 33 of feature 1, outside 8 to 32; "
         "its results there are not supported by data: train on longer rollouts or on more states"
     )
     with pytest.warns(dp.errors.RangeWarning) as caught:
@@ -76,7 +76,7 @@ def test_ranges_of_channels_of_all_values_and_of_nan():
     assert np.array_equal(of_channels.outside(fields[:, ::-1]), np.ones((1, 2, 3, 4), bool))
     of_all = training_range(fields, margin=0.0)
     assert not np.any(of_all.outside(fields[:, ::-1]))
-    with pytest.warns(dp.errors.RangeWarning, match="the first is nan, beside 0 to 7"):
+    with pytest.warns(dp.errors.RangeWarning, match="the first is nan, outside 0 to 7"):
         of_all(np.array([1.0, np.nan]))
 
 
@@ -92,11 +92,11 @@ def test_in_a_rollout_its_gradient_and_a_program():
         warnings.simplefilter("error")
         end = advance(u, 4)
     assert np.array_equal(end, drift(lambda u: u)(u, 4))
-    with pytest.warns(dp.errors.RangeWarning, match="the first is 1.61051, beside 0 to 1.5"):
+    with pytest.warns(dp.errors.RangeWarning, match="the first is 1.61051, outside 0 to 1.5"):
         slope = dp.grad(lambda u: anp.sum(advance(u, 7) ** 2))(u)
     assert slope == pytest.approx(2 * 1.1**14 * u)
     guarded = training_range(u, margin=1.0)
     program = dp.jit(lambda u: guarded(u) * 1.1)
     program(u)
-    with pytest.warns(dp.errors.RangeWarning, match="the first is 5, beside 0 to 1.5"):
+    with pytest.warns(dp.errors.RangeWarning, match="the first is 5, outside 0 to 1.5"):
         program(10 * u)

@@ -602,3 +602,20 @@ def test_a_robin_condition_without_u_divides_by_b(rng):
     slopes = [body.slopes(b, value) for body, value in zip(bodies, (2.0, 1.0), strict=True)]
     onp.testing.assert_allclose(*slopes, rtol=1e-14)
     assert bodies[1].diffusion(onp.ones(grid.shape, onp.int8)).dtype == float
+
+
+@pytest.mark.parametrize("outside", [True, False])
+@pytest.mark.parametrize("condition", [dp.dirichlet, dp.robin(1.0, 0.5)])
+def test_derivatives_are_one_sided_where_the_wall_touches_nodes(outside, condition):
+    """They were of neither side: the normal in a cell that the wall touches in a node was the diagonal of the cell."""
+    grid = dp.Grid((16, 16), size=2.0, origin=-1.0)
+    sign = 1.0 if outside else -1.0
+
+    def flux(radius):
+        level = lambda x, y: sign * (np.sqrt(x**2 + y**2) - radius)
+        body = dp.cut_cells(grid, level, dp.dirichlet, condition)
+        return np.sum(body.flux(body.solve(np.ones(grid.shape))))
+
+    step = sign * 1e-6  # towards a level that sinks
+    slope = (flux(0.375 + step) - flux(0.375)) / step
+    assert dp.grad(flux)(0.375) == pytest.approx(slope, rel=1e-4)

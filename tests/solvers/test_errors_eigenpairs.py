@@ -44,8 +44,8 @@ TABLE = [
     (
         pairs(len),
         TYPE,
-        "eigenpairs, as op, takes an Operator, got builtin_function_or_method; write dp.from_functions(f, f, n, n), or "
-        "the solver of dp.elliptic_solver with coefficients=",
+        "eigenpairs, as op, takes an Operator, got builtin_function_or_method; write dp.from_functions(f, f, n, n), "
+        "the solver of dp.elliptic_solver with coefficients=, or symmetric=False for the Jacobian of a residual",
     ),
     (
         pairs(dp.from_matrix(np.ones((2, 3)))),
