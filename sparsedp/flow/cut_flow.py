@@ -34,7 +34,7 @@ from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.pytree import copied, mapped
 from sparsedp._utils.validation import check_finite, check_kind, check_number, check_on, check_plain
 from sparsedp.autodiff.program_trace import check_values, recording_trace
-from sparsedp.autodiff.tape import cast, isbox, sample
+from sparsedp.autodiff.tape import cast, dtype_of, isbox, sample
 from sparsedp.errors import IncompatibleError, JitError, ShapeError
 from sparsedp.flow.cut_faces import cut_faces
 from sparsedp.flow.momentum import (
@@ -55,7 +55,7 @@ from sparsedp.solvers.inverse import inverse
 from sparsedp.solvers.roots import implicit
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -64,6 +64,10 @@ __all__ = ["CutFlow", "cut_flow"]
 
 SHORTEST = 1e-3  # distance of two faces below which their difference is not divided by it, in the smallest cell width
 LARGEST_IMBALANCE = 1e-6  # relative imbalance of the given velocities around a region without an outflow
+LARGEST_NORMAL_SHARE = 0.25  # of the velocity of the body, on a wall that is a polygon
+NOT_TANGENTIAL = (
+    "solid_velocity of cut_flow must be tangential to the wall of the body; the fluid would flow through it"
+)
 LARGEST_WALL_IMBALANCE = 0.1  # the same of the velocity of the body, on a wall that is a polygon
 
 
@@ -86,7 +90,7 @@ def cut_flow(
         wall. A callable is a function of the coordinates of the nodes, such as ``lambda x, y: ...``.
     boundary : flow condition or dict
         As for `face_laplacian`.
-    solid_velocity : number, or callable
+    solid_velocity : 0, or callable
         Velocity of the wall of the body: a function of the coordinates that returns both components, such as
         ``lambda x, y: (-omega * y, omega * x)`` for a rotating cylinder. Nothing flows through the wall: the velocity
         must be tangential to it. Default: 0, at rest.
@@ -319,6 +323,7 @@ class CutFlow(Reconstructible):
         array, shape (2,)
             Both components [length^3 / time^2 in 2-D].
         """
+        check_values(_check_viscosity, viscosity)
         v = self._field("v", x["v"])
         at_wall = self._at_wall(self._wall_terms(self._weights, v, self._solid))
         pressure = self._sum_of_components(self.apertures * self._pressure_force(x["p"]))
@@ -575,10 +580,8 @@ class CutFlow(Reconstructible):
         over a region without an outflow would be of second order: it is made 0.
         """
         grid = self.grid
-        if not callable(solid_velocity):
-            velocity = (solid_velocity, solid_velocity)
-        else:
-            velocity = solid_velocity(*walls.centroids)
+        velocity = _wall_velocity(solid_velocity, walls.centroids)
+        _check_tangential(velocity, walls)
         rates = np.zeros(walls.places.size)
         sizes = np.zeros(walls.places.size)
         for axis in (0, 1):
@@ -591,15 +594,13 @@ class CutFlow(Reconstructible):
         totals = self._closed_regions @ np.asarray(sample(outflow))
         bound = self._closed_regions @ np.bincount(walls.places, sizes, grid.cells.size)
         if np.any(abs(totals) > LARGEST_WALL_IMBALANCE * bound):
-            raise IncompatibleError(
-                "solid_velocity of cut_flow must be tangential to the wall of the body; the fluid would flow through it"
-            )
-        areas = np.bincount(walls.places, np.asarray(sample(walls.areas)), grid.cells.size)
-        all_areas = self._closed_regions @ (areas / grid.volumes.reshape(-1))
-        shares = self._closed_regions.T @ sp.diags_array(1.0 / np.where(all_areas > 0, all_areas, 1.0))
-        shares = sp.diags_array(areas / grid.volumes.reshape(-1) ** 2) @ shares
-        excess = from_matrix(self._closed_regions)(outflow)
-        return anp.reshape(outflow - from_matrix(shares)(excess), grid.shape)
+            raise IncompatibleError(NOT_TANGENTIAL)
+        volumes = grid.volumes.reshape(-1)
+        areas = anp.reshape(sum_at_places(walls.places, grid.cells.size)(walls.areas), (-1,))
+        regions = from_matrix(self._closed_regions)
+        all_areas = regions(areas / volumes)
+        excess = regions(outflow) / anp.where(np.asarray(sample(all_areas)) > 0, all_areas, 1.0)
+        return anp.reshape(outflow - areas / volumes**2 * regions.T(excess), grid.shape)
 
     def _check_balance(self, given):
         """Raise IncompatibleError if more enters a closed region than leaves it."""
@@ -687,6 +688,34 @@ def _slopes_at_walls(grid, sides, component):
     return lines[0], lines[-1]
 
 
+def _wall_velocity(solid_velocity: Callable | float, coordinates: Sequence) -> tuple[Any, Any]:
+    """Return both components of the velocity of the body at some points; raise an error for an invalid result."""
+    name = "solid_velocity of cut_flow"
+    if not callable(solid_velocity):
+        check_values(partial(check_number, name), solid_velocity)
+        return solid_velocity, solid_velocity
+    velocity = solid_velocity(*coordinates)
+    is_pair = isinstance(velocity, (tuple, list)) and len(velocity) == 2
+    if not is_pair:
+        raise ShapeError(f"{name} must return a pair of components; write lambda x, y: (-omega * y, omega * x)")
+    for component in velocity:
+        shape = np.shape(sample(component))
+        if shape not in ((), np.shape(coordinates[0])):
+            raise ShapeError(f"{name} must return numbers or arrays of the shape of x, got an array of shape {shape}")
+        check_kind(name, dtype_of(component), "real numbers", "; write its .real")
+        check_values(partial(check_finite, name), component)
+    return velocity[0], velocity[1]
+
+
+def _check_tangential(velocity, walls):
+    """Raise IncompatibleError if the velocity of the body has a large part along the normals of its wall."""
+    u, v = (np.asarray(sample(component)) for component in velocity)
+    n_x, n_y = (np.asarray(sample(normal)) for normal in walls.normals)
+    areas = np.asarray(sample(walls.areas))
+    if np.sum(areas * np.abs(u * n_x + v * n_y)) > LARGEST_NORMAL_SHARE * np.sum(areas * np.hypot(u, v)):
+        raise IncompatibleError(NOT_TANGENTIAL)
+
+
 def _velocity_at_walls(grid: Grid, solid_velocity: Callable | float, geometries: list) -> dict:
     """Return the velocity of the body at all walls and its slope along them, one component after the other."""
     step = 0.25 * min(float(np.min(widths)) for widths in grid.widths)
@@ -694,13 +723,12 @@ def _velocity_at_walls(grid: Grid, solid_velocity: Callable | float, geometries:
     for component, geometry in enumerate(geometries):
         walls = geometry.walls
         ones = np.ones(walls.places.size)
-        if not callable(solid_velocity):
-            values.append(solid_velocity * ones)
-            slopes.append(0.0 * ones)
-            continue
         tangent = (-walls.normals[1], walls.normals[0])
         at_wall, ahead, behind = (
-            solid_velocity(*(x + shift * t for x, t in zip(walls.centroids, tangent, strict=True)))[component] * ones
+            _wall_velocity(solid_velocity, [x + shift * t for x, t in zip(walls.centroids, tangent, strict=True)])[
+                component
+            ]
+            * ones
             for shift in (0.0, step, -step)
         )
         values.append(at_wall)

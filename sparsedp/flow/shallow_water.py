@@ -557,6 +557,7 @@ class FrictionStep(Reconstructible):
         -------
         array like u
         """
+        u = self.law._checked_state(u)  # whole numbers become floating-point numbers
         dt = self.dt
         if callable(dt):
             dt = dt(params)

@@ -272,6 +272,8 @@ class SceneWithUnits(Reconstructible):
             for place, name, one, other in zip(places, names, leaves(value), others, strict=True):
                 if name is not None or is_variable(one):
                     runs.append(_compared(dimension, place, self._exponent(name, dimension), one, other))
+        if not runs and not gaps:
+            gaps.append("the result has no floating-point numbers: there is nothing to compare")
         return DimensionCheck(runs, rtol, gaps)
 
     def _gaps(self, args: tuple, magnitudes: list, value: Any) -> list[str]:

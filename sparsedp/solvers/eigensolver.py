@@ -72,6 +72,8 @@ SHIFT_OF_SINGULAR = 1e-6
 SHIFT_OF_INDEFINITE = 1e-4  # the same for operators with negative eigenvalues
 CLEARANCE = 1e-3  # smallest distance of the first shift below negative eigenvalues from them, relative to the shift
 OFFSET_OF_SHIFT = 1e-11  # distance from a shift of the user, which may be an eigenvalue, relative to the mean size
+# The same for operators that are not symmetric: values at distance d have errors of EPS d^2 / offset.
+OFFSET_OF_GENERAL_SHIFT = 1e-6
 SYMMETRIC = 1e-12  # two products that should be equal may differ by this share of their sizes
 LARGEST_EXPONENT = 200  # an operator or a mass beyond this power of two is scaled
 ROUNDING = 1e-12  # eigenvalues that differ by this share of the size of the operator are equal
@@ -970,7 +972,7 @@ def _general_dense(pencil, which):
         return la.eigvals(stiffness, mass)
     if isinstance(which, str):
         raise ValueError(f"a singular mass needs a shift, got which={which!r}; write a number as which")
-    sigma = which - OFFSET_OF_SHIFT * pencil.scale
+    sigma = which - OFFSET_OF_GENERAL_SHIFT * pencil.scale
     if which.imag == 0:
         sigma = sigma.real
     with np.errstate(all="ignore"):
@@ -1000,7 +1002,7 @@ def _general_by_arpack(pencil, k, which, maxiter):
     dtype = pencil.dtype
     if not isinstance(which, str):
         sigma = which.real if which.imag == 0 else which
-        sigma = sigma - OFFSET_OF_SHIFT * pencil.scale
+        sigma = sigma - OFFSET_OF_GENERAL_SHIFT * pencil.scale
         solve = pencil.shifted_inverse(sigma, INNER_RTOL, False)
         if isinstance(sigma, complex):
             dtype = complex

@@ -254,7 +254,7 @@ def test_a_wrong_derivative_is_caught(monkeypatch):
         dp.grad(weighted_force)(POINT)
 
 
-@pytest.mark.whole
+@pytest.mark.slow
 def test_a_force_that_is_not_differentiated_is_caught():
     def constant_force(*arguments, **options):
         flow = dp.cut_flow(*arguments, **options)
@@ -274,3 +274,17 @@ def test_flows_are_found_again_by_continuation_and_after_pickling():
     copy = pickle.loads(pickle.dumps(flow))
     a, b = (f.steady(0.1, parabola(grid)) for f in (flow, copy))
     assert np.array_equal(a["v"], b["v"]) and repr(copy) == repr(flow)
+
+
+def test_the_derivative_in_the_level_of_a_closed_box_with_a_moving_wall():
+    """The shares of the outflow through a polygon depend on the level, too."""
+    grid = dp.Grid((12, 8), size=(3.0, 2.0))
+
+    def energy(height):
+        level = lambda x, y: np.sqrt(((x - 1.03) / 0.7) ** 2 + ((y - 1.01) / height) ** 2) - 1.0
+        wall = lambda x, y: (2 * (y - 1.01) / height**2, -2 * (x - 1.03) / 0.49)
+        flow = dp.cut_flow(grid, level, solid_velocity=wall, convection=False)
+        return np.sum(flow.steady(0.1, 0.0)["v"] ** 2)
+
+    slope = (energy(0.35 + 1e-5) - energy(0.35 - 1e-5)) / 2e-5
+    assert dp.grad(energy)(0.35) == pytest.approx(slope, rel=1e-6)

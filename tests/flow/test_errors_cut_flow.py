@@ -60,3 +60,37 @@ def test_a_body_that_grows():
     message = "solid_velocity of cut_flow must be tangential to the wall of the body; the fluid would flow through it"
     with refused(IncompatibleError, message):
         dp.cut_flow(grid, lambda x, y: np.hypot(x, y) - 0.5, solid_velocity=lambda x, y: (x, y))
+
+
+CHANNEL_GRID = dp.Grid((8, 6), size=(2.0, 1.5))
+
+
+def around_disc(solid_velocity):
+    level = lambda x, y: np.hypot(x - 1.03, y - 0.77) - 0.4
+    return dp.cut_flow(CHANNEL_GRID, level, {"x": (dp.inflow, dp.outflow)}, solid_velocity)
+
+
+@pytest.mark.parametrize("wrong", [lambda x, y: 0.3 * x, lambda x, y: (x, y, x), lambda x, y: 1.0])
+def test_a_velocity_that_is_no_pair(wrong):
+    message = "solid_velocity of cut_flow must return a pair of components; write lambda x, y: (-omega * y, omega * x)"
+    with refused(ShapeError, message):
+        around_disc(wrong)
+
+
+def test_wrong_velocities_of_the_body():
+    with pytest.raises(
+        ShapeError,
+        match="solid_velocity of cut_flow must return numbers or arrays of the shape of x, got an array of shape",
+    ):
+        around_disc(lambda x, y: (np.ones(3), y))
+    with pytest.raises(NonFiniteError, match="solid_velocity of cut_flow must be finite"):
+        around_disc(lambda x, y: (np.nan * x, y))
+    with pytest.raises(TypeError, match="solid_velocity of cut_flow must hold real numbers"):
+        around_disc(lambda x, y: (1j * x, y))
+    message = "solid_velocity of cut_flow must be tangential to the wall of the body; the fluid would flow through it"
+    for through in (3.0, lambda x, y: (x - 1.03, y - 0.77)):
+        with refused(IncompatibleError, message):
+            around_disc(through)
+    flow = around_disc(0.0)
+    with pytest.raises(ValueError, match="the viscosity of cut_flow must be > 0, got -1"):
+        flow.force(flow.steady(1.0, 0.0), -1.0)

@@ -110,3 +110,9 @@ def test_derivatives_of_steps_with_friction():
     along = dp.jvp(loss, point, {**point})[1]
     gradient = dp.grad(loss)(point)
     assert along == pytest.approx(sum(np.sum(gradient[name] * point[name]) for name in point), rel=1e-10)
+
+
+def test_whole_numbers_as_a_state():
+    law = dp.shallow_water(dp.Grid(6, size=6.0), manning=0.03)
+    u = np.array([[4, 4, 4, 2, 2, 2], [0] * 6])
+    assert np.array_equal(law.stepper(0.1)(u), law.stepper(0.1)(u.astype(float)))

@@ -145,3 +145,14 @@ def test_a_number_without_a_unit_is_not_taken_for_degrees():
     scene = dp.interop.with_units(np.sin, ("degree",), "")
     with pytest.raises(TypeError, match=r"^argument 0 of with_units\(sin\) must be a Quantity with a unit like degree"):
         scene(90.0)
+
+
+def test_a_count_declared_without_a_unit_is_inconclusive():
+    scene = dp.interop.with_units(lambda h: int(np.sum(h > 1.0)), ("m",), None)
+    report = scene.check(Q(np.linspace(0.5, 1.5, 11), "m"))
+    assert report.verdict == "inconclusive" and "no floating-point numbers" in str(report)
+
+
+def test_units_with_a_broken_exponent():
+    scene = dp.interop.with_units(lambda n: 2.0 * n, ("s/m^(1/3)",), "s/m^(1/3)")
+    assert scene(Q(0.03, "s/m**(1/3)")).magnitude == 0.06

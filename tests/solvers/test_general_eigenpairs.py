@@ -259,3 +259,10 @@ def test_multiple_eigenvalues_are_refused(matrix, k):
         dp.jvp(lambda a: value(a, 0), entries, np.ones(9))
     if k == 3:
         np.testing.assert_allclose(dp.grad(value)(entries, 2), np.eye(9)[8], atol=1e-12)
+
+
+@pytest.mark.parametrize("which, exact", [(2.0, [1.0, 2.0]), (5.0, [3.0, 4.0, 5.0, 6.0])])
+def test_values_near_a_shift_that_is_an_eigenvalue(which, exact):
+    matrix = np.diag(np.arange(1.0, 30.0)) + np.eye(29, k=1)
+    pairs = dp.eigenpairs(dp.from_matrix(matrix), len(exact), which, symmetric=False, method="arpack")
+    assert pairs.values == pytest.approx(exact, rel=1e-10)
