@@ -87,7 +87,9 @@ class ViscousStress(DiffusionForm):
         self.slopes = self._velocity_slopes + self._transposed_slopes()
         self.divergence = free @ gain
         self._fluid = FluidPart.of_cells(grid, settings.solid)
-        self._cells = {sides: self._cells_beside(*sides) for sides in product((False, True), repeat=2)}
+        self._cells: dict[Any, Operator] = {
+            ends: self._cells_beside(*ends) for ends in product((False, True), repeat=2)
+        }
         share_along_component = self._shares(0)
         share_along_axis = self._shares(1)
         if settings.solid is not None:

@@ -551,8 +551,9 @@ class GeneralEigenpairs:
     def __init__(self, problem: GeneralEigenProblem, split: Callable | None) -> None:
         self._problem = problem
         self._split = split
-        self._solution: Any = problem.plain_solution
-        self._count = len(self._solution.values)
+        solution: Any = problem.plain_solution
+        self._solution = solution
+        self._count = len(solution.values)
 
     @cached_property
     def values(self) -> Any:
