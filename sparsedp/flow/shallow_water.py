@@ -348,7 +348,7 @@ class ShallowWater(FiniteVolumes):
         return g
 
     def _check_physical(self, u: Any, params: Any, argument: str = "", at: str = "") -> None:
-        advice = "" if self.manning is None else "; friction needs the implicit steps of law.stepper(dt)"
+        advice = "" if self.manning is None else "; with friction, take those of law.stepper(dt)"
         check_values(partial(_check_depth, self._what("depth", argument) + at, argument, advice), u[0])
 
     def _required_fields(self) -> str:

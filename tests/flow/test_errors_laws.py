@@ -107,7 +107,7 @@ TABLE = [
         lambda: dp.shallow_water(LINE, manning=0.03).stepper(0.1)(BELOW),
         UnstableStepError,
         "the depth of a shallow_water must be >= 0, got -3 in cell 1; give a state without such cells, or take smaller "
-        "steps, dt <= law.time_step(u, params)",
+        "steps, dt <= law.time_step(u, params); with friction, take those of law.stepper(dt)",
     ),
     (
         lambda: law(positive={1: lambda u, params: u[0]}),
