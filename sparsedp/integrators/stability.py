@@ -123,7 +123,7 @@ def _interior_eigenvalues(matrix: Any) -> NDArray:
     middle = matrix.shape[0] // 2
     row = matrix[[middle]].tocoo()
     angles = np.linspace(0.0, 2 * np.pi, DIRECTIONS, endpoint=False)
-    return np.exp(1j * np.outer(angles, row.coords[1] - middle)) @ row.data
+    return np.exp(1j * np.outer(angles, row.col - middle)) @ row.data
 
 
 def _ritz_values(matrix: Any) -> NDArray:
