@@ -32,10 +32,10 @@ from scipy.sparse.csgraph import connected_components
 
 from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.pytree import copied, mapped
-from sparsedp._utils.validation import check_finite, check_kind, check_number, check_on, check_plain
-from sparsedp.autodiff.program_trace import check_values, recording_trace
-from sparsedp.autodiff.tape import cast, dtype_of, isbox, sample
-from sparsedp.errors import IncompatibleError, JitError, ShapeError
+from sparsedp._utils.validation import check_finite, check_kind, check_number, check_plain
+from sparsedp.autodiff.program_trace import check_values
+from sparsedp.autodiff.tape import dtype_of, sample
+from sparsedp.errors import IncompatibleError, ShapeError
 from sparsedp.flow.cut_faces import cut_faces
 from sparsedp.flow.momentum import (
     MomentumFluxes,
@@ -48,7 +48,7 @@ from sparsedp.flow.momentum import (
 from sparsedp.flow.wall_fit import wall_fit
 from sparsedp.grid.boundary_conditions import no_slip, resolve
 from sparsedp.grid.grid import Grid, check_grid
-from sparsedp.operators.cut_geometry import sum_at_places
+from sparsedp.operators.cut_geometry import level_at_nodes, sum_at_places
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.operators.given import from_matrix
 from sparsedp.solvers.inverse import inverse
@@ -187,7 +187,7 @@ class CutFlow(Reconstructible):
         if grid.dim != 2 or not grid.cells.size:
             raise ShapeError(f"cut_flow takes a 2-D grid with cells, got {grid}")
         self._sides = resolve(grid, boundary, no_slip, patches=True)
-        level = _checked_level(grid, level)
+        level = level_at_nodes("cut_flow", grid, level)
         self._arguments = copied((grid, level, boundary, solid_velocity, convection, options))
         self.grid = grid
         self._convection = bool(convection)
@@ -641,23 +641,6 @@ def _has_fluid(grid, component, geometry):
     at_outer = outer[:, : upper.shape[1]] | upper
     found = (np.asarray(sample(geometry.apertures)) > 0) | at_middle | at_outer
     return (found.T if component else found).reshape(-1)
-
-
-def _checked_level(grid, level):
-    """Return the level at the nodes, traced or not, in double precision."""
-    if callable(level) and not isbox(level):
-        level = level(*np.meshgrid(*(grid.coordinates(a, "nodes") for a in range(grid.dim)), indexing="ij"))
-    if recording_trace([level]) is not None:
-        raise JitError(
-            "dp.jit cannot record the level of cut_flow, whose values decide which cells are cut; call the function "
-            "without dp.jit"
-        )
-    check_plain("cut_flow", level)
-    values = np.asarray(sample(level))
-    check_on("the level of cut_flow", values, grid.nodes)
-    check_kind("the level of cut_flow", values.dtype, "real numbers", "; write level.real")
-    check_finite("the level of cut_flow", values)
-    return cast(level if isbox(level) else values, np.dtype(float))
 
 
 def _check_viscosity(viscosity):

@@ -25,7 +25,10 @@ import autograd.numpy as anp
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp.autodiff.tape import sample
+from sparsedp._utils.validation import check_finite, check_kind, check_on, check_plain
+from sparsedp.autodiff.program_trace import recording_trace
+from sparsedp.autodiff.tape import cast, isbox, sample
+from sparsedp.errors import JitError
 from sparsedp.operators.given import from_matrix
 
 if TYPE_CHECKING:
@@ -35,7 +38,7 @@ if TYPE_CHECKING:
     from sparsedp.grid.space import Space
     from sparsedp.operators.operator import Operator
 
-__all__ = ["CutGeometry", "cut_geometry", "sum_at_places"]
+__all__ = ["CutGeometry", "cut_geometry", "level_at_nodes", "sum_at_places"]
 
 # A level below this share of the largest one around it is taken as 0, so that powers of fractions do not underflow.
 TINY = 1e-10
@@ -67,6 +70,31 @@ class CutGeometry(NamedTuple):
     areas: Any
     normals: list
     centroids: list
+
+
+def level_at_nodes(name: str, grid: Grid, level: Any) -> Any:
+    """Return a level at the nodes, traced or not, in double precision; raise an error for an invalid one.
+
+    Parameters
+    ----------
+    name : str
+        Name of the caller, for error messages.
+    grid : Grid
+    level : array, shape `grid.nodes.shape`, or callable
+    """
+    if callable(level) and not isbox(level):
+        level = level(*np.meshgrid(*(grid.coordinates(a, "nodes") for a in range(grid.dim)), indexing="ij"))
+    if recording_trace([level]) is not None:
+        raise JitError(
+            f"dp.jit cannot record the level of {name}, whose values decide which cells are cut; call the function "
+            "without dp.jit"
+        )
+    check_plain(name, level)
+    values = np.asarray(sample(level))
+    check_on(f"the level of {name}", values, grid.nodes)
+    check_kind(f"the level of {name}", values.dtype, "real numbers", "; write level.real")
+    check_finite(f"the level of {name}", values)
+    return cast(level if isbox(level) else values, np.dtype(float))
 
 
 def cut_geometry(grid: Grid, level: Any) -> CutGeometry:

@@ -8,11 +8,8 @@ from typing import TYPE_CHECKING, Any
 import autograd.numpy as anp
 import numpy as np
 
-from sparsedp._utils.validation import check_finite, check_kind, check_on, check_plain
-from sparsedp.autodiff.program_trace import recording_trace
-from sparsedp.autodiff.tape import cast, isbox, sample
-from sparsedp.errors import JitError
-from sparsedp.operators.cut_geometry import cut_geometry, sum_at_places
+from sparsedp.autodiff.tape import sample
+from sparsedp.operators.cut_geometry import cut_geometry, level_at_nodes, sum_at_places
 from sparsedp.operators.masks_and_lift import Body
 
 if TYPE_CHECKING:
@@ -46,7 +43,7 @@ class CutGrid(Body):
 
     def __init__(self, grid: Grid, level: Any) -> None:
         self.grid = grid
-        self._geometry = cut_geometry(grid, _checked_level(grid, level))
+        self._geometry = cut_geometry(grid, level_at_nodes("cut_cells", grid, level))
         self.fractions = anp.reshape(self._geometry.fractions, grid.shape)
         self.volumes = self.fractions * grid.volumes
         self.apertures = self._geometry.apertures
@@ -80,20 +77,3 @@ class CutGrid(Body):
         """Return a cell field, or a batch of them, with one axis for the cells."""
         shape = np.shape(field)
         return anp.reshape(field, (*shape[: len(shape) - self.grid.dim], self.grid.cells.size))
-
-
-def _checked_level(grid, level):
-    """Return the level at the nodes, traced or not, in double precision."""
-    if callable(level) and not isbox(level):
-        level = level(*np.meshgrid(*(grid.coordinates(a, "nodes") for a in range(grid.dim)), indexing="ij"))
-    if recording_trace([level]) is not None:
-        raise JitError(
-            "dp.jit cannot record the level of cut_cells, whose values decide which cells are cut; call the function "
-            "without dp.jit"
-        )
-    check_plain("cut_cells", level)
-    values = np.asarray(sample(level))
-    check_on("the level of cut_cells", values, grid.nodes)
-    check_kind("the level of cut_cells", values.dtype, "real numbers", "; write level.real")
-    check_finite("the level of cut_cells", values)
-    return cast(level if isbox(level) else values, np.dtype(float))
