@@ -1,8 +1,9 @@
 """Onsets of instability by `eigenpairs`: convection between two plates, and vortices behind a cylinder.
 
 Run ``python -m benchmarks.stability [cells ...]`` in the root of the repository: cells a diameter of the cylinder, 10
-by default. A row: the critical number, by Newton's method on the growth rate, whose derivative is that of the
-eigenvalue; the published one; by how much it is off; the derivative of the growth rate there; seconds. For the cylinder
+by default. A row: the critical number, by Newton's method on the growth rate, whose derivative is the
+derivative of the eigenvalue; the published one; by how much it is off;
+the derivative of the growth rate there; seconds. For the cylinder
 also the Strouhal number. Then the verdicts of `check.gradient` on small grids.
 
 Published: 1707.762 at the wavenumber 3.117 between rigid plates (S. Chandrasekhar, Hydrodynamic and Hydromagnetic

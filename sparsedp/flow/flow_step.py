@@ -214,7 +214,7 @@ def flow_step(
     at most in proportion to the shear rate or to its inverse, as in Smagorinsky's model and for plastic fluids.
     A viscosity, diffusivity or density in solid cells has no effect, is not checked and has the derivative 0: beside an
     obstacle, stresses are computed from the harmonic average of the viscosity of fluid cells alone. In solid cells a
-    function of the shear rate gets that of the first fluid cell.
+    function of the shear rate gets the shear rate of the first fluid cell.
     A viscosity, diffusivity or density that varies in space is not available on ranks.
     Convection is explicit. Let the Courant number c be dt times the largest sum over the axes of |v| / h in a cell. A
     step with c > 0.5 raises an error if it would amplify waves by more than 2 %. Without viscosity the limit is

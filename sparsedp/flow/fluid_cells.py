@@ -81,8 +81,8 @@ class CellsAround:
     """The four cells around edges, of which solid ones are replaced by fluid ones.
 
     A solid cell is replaced by the other cell of its pair along the first direction. If both are solid, the pair is
-    replaced by the other pair. With `share`, the harmonic average of the pairs is that of the fluid cells, weighted by
-    their areas: 1 / k = (sum of w_i / k_i) / (sum of w_i).
+    replaced by the other pair. With `share`, the harmonic average of the pairs equals the average of the fluid cells,
+    weighted by their areas: 1 / k = (sum of w_i / k_i) / (sum of w_i).
 
     Parameters
     ----------

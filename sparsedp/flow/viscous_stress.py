@@ -7,8 +7,8 @@ corners of cells). With the slopes S v, the walls' contribution W and the transp
     L(mu) v = C (mu (S v + W walls + T v)),    shear rate = sqrt(2 D : D),    D = (grad v + grad v^T) / 2,
 
 where C is the divergence over the control volumes. On edges mu is the harmonic average of the four cells, with which
-the stress between two layers of fluid is exact. Beside obstacles it is that of the three, two or one fluid cells, so
-that the values of mu in solid cells have no effect.
+the stress between two layers of fluid is exact. Beside obstacles it is the average of the fluid cells among them,
+so that the values of mu in solid cells have no effect.
 
 T v affects only faces whose velocity is unknown. On the ends of an axis it is chosen so that C T v is the gradient of
 the divergence, which is 0: there dv_a/dx_c = 0, and dv_c/dx_c is as in the last cell. For a constant viscosity L(mu)

@@ -102,8 +102,9 @@ def _outermost_eigenvalues(op: Any) -> NDArray | None:
 def _eigenvalues_of_factor(factor: Factor) -> NDArray:
     """Return the outermost eigenvalues of a 1-D factor.
 
-    For a factor far from normal, such as upwind differences between walls, they do not bound the growth in a number of
-    steps like that of the cells. Those of the same stencil on an unbounded axis do; they are then returned too.
+    For a factor far from normal, such as upwind differences between walls, they do not bound the growth in about
+    as many steps as there are cells. The eigenvalues of the same stencil on an unbounded axis do; they are then
+    returned too.
     """
     basis = diagonalise(factor)
     if basis is not None:

@@ -17,7 +17,7 @@ wall, which is fitted to the values at the other walls:
 
 The differences of the values at the walls are those of the condition, (g_j - g_i) / a, times a L / (a L + b): the share
 that falls off between the walls. So linear fields are exact, and so are sources between walls with one value. Between
-L = 0.6 and 0.9 cells the slope goes over to that of the fit, smoothly, so that derivatives in the level exist.
+L = 0.6 and 0.9 cells the slope changes smoothly into the slope of the fit, so that derivatives in the level exist.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ VALUE_DAMPING = 1e-4
 # used.
 ENOUGH = 0.4
 # Ratios of fluid volume to wall area, in cell widths: up to the first one the slope is that in a gap, from the second
-# one on that of the fit. A plane wall has 1.2, a gap half of its width.
+# one on the slope of the fit. A plane wall has 1.2, a gap half of its width.
 NARROW = 0.6
 WIDE = 0.9
 THINNEST = 1e-3  # half of the width of a gap below which the slope does not become steeper, in cell widths

@@ -952,7 +952,7 @@ def general_values(pencil: Pencil, settings: EigenSettings) -> NDArray[Any]:
 
 
 def _sorted(values):
-    """Return eigenvalues in ascending order of their real parts; those with equal ones in that of the imaginary parts.
+    """Return eigenvalues in ascending order of their real parts; equal ones are ordered by their imaginary parts.
 
     The real parts of a conjugate pair may differ by rounding.
     """

@@ -434,7 +434,7 @@ class Pair:
         scale_u = 2.0**-pencil.mass_exponent
         safe = product if product != 0 else 1.0
         self._scaled = v, u / safe, mass_v, mass_u / safe
-        # In the units of the operators as given, M is 2^mass_exponent times that of the pencil.
+        # In the units of the operators as given, M is 2^mass_exponent times the mass of the pencil.
         self.v = self._embedded(v)
         self.u = self._embedded(u / safe * scale_u)
         self.mass_v = self._embedded(mass_v) * 2.0**pencil.mass_exponent
