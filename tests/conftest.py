@@ -11,6 +11,7 @@ from functools import cached_property
 from pathlib import Path
 
 os.environ["MPLBACKEND"] = "Agg"  # before anything can import matplotlib
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # BLAS threads of two workers compete for the same cores
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell did that which started the run in the background
     signal.signal(signal.SIGINT, signal.default_int_handler)  # or tests of Ctrl-C, and their processes, never end
