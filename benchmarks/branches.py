@@ -15,6 +15,7 @@ from time import perf_counter
 import autograd.numpy as np
 
 import sparsedp as dp
+from benchmarks.tables import lines
 
 FOLDS = {1: 3.513830719, 2: 6.808124423}  # of the Bratu problem on a unit line and square
 # Reattachment lengths by E. Erturk, Computers and Fluids 37 (2008), 633-655.
@@ -180,3 +181,4 @@ if __name__ == "__main__":
     steps()
     cube(cells)
     verdicts()
+    print(f"lines: Bratu {lines(bratu)}, step {lines(Step)}, cube {lines(Cube)}")

@@ -17,6 +17,7 @@ from time import perf_counter
 import autograd.numpy as np
 
 import sparsedp as dp
+from benchmarks.tables import lines
 
 CRITICAL_RAYLEIGH = 1707.762
 CRITICAL_REYNOLDS = 46.7
@@ -150,6 +151,8 @@ def verdicts():
     wake.root = dp.implicit(wake, method="direct", rtol=1e-13)
     wake.state = wake.root(wake.state, 20.0)
     print(f"gradient of the cylinder: {dp.check.gradient(wake.growth, 40.0).verdict}")
+    strouhal = lambda reynolds: np.imag(wake.eigenvalue(reynolds)) / (2 * np.pi)
+    print(f"gradient of its Strouhal number: {dp.check.gradient(strouhal, 40.0).verdict}")
 
 
 if __name__ == "__main__":
@@ -161,3 +164,4 @@ if __name__ == "__main__":
     for cells in parser.parse_args().cells:
         cylinder(cells)
     verdicts()
+    print(f"lines: plates {lines(Layer)}, cylinder {lines(Wake)}")

@@ -1,13 +1,27 @@
 """Tables of benchmarks with one row a scene: their command line, and the lines of a scene."""
 
 import argparse
+import ast
 import inspect
+import textwrap
 
 
 def lines(scene):
-    """Return the number of lines of code of a scene, without its docstring."""
-    body = inspect.getsource(scene).replace(f'"""{scene.__doc__}"""', "").splitlines()[1:]
-    return sum(bool(line.strip()) for line in body)
+    """Return the number of lines of code of a scene, without its signature and its docstrings.
+
+    Parameters
+    ----------
+    scene : function or class
+        A function gives the lines of its body, a class all lines below ``class``.
+    """
+    source = textwrap.dedent(inspect.getsource(scene))
+    definition = ast.parse(source).body[0]
+    code = {number for number, line in enumerate(source.splitlines(), 1) if line.strip()}
+    for node in ast.walk(definition):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and ast.get_docstring(node) is not None:
+            docstring = node.body[0]
+            code -= set(range(docstring.lineno, docstring.end_lineno + 1))
+    return sum(number >= definition.body[0].lineno for number in code)
 
 
 def print_rows(description, columns, cases, row):
