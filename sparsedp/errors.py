@@ -103,12 +103,15 @@ class ConvergenceError(SparsedpError, RuntimeError):
         The record of the solve: status, iterations, residual.
     best : ndarray or None
         The best iterate that was computed.
+    branch : Branch or None
+        The branch up to the failure, from `continuation`.
     """
 
     def __init__(self, message: str, info: Any = None, best: Any = None):
         super().__init__(message)
         self.info = info
         self.best = best
+        self.branch: Any = None
 
 
 class IncompatibleError(ConvergenceError):

@@ -79,6 +79,8 @@ GROWTH = 2.0  # largest factor from one step to the next
 NUDGE = 1e-7  # arc length by which the point of a singular Jacobian is moved
 FOLD_TOLERANCE = 1e-8  # component along p of the unit tangent at a fold; the error of p is of the order of its square
 FOLD_STEPS = 40  # largest number of steps towards a fold
+SLOPE_NOISE = 1e-13  # component along p of a unit tangent below which its sign is rounding
+RECHECKS = 3  # solves of a corrector, each of which starts with the Jacobian at the end of the one before
 FOLD_ACCURACY = 1e-6  # factor on the tolerance for points near a fold, whose parameter becomes the one of the fold
 SMALL_SLOPE = 0.25  # share of the larger slope at the ends of a step: a smaller slope between them is computed
 KNOWN_SLOPE = 0.5  # largest relative difference of a computed slope and its prediction if no further one is needed
@@ -136,8 +138,9 @@ def continuation(
     ValueError
         If `stop` equals `start` up to rounding, or a setting is out of range.
     ConvergenceError
-        If there is no steady state at `start` near the guess, or steps become too short. `error.best` is the last
-        steady state that was found; at `start`, the best iterate of Newton's method.
+        If there is no steady state at `start` near the guess: `error.best` is the best iterate of Newton's method. Or
+        if steps become too short, as where a branch ends or goes to infinity: `error.branch` is the branch up to there,
+        with the status "stopped", and `error.best` its last steady state.
     NonFiniteError, ShapeError, DerivativeError
         As `steady`. Also DerivativeError if an argument is traced by a derivative: see `Branch.solve`.
     JitError
@@ -152,6 +155,8 @@ def continuation(
     **End.** The branch ends at p = `stop` (`branch.status` is "reached_stop"), or, after a fold, where it returns to
     p = `start` ("returned_to_start"), or after `maxsteps` steps ("max_steps"). The last point is exactly at `stop` or
     `start` in the first two cases. A fold whose parameter is `stop` or `start` within `rtol` of the range ends it too.
+    A branch that goes to infinity, as x = p exp(x) does for p -> 0, ends after `maxsteps` steps or with
+    ConvergenceError.
 
     **Steps.** The length of a step combines the changes of p, in units of the range, and of x, each field in units of
     its largest norm so far, or of its change over the range at the rate at `start` if that is larger. A step is
@@ -251,7 +256,8 @@ class Branch(Frozen):
     states : list of trees
         The steady states.
     folds : list of Fold
-    status : "reached_stop", "returned_to_start" or "max_steps"
+    status : "reached_stop", "returned_to_start", "max_steps" or "stopped"
+        "stopped" only for the `branch` of a ConvergenceError.
     rejected : int
         Number of steps that were repeated with half their length.
     iterations : int
@@ -259,7 +265,7 @@ class Branch(Frozen):
     seconds : float
     root : Root
         The function root(guess, p, *params) of `implicit`, with the sparsity pattern of the Jacobian.
-    params : int
+    param_count : int
         Number of other parameters.
     """
 
@@ -271,7 +277,12 @@ class Branch(Frozen):
     iterations: int
     seconds: float
     root: Root
-    params: int
+    param_count: int
+
+    @property
+    def params(self) -> int:
+        """The same as `param_count`."""
+        return self.param_count
 
     @opaque
     def solve(self, index: int, p: Any, *params: Any) -> Any:
@@ -304,9 +315,9 @@ class Branch(Frozen):
         if not -count <= number < count:
             raise IndexError(f"index of branch.solve must be from {-count} to {count - 1}, got {number}")
         check_number("p of branch.solve", plain(p))
-        if len(params) != self.params:
+        if len(params) != self.param_count:
             raise TypeError(
-                f"branch.solve takes an index, p and {self.params} other parameters, as many as continuation got, "
+                f"branch.solve takes an index, p and {self.param_count} other parameters, as many as continuation got, "
                 f"got {len(params)}"
             )
         return self.root(self.states[number], p if isbox(p) else float(p), *params)
@@ -428,6 +439,7 @@ class BorderedEquation:
         self.level = level
         self.nudge = nudge
         self.name = "continuation"
+        self.advice = ""  # a corrector that fails is repeated with a shorter step
         self.size = row.size
 
     def check_finite(self, values: Sequence[Any]) -> None:
@@ -686,15 +698,30 @@ class Curve:
         Raises
         ------
         ConvergenceError, NonFiniteError, UnstableStepError
+
+        Notes
+        -----
+        Newton's method accepts a point by the Jacobian of its last step. If terms of the residual shrink by many orders
+        of magnitude within this step, those of the Jacobian at the point itself are much smaller. So the point is
+        tested again with that one, and corrected further if it fails.
         """
         nudge = NUDGE * near.tangent
         equation = BorderedEquation(self.equation, self.bordered, row, float(row @ prediction), nudge)
         run = Run()
         rtol = accuracy * self.root.rtol
-        newton: Any = Newton(equation, self.values, self.jacobians, rtol, CORRECTOR_STEPS, run)  # type: ignore[arg-type]
-        z = newton.solve(prediction, near.jacobian.with_row(row))
-        jacobian = self._jacobian(z, self.row_along(near.tangent), nudge)
-        return CurvePoint(z, self._unit(jacobian.tangent()), jacobian, run.iterations)
+        z = prediction
+        jacobian = near.jacobian
+        for _ in range(RECHECKS):
+            iterations = run.iterations
+            newton: Any = Newton(equation, self.values, self.jacobians, rtol, CORRECTOR_STEPS, run)  # type: ignore[arg-type]
+            z = newton.solve(z, jacobian.with_row(row))
+            if run.iterations == iterations and jacobian is not near.jacobian:
+                return CurvePoint(z, self._unit(jacobian.tangent()), jacobian, run.iterations)
+            jacobian = self._jacobian(z, self.row_along(near.tangent), nudge)
+        raise ConvergenceError(
+            f"the residual at parameter {z[-1]:.8g} is small only beside the terms of an earlier iterate",
+            best=self.unknowns.rounded(z[:-1]),
+        )
 
 
 # ---- steps -----------------------------------------------------------------------------------------------------------
@@ -707,7 +734,14 @@ class Steps(NamedTuple):
     stop: float
     first: float
     largest: float
-    most: int
+    maxsteps: int
+
+
+class PathPoint(NamedTuple):
+    """A point of a step, and whether it is a fold."""
+
+    point: CurvePoint
+    is_fold: bool
 
 
 class Follower:
@@ -744,14 +778,20 @@ class Follower:
         if not self.is_natural:
             size = min(steps.first / self._speed(point), steps.largest)
         status = ""
-        for _ in range(steps.most):
-            path, size = self._step(point, size)
-            status = self._add(point, path)
+        failure = None
+        for _ in range(steps.maxsteps):
+            try:
+                path, status, size = self._step(point, size)
+            except ConvergenceError as error:
+                failure = error
+                status = "stopped"
+                break
+            self._add(path)
             if status:
                 break
-            point = self.curve.rescaled(path[-1])
+            point = self.curve.rescaled(path[-1].point)
         root.units = self.curve.units
-        return Branch(
+        branch = Branch(
             parameter=np.array(self.parameters),
             states=self.states,
             folds=self.folds,
@@ -760,8 +800,12 @@ class Follower:
             iterations=self.iterations,
             seconds=perf_counter() - start_time,
             root=root,
-            params=len(params),
+            param_count=len(params),
         )
+        if failure is not None:
+            failure.branch = branch
+            raise failure
+        return branch
 
     def _speed(self, point):
         """Return by how much p changes for a unit of arc length, in units of its range."""
@@ -775,32 +819,40 @@ class Follower:
     # ------------------------------------------------------------ one step
 
     def _step(self, point, size):
-        """Return the next points, between which there is at most one fold, and the length of the step after them."""
+        """Take a step.
+
+        Returns
+        -------
+        path : list of PathPoint
+        status : str
+            The status word if the branch ends with these points, else "".
+        size : float
+            Length of the next step.
+        """
         reason = ""
-        while size >= SMALLEST_STEP * self.steps.largest:
+        smallest = SMALLEST_STEP * self.steps.largest
+        size = max(size, smallest)
+        while size >= smallest:
             try:
                 following = self._point_at(point, size)
                 angle = self.curve.turning(point, following)
-                path = [following]
-                if angle <= LARGEST_ANGLE:
-                    path = self._path(point, following)
+                if angle > LARGEST_ANGLE:
+                    raise ConvergenceError(f"the branch turns by {angle:.2g} radians in a step of {size:.1e}")
+                path = self._path(point, following)
+                if self.is_natural and len(path) > 1:
+                    raise ConvergenceError(f"there are two folds in a step of {size:.1e}")
+                full_path, status = self._with_folds_and_end(point, path)
+                return full_path, status, min(size * _growth(following.iterations, angle), self.steps.largest)
             except (ConvergenceError, NonFiniteError, UnstableStepError) as error:
                 reason = str(error)
-            else:
-                if angle > LARGEST_ANGLE:
-                    reason = f"the branch turns by {angle:.2g} radians in a step of {size:.1e}"
-                elif self.is_natural and len(path) > 1:
-                    reason = f"there are two folds in a step of {size:.1e}"
-                else:
-                    return path, min(size * _growth(following.iterations, angle), self.steps.largest)
             self.rejected += 1
             size *= 0.5
-        advice = "start from another guess or smooth kinks of the residual"
+        advice = "the branch may end or go to infinity there, or the residual may have a kink"
         if self.is_natural:
             advice = "a fold may be near, write method='arclength'"
         raise ConvergenceError(
             f"continuation stopped at parameter {point.z[-1]:.8g} after {len(self.parameters) - 1} steps, as shorter "
-            f"steps fail as well: {advice}; the last failure was: {reason}",
+            f"steps fail as well: {advice}; error.branch is the branch up to there; the last failure was: {reason}",
             best=self.states[-1],
         )
 
@@ -815,40 +867,41 @@ class Follower:
 
     # ------------------------------------------------------------ folds and ends
 
-    def _add(self, point, path):
-        """Add the next points, and the folds before them; return the status word if the branch ends."""
-        for after in path:
-            status = self._add_part(point, after)
-            if status:
-                return status
-            point = after
-        return ""
+    def _add(self, path):
+        """Append points and folds to those of the branch."""
+        for point, is_fold in path:
+            self._append(point)
+            if is_fold:
+                null_vector = self.curve.unknowns.rounded(point.tangent[:-1] / length(point.tangent[:-1]))
+                self.folds.append(Fold(len(self.states) - 1, self.parameters[-1], self.states[-1], null_vector))
 
-    def _add_part(self, point, following):
-        """Append `following`, and the fold before it if there is one.
-
-        Return the status word, or "" if the branch continues.
-        """
-        if point.tangent[-1] * following.tangent[-1] < 0 and not self.is_natural:
-            fold = self._fold(point, following)
-            status = self._end_at(fold)
-            if not status:
-                status = self._end(point, fold)
+    def _with_folds_and_end(self, point, path):
+        """Return the points of a path with the folds between them, up to the end of the range, and the status word."""
+        full_path: list[PathPoint] = []
+        for following in path:
+            if self._turns_back(point, following):
+                fold = self._fold(point, following)
+                status = self._end_at(fold)
+                last = None
+                if not status:
+                    last, status = self._end(point, fold)
+                full_path.append(PathPoint(fold, True) if last is None else PathPoint(last, False))
                 if status:
-                    return status
-            self._append(fold)
-            null_vector = fold.tangent[:-1] / length(fold.tangent[:-1])
-            unknowns = self.curve.unknowns
-            self.folds.append(
-                Fold(len(self.states) - 1, self.parameters[-1], self.states[-1], unknowns.rounded(null_vector))
-            )
+                    return full_path, status
+                point = fold
+            last, status = self._end(point, following)
+            full_path.append(PathPoint(following if last is None else last, False))
             if status:
-                return status
-            point = fold
-        status = self._end(point, following)
-        if not status:
-            self._append(following)
-        return status
+                return full_path, status
+            point = following
+        return full_path, ""
+
+    def _turns_back(self, point, following):
+        """Return whether p turns back between two points."""
+        slopes = np.array([point.tangent[-1], following.tangent[-1]])
+        if self.is_natural or not slopes[0] * slopes[1] < 0:
+            return False
+        return bool(np.max(np.abs(slopes)) * self.curve.units[-1] > SLOPE_NOISE)
 
     def _path(self, point, following, depth=0):
         """Return the points after `point` up to `following`, such that at most one fold is between neighbours."""
@@ -891,7 +944,7 @@ class Follower:
         return ""
 
     def _end(self, point, following):
-        """If the range ends between two points, add the point there, and return the status word."""
+        """Return the point between two others at which the range ends, and the status word; or None and ""."""
         start, stop = self.steps.start, self.steps.stop
         direction = np.sign(stop - start)
         tolerance = self.curve.root.rtol * abs(stop - start)
@@ -900,14 +953,16 @@ class Follower:
         elif direction * (following.z[-1] - start) <= 0:
             limit, status = start, "returned_to_start"
         else:
-            return ""
+            return None, ""
         share = (limit - point.z[-1]) / (following.z[-1] - point.z[-1])
         prediction = point.z + share * (following.z - point.z)
         prediction[-1] = limit
         last = self.curve.point(following, prediction, self.curve.parameter_row)
+        units = self.curve.units
+        if not length(units * (last.z - prediction)) <= length(units * (following.z - point.z)):
+            raise ConvergenceError(f"there is no point of this branch at parameter {limit:g}")
         last.z[-1] = limit
-        self._append(last)
-        return status
+        return last, status
 
     def _fold(self, point, following):
         """Return the point between two others at which the tangent has no component along p: regula falsi."""
@@ -923,7 +978,9 @@ class Follower:
             fold = self._point_at(point, size, FOLD_ACCURACY)
             self.iterations += fold.iterations
             slope = fold.tangent[-1]
-            if abs(slope) * unit <= FOLD_TOLERANCE or not low < size < high:
+            if abs(slope) * unit <= FOLD_TOLERANCE:
+                return fold._replace(iterations=0)
+            if not low < size < high:
                 break
             if slope * high_slope > 0:
                 high, high_slope = size, slope
@@ -933,7 +990,9 @@ class Follower:
                 low, low_slope = size, slope
                 if slope * last_slope > 0:
                     high_slope *= 0.5
-        return fold._replace(iterations=0)
+        if abs(slope) * (high - low) <= self.curve.root.rtol * abs(self.steps.stop - self.steps.start):
+            return fold._replace(iterations=0)  # p turns back at a kink
+        raise ConvergenceError(f"the fold near parameter {fold.z[-1]:.8g} is not located")
 
 
 def _smallest_slope(mean, first, last):

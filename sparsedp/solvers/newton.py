@@ -201,6 +201,7 @@ class Equation:
     """
 
     root_residual: float | None = None
+    advice = "; start from the solution for nearby parameters, or raise maxiter"  # in the message of a failed solve
 
     def __init__(self, residual: Callable[..., Any], unknowns: Unknowns, params: Sequence[Any], name: str) -> None:
         self.residual = residual
@@ -650,7 +651,7 @@ class Newton:
         if status == "stagnated" and self.J.singular:
             hint += "; its Jacobian is singular there, start from another guess or fix what is free by a constant"
         elif not (has_own_reason or hint or self.is_time_step):
-            hint = "; start from the solution for nearby parameters, or raise maxiter"
+            hint = self.equation.advice
         raise ConvergenceError(
             f"{self.equation.name} after {run.iterations} Newton steps: {reason}{hint}",
             info=run.info(),

@@ -6,6 +6,7 @@ import pytest
 from test_steady import bratu, bratu_exact
 
 import sparsedp as dp
+import sparsedp.solvers.continuation as module
 from sparsedp.errors import ConvergenceError, DerivativeError, JitError, NonFiniteError, UnstableStepError
 
 BRATU_FOLD = {1: 3.513830719, 2: 6.808124423}
@@ -194,7 +195,8 @@ def test_natural_steps_do_not_pass_a_fold():
     with pytest.raises(
         ConvergenceError,
         match=r"continuation stopped at parameter 2 after \d+ steps, as shorter steps fail as well: "
-        r"a fold may be near, write method='arclength'; the last failure was: .*",
+        r"a fold may be near, write method='arclength'; error\.branch is the branch up to there; the last failure was: "
+        ".*",
     ) as failure:
         dp.continuation(cubic, -3.0, -4.0, 4.0, method="natural")
     assert failure.value.best == pytest.approx(-1.0, abs=0.1)
@@ -275,10 +277,77 @@ def test_a_branch_that_ends_is_reported():
     """x = sqrt(p - 1) ends at p = 1 with a vertical tangent in the wrong direction: NaN behind it."""
     with pytest.raises(
         ConvergenceError,
-        match=r"continuation stopped at parameter .* after \d+ steps, as shorter steps fail as well: start from "
-        "another guess or smooth kinks of the residual; the last failure was: .*",
-    ):
+        match=r"continuation stopped at parameter .* after \d+ steps, as shorter steps fail as well: the branch may "
+        r"end or go to infinity there, or the residual may have a kink; error\.branch is the branch up to there; the "
+        "last failure was: .*",
+    ) as failure:
         dp.continuation(lambda x, p: x - anp.sqrt(p - 1), 1.0, 2.0, 0.0)
+    branch = failure.value.branch
+    assert branch.status == "stopped"
+    assert branch.parameter[-1] == pytest.approx(1.0, abs=1e-6)
+    np.testing.assert_allclose(branch.parameter, 1 + np.square(branch.states), rtol=1e-9)
+    assert branch.solve(0, 2.0) == branch.states[0] == 1.0
+
+
+@pytest.mark.parametrize("stop", [1.0, pytest.param(0.5, marks=pytest.mark.whole)])
+def test_a_branch_to_infinity_has_no_fold_there(stop):
+    """x = p exp(x) has one fold, at p = 1 / e; then x grows without bound while p decreases to `start`."""
+    branch = dp.continuation(lambda x, p: x - p * anp.exp(x), 0.0, 0.0, stop, maxsteps=70)
+    assert branch.status == "max_steps"
+    assert [fold.parameter for fold in branch.folds] == pytest.approx([1 / np.e], rel=1e-13)
+    assert branch.folds[0].state == pytest.approx(1.0, abs=1e-7)
+    x = np.array(branch.states)
+    assert x[-1] > 100
+    np.testing.assert_allclose(branch.parameter, x * np.exp(-x), rtol=1e-8)
+    assert branch.params == branch.param_count == 0
+
+
+@pytest.mark.whole
+def test_a_branch_to_a_singular_state_is_returned_with_the_error():
+    """L u + lam / (1 - u)^2 = 0, a membrane in an electric field: u reaches 1 as lam returns to 0."""
+    n = 16
+    L = dp.laplacian(dp.Grid(n, size=1.0), dp.dirichlet)
+
+    def residual(u, lam):
+        return L(u) + lam / (1 - u) ** 2
+
+    with pytest.raises(ConvergenceError, match="the branch may end or go to infinity there") as failure:
+        dp.continuation(residual, np.zeros(n), 0.0, 2.0)
+    assert "raise maxiter" not in str(failure.value)
+    branch = failure.value.branch
+    assert branch.status == "stopped"
+    assert np.array_equal(branch.states[-1], failure.value.best)
+    assert 0 < branch.parameter[-1] < 1e-8
+    assert np.max(branch.states[-1]) < 1
+    (fold,) = branch.folds
+    assert dp.jvp(lambda u: residual(u, fold.parameter), fold.state, fold.null_vector)[1] == pytest.approx(0, abs=1e-4)
+    assert fold.parameter == pytest.approx(1.4000164, rel=0.005)
+
+
+def test_a_point_that_fails_a_test_is_not_taken(monkeypatch):
+    monkeypatch.setattr(module, "SMALLEST_STEP", 0.4)
+    monkeypatch.setattr(module, "FOLD_TOLERANCE", 0.0)
+    monkeypatch.setattr(module, "FOLD_STEPS", 1)
+    with pytest.raises(ConvergenceError, match=r"the fold near parameter (2|1\.9\d+) is not located"):
+        dp.continuation(cubic, -3.0, -4.0, 4.0)
+    monkeypatch.setattr(module, "RECHECKS", 1)
+    with pytest.raises(
+        ConvergenceError,
+        match=r"the residual at parameter -3\.\d+ is small only beside the terms of an earlier iterate",
+    ):
+        dp.continuation(cubic, -3.0, -4.0, 4.0)
+
+
+def test_a_kink_and_a_missing_end_stop_the_branch():
+    with pytest.raises(ConvergenceError, match=r"the branch turns by \d\.\d+ radians in a step of \d\.\de-\d\d"):
+        dp.continuation(lambda x, p: x - 2 - 0.6 * anp.abs(p), 2.6, -1.0, 1.0)
+
+    def residual(x, p):
+        return x - (100.0 if p == 1.0 else p)
+
+    with pytest.raises(ConvergenceError, match="there is no point of this branch at parameter 1") as failure:
+        dp.continuation(residual, 0.0, 0.0, 1.0)
+    np.testing.assert_allclose(failure.value.branch.states, failure.value.branch.parameter, rtol=1e-9)
 
 
 def test_wrong_arguments_are_refused():
