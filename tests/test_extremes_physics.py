@@ -199,8 +199,8 @@ PIECES = {
 ZERO_REFUSED = {
     "tensor": "k must be positive definite in every cell",
     "positive": "the u of a conservation_law must be > 0, got 0 in cell",
-    "varying density": "the density of flow_step must be > 0, got 0",
-    "weighted projection": "the density of projection must be > 0, got 0",
+    "varying density": "density of flow_step must be > 0, got 0",
+    "weighted projection": "density of projection must be > 0, got 0",
 }
 EVERY = pytest.mark.parametrize("name", PIECES)
 SHAPES = [(0,), (0, 3), (1,), (1, 1), (1, 7), (7, 1), (2, 2), (7, 5), (1, 1, 1), (2, 1, 3)]

@@ -31,6 +31,7 @@ __all__ = [
     "check_choice",
     "check_finite",
     "check_function",
+    "check_in_range",
     "check_integer",
     "check_kind",
     "check_leaves",
@@ -405,6 +406,33 @@ def check_number(name: str, value: Any, needs: str = "", advice: str = "", kind:
         limits = [float(word) for word in needs.split() if word.isdigit()]
         raise ValueError(f"{name} must be {needs}, got {number_beside(value, *limits)}{advice}")
     return float(value)
+
+
+def check_in_range(name: str, values: Any, needs: str, where: str = "in cell") -> None:
+    """Raise an error for a coefficient that is not finite, or out of range.
+
+    Parameters
+    ----------
+    name : str
+    values : number or real array
+    needs : str
+        The range of valid numbers, a key of `RANGES`.
+    where : "in cell" or "on face"
+        Words before the index of an entry of an array.
+
+    Raises
+    ------
+    NonFiniteError, ValueError
+        With the first invalid entry of an array and its index.
+    """
+    if np.ndim(values) == 0:
+        check_number(name, values, needs)
+        return
+    check_finite(name, values)
+    valid = RANGES[needs](values)
+    if not np.all(valid):
+        first = place(int(np.argmin(valid)), np.shape(values))
+        raise ValueError(f"{name} must be {needs}, got {number_beside(values[first], 0.0)} {where} {first}")
 
 
 def _shown(value):

@@ -318,26 +318,27 @@ def _check(settings: FlowSettings) -> None:
 
 
 def _check_coefficient(name: str, value: Any, range_: str) -> None:
-    """Raise unless a coefficient is a function, an array, or a number in the given range that is not traced."""
-    if not callable(value) and np.ndim(sample(value)) == 0:
+    """Raise unless a coefficient is a function, or constant: an array, or a number in the given range."""
+    if callable(value):
+        return
+    _check_not_traced(name, value)
+    if np.ndim(value) == 0:
         _check_constant(name, value, range_)
-    elif isbox(value):
-        raise _traced(name)
 
 
 def _check_constant(name: str, number: Any, range_: str) -> None:
     """Raise unless an argument is a finite number in the given range that is not traced."""
-    if isbox(number):
-        raise _traced(name)
+    _check_not_traced(name, number)
     check_number(f"{name} of flow_step", number, range_)
 
 
-def _traced(name: str) -> DerivativeError:
-    argument = name.split()[0]
-    return DerivativeError(
-        f"flow_step needs a constant {name}, got a traced one; a derivative in the {argument} takes "
-        f"{argument}=lambda params: ..."
-    )
+def _check_not_traced(name: str, value: Any) -> None:
+    if isbox(value):
+        argument = name.split()[0]
+        raise DerivativeError(
+            f"flow_step needs a constant {name}, got a traced one; a derivative in the {argument} takes "
+            f"{argument}=lambda params: ..."
+        )
 
 
 def _rebuild(arguments: dict[str, Any]) -> FlowStep:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.sparse as sp
 
-from sparsedp._utils.validation import check_finite, check_kind, check_plain
+from sparsedp._utils.validation import check_in_range, check_kind, check_plain
 from sparsedp.autodiff.program_trace import check_values
 from sparsedp.autodiff.tape import cast, dtype_of, isbox, real_dtype, sample
 from sparsedp.errors import NonFiniteError, ShapeError
@@ -79,7 +79,7 @@ class WeightedProjection:
         grid = self._open.domain.grid
         grid.backend.check("density in projection")
         value = density
-        check_plain("the density of projection", density)
+        check_plain("density of projection", density)
         if not isbox(density):
             value = np.asarray(density)
         shape = np.shape(sample(value))
@@ -89,20 +89,20 @@ class WeightedProjection:
                 f"projection takes a density that is a number or a field on {grid.cells} or {grid.faces}, got an array "
                 f"of shape {shape}"
             )
-        check_kind("the density of projection", dtype_of(value), "real numbers", "; write its .real")
+        check_kind("density of projection", dtype_of(value), "real numbers", "; write its .real")
         if shape == ():
-            check_values(_check_density, value)
+            check_values(partial(check_in_range, "density of projection", needs="> 0"), value)
         elif grid.cells.shape in (shape, shape[1:]):
-            value = self._fluid_values(self._fluid_cells, value)
+            value = self._fluid_values(self._fluid_cells, value, "in cell")
             if np.shape(sample(value)) != ():
                 value = self._to_faces(value)
         else:
-            value = self._fluid_values(self._fluid_faces, value)
+            value = self._fluid_values(self._fluid_faces, value, "on face")
         return cast(value, real_dtype(dtype))
 
-    def _fluid_values(self, fluid: FluidPart, density: Any) -> Any:
+    def _fluid_values(self, fluid: FluidPart, density: Any, where: str) -> Any:
         """Return a density with values outside of the fluid replaced; 1 where there is no fluid."""
-        check_values(partial(_check_density_of_fluid, fluid), density)
+        check_values(partial(_check_density_of_fluid, fluid, where), density)
         if fluid.empty:
             return 1.0
         return fluid.filled(density)
@@ -135,12 +135,5 @@ def _check_reciprocal(density):
         )
 
 
-def _check_density(density):
-    """Raise an error for a density that is not finite or not > 0."""
-    check_finite("the density of projection", density)
-    if np.any(density <= 0):
-        raise ValueError(f"the density of projection must be > 0, got {np.min(density):.6g}")
-
-
-def _check_density_of_fluid(fluid, density):
-    _check_density(fluid.with_ones(density))
+def _check_density_of_fluid(fluid, where, density):
+    check_in_range("density of projection", fluid.with_ones(density), "> 0", where)

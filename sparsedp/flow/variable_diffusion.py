@@ -34,7 +34,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp._utils.pytree import mapped
-from sparsedp._utils.validation import check_finite, check_kind, check_number, check_on, place
+from sparsedp._utils.validation import check_in_range, check_kind, check_on
 from sparsedp.autodiff.program_trace import check_values, sample
 from sparsedp.autodiff.tape import cast, dtype_of, isbox, real_dtype
 from sparsedp.autodiff.tape_constants import frozen
@@ -171,24 +171,17 @@ class Coefficient:
             return value
         if np.shape(sample(value)) != (*batch, *self._cells.shape):
             check_on(f"flow_step, as {self.name},", sample(value), self._cells, "; write one number for each cell")
-        check_kind(f"the {self.name} of flow_step", dtype_of(value), "real numbers", "; write its .real")
+        check_kind(f"{self.name} of flow_step", dtype_of(value), "real numbers", "; write its .real")
         check_values(self._check_range, value)
         if self.fluid.empty:
             return 1.0
         return self.fluid.filled(value)
 
     def _check_range(self, value: Any) -> None:
-        """Raise an error for values that are not finite, or out of range."""
-        name = f"the {self.name} of flow_step"
-        if np.ndim(value) == 0:
-            check_number(name, value, self._needs)
-            return
-        value = self.fluid.with_ones(value)
-        check_finite(name, value)
-        bad = value < 0 if self._needs == ">= 0" else value <= 0
-        if np.any(bad):
-            cell = place(int(np.argmax(bad)), np.shape(value))
-            raise ValueError(f"{name} must be {self._needs}, got {value[cell]:.6g} in cell {cell}")
+        """Raise an error for values in the fluid that are not finite, or out of range."""
+        if np.ndim(value) > 0:
+            value = self.fluid.with_ones(value)
+        check_in_range(f"{self.name} of flow_step", value, self._needs)
 
 
 def as_array(value: Any) -> Any:

@@ -20,7 +20,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp._utils.pytree import copied
-from sparsedp._utils.validation import check_plain
+from sparsedp._utils.validation import check_in_range, check_plain
 from sparsedp.autodiff.program_trace import check_values
 from sparsedp.autodiff.tape import isbox
 from sparsedp.errors import IncompatibleError, ShapeError
@@ -343,18 +343,13 @@ class CutCells(CutOperators):
                 f"{np.shape(density)}"
             )
         density = self._face_field("density", density, "real numbers", "; write density.real")
-        check_values(_check_positive, anp.where(self._is_open, density, 1.0))
-        return 1.0 / anp.where(self._is_open, density, 1.0)
+        density = anp.where(self._is_open, density, 1.0)
+        check_values(partial(check_in_range, "density of cut_cells", needs="> 0", where="on face"), density)
+        return 1.0 / density
 
     def __repr__(self) -> str:
         counts = f"{np.count_nonzero(self.is_fluid)} of {self.is_fluid.size} cells hold fluid"
         return f"<cut_cells: {counts}, {self._geometry.cut.size} are cut, {self.solid_boundary} on the wall>"
-
-
-def _check_positive(density):
-    least = np.min(density, initial=np.inf)
-    if not least > 0:
-        raise ValueError(f"density of cut_cells must be > 0, got {least:g}")
 
 
 def _check_balance(dim, outflow, size):

@@ -78,7 +78,7 @@ def test_errors(body):
     ):
         dp.projection(dp.Grid((9, 8)), body)
     P = dp.projection(GRID, body, CHANNEL)
-    with pytest.raises(ValueError, match="^density of cut_cells must be > 0, got -1$"):
+    with pytest.raises(ValueError, match="^density of cut_cells must be > 0, got -1 on face 0$"):
         P(v, -v)
     with pytest.raises(NonFiniteError, match="density of cut_cells must be finite"):
         P(v, np.nan)

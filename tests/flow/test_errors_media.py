@@ -17,11 +17,11 @@ def media(**given):
 
 NEGATIVE = -np.eye(4)
 REFUSED = [
-    ({"viscosity": NEGATIVE}, ValueError, "the viscosity of flow_step must be >= 0, got -1 in cell (0, 0)"),
-    ({"viscosity": lambda p: NEGATIVE}, ValueError, "the viscosity of flow_step must be >= 0, got -1 in cell (0, 0)"),
-    ({"density": np.eye(4)}, ValueError, "the density of flow_step must be > 0, got 0 in cell (0, 1)"),
+    ({"viscosity": NEGATIVE}, ValueError, "viscosity of flow_step must be >= 0, got -1 in cell (0, 0)"),
+    ({"viscosity": lambda p: NEGATIVE}, ValueError, "viscosity of flow_step must be >= 0, got -1 in cell (0, 0)"),
+    ({"density": np.eye(4)}, ValueError, "density of flow_step must be > 0, got 0 in cell (0, 1)"),
     ({"density": 0.0}, ValueError, "density of flow_step must be > 0, got 0"),
-    ({"density": lambda p: 0 * p}, ValueError, "the density of flow_step must be > 0, got 0"),
+    ({"density": lambda p: 0 * p}, ValueError, "density of flow_step must be > 0, got 0"),
     (
         {"viscosity": np.ones(3)},
         dp.errors.ShapeError,
@@ -43,12 +43,12 @@ REFUSED = [
     (
         {"viscosity": np.full((4, 4), 1j)},
         TypeError,
-        "the viscosity of flow_step must hold real numbers, got dtype complex128; write its .real",
+        "viscosity of flow_step must hold real numbers, got dtype complex128; write its .real",
     ),
     (
         {"density": np.full((4, 4), np.nan)},
         dp.errors.NonFiniteError,
-        "the density of flow_step must be finite, got 16 that are NaN or infinite, the first at (0, 0)",
+        "density of flow_step must be finite, got 16 that are NaN or infinite, the first at (0, 0)",
     ),
     ({"dt": lambda p: -p}, ValueError, "dt of flow_step must be > 0, got -1"),
     (
@@ -135,10 +135,10 @@ PROJECTION = [
         "projection takes a density that is a number or a field on cells(4, 4) or faces(4, 4), got an array of shape "
         "(5,)",
     ),
-    (0.0, ValueError, "the density of projection must be > 0, got 0"),
-    (NEGATIVE, ValueError, "the density of projection must be > 0, got -1"),
-    (1j, TypeError, "the density of projection must hold real numbers, got dtype complex128; write its .real"),
-    (np.nan, dp.errors.NonFiniteError, "the density of projection must be finite, got nan; write a finite number"),
+    (0.0, ValueError, "density of projection must be > 0, got 0"),
+    (NEGATIVE, ValueError, "density of projection must be > 0, got -1 in cell (0, 0)"),
+    (1j, TypeError, "density of projection must hold real numbers, got dtype complex128; write its .real"),
+    (np.nan, dp.errors.NonFiniteError, "density of projection must be finite, got nan"),
     (
         1e-320,
         dp.errors.NonFiniteError,

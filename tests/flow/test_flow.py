@@ -275,7 +275,7 @@ def test_refused_arguments():
         "viscosity=lambda params: ...",
     ):
         dp.value_and_grad(lambda nu: anp.sum(dp.flow_step(grid, 0.1, nu).start(rest)["v"]))(0.1)
-    with pytest.raises(ValueError, match="the viscosity of flow_step must be >= 0, got -1"):
+    with pytest.raises(ValueError, match="viscosity of flow_step must be >= 0, got -1"):
         dp.flow_step(grid, 0.1, lambda nu: nu).start(rest, -1.0)
     with pytest.raises(
         dp.errors.ShapeError,
