@@ -176,9 +176,7 @@ class CutFlow(Reconstructible):
         Coordinates of the centre of the open part of each face, to which its velocity belongs; of closed faces, of the
         place that opens first.
     is_free : bool array, shape (faces.size,)
-        Whether the velocity of a face is an unknown. On other faces it is given, or 0 in the body.
-    info : SolveLog
-        Records of the last solves.
+        Whether the velocity of a face is an unknown. On other faces it is prescribed, or 0 in the body.
     """
 
     def __init__(

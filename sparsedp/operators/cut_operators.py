@@ -49,12 +49,7 @@ class CutOperators(CutGrid):
     Parameters
     ----------
     grid, level, boundary, solid_boundary
-        As `cut_cells` takes them.
-
-    Attributes
-    ----------
-    boundary, solid_boundary
-        The conditions on the walls of the grid and on the wall of the body.
+        As `cut_cells` takes them. All but the level are attributes, see `Body`; `CutGrid` has the others.
     """
 
     def __init__(self, grid: Grid, level: Any, boundary: Any, solid_boundary: Any) -> None:

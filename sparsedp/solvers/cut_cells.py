@@ -146,18 +146,13 @@ class CutCells(CutOperators):
 
     Attributes
     ----------
-    fractions, volumes : arrays, shape `grid.shape`
-        Fluid fraction and fluid volume [length^dim] of each cell.
-    apertures : array, shape (faces.size,)
-        Fluid fraction of each face.
-    areas : array, shape `grid.shape`
-        Area of the wall in each cell [length^(dim - 1)].
-    is_fluid : bool array, shape `grid.shape`
-        Whether a cell holds fluid.
-    boundary, solid_boundary
-        The conditions on the walls of the grid and on the wall of the body.
     info : SolveLog
         Records of the last solves.
+
+    Notes
+    -----
+    `CutGrid` describes the fields of the geometry: fractions, volumes, apertures, areas, is_fluid, normals, centroids.
+    `Body` describes the conditions: boundary, solid_boundary.
     """
 
     info: Any = None
