@@ -165,12 +165,12 @@ def _call_error(error, function, written, advice, args, options):
 def _misfit(form, written, advice, args, options):
     """Return the TypeError for arguments that do not match a signature."""
     parameters = {name: parameter for name, parameter in form.parameters.items() if name != "self"}
-    given = args
+    positional_args = args
     if "self" in form.parameters:
-        given = args[1:]
+        positional_args = args[1:]
     example = None
     if advice is not None:
-        example = advice(*given, **options)
+        example = advice(*positional_args, **options)
     example = example or EXAMPLES.get(written) or _example(written, parameters)
     takes_any_keyword = any(parameter.kind is Parameter.VAR_KEYWORD for parameter in parameters.values())
     for name in options:
@@ -180,13 +180,13 @@ def _misfit(form, written, advice, args, options):
             )
     by_position = Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD
     positional = [parameter for parameter in parameters.values() if parameter.kind in by_position]
-    if len(given) > len(positional):
+    if len(positional_args) > len(positional):
         arguments = "argument" if len(positional) == 1 else "arguments"
         return TypeError(
-            f"{written} takes {len(positional)} {arguments} by position, got {len(given)}; write {example}"
+            f"{written} takes {len(positional)} {arguments} by position, got {len(positional_args)}; write {example}"
         )
     for name, parameter in parameters.items():
-        filled = name in options or parameter in positional[: len(given)]
+        filled = name in options or parameter in positional[: len(positional_args)]
         if _is_required(parameter) and not filled:
             return TypeError(f"{written} needs the argument {name!r}; write {example}")
     return TypeError(f"{written} was given an argument twice, by position and by name; write {example}")
@@ -394,14 +394,14 @@ def wrapped_functions(function: Callable) -> list[Any]:
     Attributes of a function are not copied by all wrappers. This finds them behind `jit`, `functools.wraps`,
     `functools.lru_cache`, `functools.partial` and the method ``__call__`` of an object, in any nesting.
     """
-    found: list[Any] = []
+    functions: list[Any] = []
     layer: Any = function
-    while layer is not None and not any(layer is outer for outer in found):
-        found.append(layer)
+    while layer is not None and not any(layer is outer for outer in functions):
+        functions.append(layer)
         if isinstance(layer, partial):
             layer = layer.func
         elif isinstance(layer, MethodType) and layer.__name__ == "__call__":
             layer = layer.__self__
         else:
             layer = getattr(layer, "__wrapped__", None)
-    return found
+    return functions

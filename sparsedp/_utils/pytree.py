@@ -437,12 +437,12 @@ def _pair(tree, reference, shapes, prefix):
     entries = []
     for name, place in zip(names, _places(tree, reference)):
         branch = child(tree, place)
-        wanted = child(reference, name)
-        if not (shapes or is_branch(branch) or is_branch(wanted)):  # the most frequent case
+        reference_branch = child(reference, name)
+        if not (shapes or is_branch(branch) or is_branch(reference_branch)):  # the most frequent case
             entries.append(branch)
             continue
         try:
-            entries += _pair(branch, wanted, shapes, prefix)
+            entries += _pair(branch, reference_branch, shapes, prefix)
         except _MismatchError as mismatch:
             mismatch.subscripts.append(subscript(reference, name))
             raise
@@ -477,17 +477,17 @@ def _places(tree, reference):
     return range(len(reference))
 
 
-def _check_names(kind, names, wanted):
+def _check_names(kind, names, expected):
     """Raise an error for unknown and missing names."""
-    unknown = [repr(name) for name in names if name not in wanted]
-    missing = [repr(name) for name in wanted if name not in names]
+    unknown = [repr(name) for name in names if name not in expected]
+    missing = [repr(name) for name in expected if name not in names]
     if unknown:
         problem = f"unknown {kind}{'s' if len(unknown) > 1 else ''} {', '.join(unknown)}"
     elif missing:
         problem = f"missing {kind}{'s' if len(missing) > 1 else ''} {', '.join(missing)}"
     else:
         return
-    raise _MismatchError(f"{problem}; expected {', '.join(map(repr, wanted)) or 'none'}")
+    raise _MismatchError(f"{problem}; expected {', '.join(map(repr, expected)) or 'none'}")
 
 
 # ---- norms -----------------------------------------------------------------------------------------------------------

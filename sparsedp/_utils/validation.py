@@ -243,14 +243,14 @@ def _is_floating(leaf):
 
 def check_out(op: Any, out: Any, u: np.ndarray, dtype: np.dtype, shape: tuple[int, ...]) -> None:
     """Raise an error for an array `out` of a wrong shape or dtype, or that shares memory with the argument `u`."""
-    wanted = f"out=np.empty({shape}, {dtype.name!r})"
-    check_type(f"{op.name}, as out,", out, np.ndarray, "an array", wanted)
+    example = f"out=np.empty({shape}, {dtype.name!r})"
+    check_type(f"{op.name}, as out,", out, np.ndarray, "an array", example)
     if out.shape != shape:
-        raise ShapeError(f"{op.name} gives a field on {op.codomain}, got out of shape {out.shape}; write {wanted}")
+        raise ShapeError(f"{op.name} gives a field on {op.codomain}, got out of shape {out.shape}; write {example}")
     if out.dtype != dtype:
-        raise TypeError(f"{op.name} gives {dtype} here, got out of dtype {out.dtype}; write {wanted}")
+        raise TypeError(f"{op.name} gives {dtype} here, got out of dtype {out.dtype}; write {example}")
     if not out.flags.c_contiguous or not out.flags.writeable or np.may_share_memory(out, u):
-        raise ValueError(f"{op.name} needs an out that is contiguous, writeable and apart from u; write {wanted}")
+        raise ValueError(f"{op.name} needs an out that is contiguous, writeable and apart from u; write {example}")
 
 
 def check_finite(
@@ -315,10 +315,10 @@ def check_function(name: str, thing: Any, example: str, count: int | None = None
         check_takes(name, thing, count, example)
 
 
-def check_type(name: str, thing: Any, kind: Any, wanted: str, example: str) -> None:
-    """Raise TypeError for a value that is not an instance of `kind`; `wanted` is its description: "an array"."""
+def check_type(name: str, thing: Any, kind: Any, description: str, example: str) -> None:
+    """Raise TypeError for a value that is not an instance of `kind`; `description` is what is expected: "an array"."""
     if not isinstance(thing, kind):
-        raise TypeError(f"{name} takes {wanted}, got {type(thing).__name__}; write {example}")
+        raise TypeError(f"{name} takes {description}, got {type(thing).__name__}; write {example}")
 
 
 def check_shape(what: str, value: Any, shape: tuple[int, ...], advice: str = "") -> None:

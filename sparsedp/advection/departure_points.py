@@ -69,10 +69,10 @@ class Trajectory:
         """Replace g, the cotangent of the velocity along the step, by the cotangent of w, in place."""
         if not self._half_way:
             return
-        given = g.copy()
+        cotangents = g.copy()
         through_points = np.zeros_like(g)
         slopes = np.empty_like(g)
-        for row, part, target in zip(self._half_way, given, g, strict=True):
+        for row, part, target in zip(self._half_way, cotangents, g, strict=True):
             row.vjp(part, target, EMPTY)
             through_points += row.velocity_slopes(part, slopes)
         g += through_points

@@ -179,13 +179,13 @@ def _cotangents(
     return [cotangents[num] for num in nums], finite
 
 
-def _check_derivative(method: TransportMethod, description: str, derivative: Any, given: Iterable) -> None:
+def _check_derivative(method: TransportMethod, description: str, derivative: Any, inputs: Iterable) -> None:
     """Raise if a derivative is not finite although all cotangents or tangents passed to the step are finite."""
-    check_values(partial(_check_plain_derivative, method.name, description), derivative, *given)
+    check_values(partial(_check_plain_derivative, method.name, description), derivative, *inputs)
 
 
-def _check_plain_derivative(name, description, derivative, *given):
-    if surely_finite(derivative) or not all(np.all(np.isfinite(value)) for value in given):
+def _check_plain_derivative(name, description, derivative, *inputs):
+    if surely_finite(derivative) or not all(np.all(np.isfinite(value)) for value in inputs):
         return
     check_finite(name, np.asarray(derivative), f"cannot represent {description}")
 

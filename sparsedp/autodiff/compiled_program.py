@@ -270,7 +270,7 @@ def moved_entries(function: Callable, args: Sequence, options: dict, samples: Se
     total = sum(np.size(sample) for arg, sample in zip(args, samples, strict=True) if type(arg) is Slot)
     if total > MOST_NUMBERED:
         raise NotCompiled(f"{total} entries to be moved")
-    found = []
+    results = []
     for base in (2**21, 3 * 2**21):  # a constant is the same in both runs; all numbers are exact in single precision
         start = base
         numbered = []
@@ -284,8 +284,8 @@ def moved_entries(function: Callable, args: Sequence, options: dict, samples: Se
         result = np.asarray(function(*numbered, **options), float)
         if result.shape != shape:
             raise NotCompiled("a movement of entries whose shape depends on them")
-        found.append(result.reshape(-1).copy())
-    first, second = found
+        results.append(result.reshape(-1).copy())
+    first, second = results
     places = np.where(first == second, -1, first - 2**21).astype(np.int64)
     is_moved = places >= 0
     if np.any(is_moved & ((second - first != 2**22) | (places >= total))):
@@ -567,17 +567,17 @@ class _Translator:
 
     # ---- entries ----
 
-    def cast(self, value: Any, dtype: str, wanted: str) -> Any:
+    def cast(self, value: Any, dtype: str, target: str) -> Any:
         """Convert an entry to another dtype."""
-        if dtype == wanted:
+        if dtype == target:
             return value
-        if wanted == "?":
+        if target == "?":
             return self.builder.fcmp_unordered("!=", value, ir.Constant(value.type, 0.0))
         if dtype == "?":
-            return self.builder.uitofp(value, TYPES[wanted])
+            return self.builder.uitofp(value, TYPES[target])
         if isinstance(value, ir.Constant):
-            return ir.Constant(TYPES[wanted], float(DTYPES[wanted].type(value.constant)))
-        if wanted == "f":
+            return ir.Constant(TYPES[target], float(DTYPES[target].type(value.constant)))
+        if target == "f":
             return self.builder.fptrunc(value, SINGLE)
         return self.builder.fpext(value, DOUBLE)
 
@@ -1250,7 +1250,7 @@ def _dtype_of(sample, name):
 
 def _without_repetitions(calls):
     """Return the calls without those that repeat an earlier call, and for the results of these the earlier slots."""
-    known: dict = {}
+    numbers: dict = {}
     aliases: dict[int, int] = {}
     kept = []
     for call in calls:
@@ -1263,11 +1263,11 @@ def _without_repetitions(calls):
             parts = [_key(part) for part in (*args, *call.options.items())]
             if None not in parts:
                 key = (_plain_function(call.function), *parts)
-        if key in known and key is not None:
-            aliases[call.result.number] = known[key]
+        if key in numbers and key is not None:
+            aliases[call.result.number] = numbers[key]
             continue
         if key is not None:
-            known[key] = call.result.number
+            numbers[key] = call.result.number
         kept.append(call)
     return kept, aliases
 

@@ -265,12 +265,12 @@ class Jitted(Reconstructible):
 
     def jitted_value_and_grad(self, argnum: int) -> Jitted:
         """Return the jitted function ``value_and_grad(function, argnum)``, which `value_and_grad` calls."""
-        known = self._gradients.get(argnum)
-        if known is None:
-            known = self.related(value_and_grad(self.function, argnum), self.falls_back)
-            known.name = f"value_and_grad({self.name})"
-            known = self._gradients.setdefault(argnum, known)
-        return known
+        gradient = self._gradients.get(argnum)
+        if gradient is None:
+            gradient = self.related(value_and_grad(self.function, argnum), self.falls_back)
+            gradient.name = f"value_and_grad({self.name})"
+            gradient = self._gradients.setdefault(argnum, gradient)
+        return gradient
 
     def jitted_hvp(self, x: Any, tangent: Any) -> Any:
         """Return ``hvp(function, x, tangent)`` by a program."""
@@ -287,12 +287,12 @@ class Jitted(Reconstructible):
         trace = entries[places[0]]._trace
         tangents = tuple([entries[place]._node.g for place in places])
         plain_args, plain_options = rebuild([entry._value if isbox(entry) else entry for entry in entries])
-        known = self._tangents.get(places)
-        if known is None:
-            known = self.related(partial(_value_and_tangent, self.function, places), falls_back=True)
-            known.name = f"jvp({self.name})"
-            known = self._tangents.setdefault(places, known)
-        value, tangent = known(plain_args, plain_options, tangents)
+        tangent_program = self._tangents.get(places)
+        if tangent_program is None:
+            tangent_program = self.related(partial(_value_and_tangent, self.function, places), falls_back=True)
+            tangent_program.name = f"jvp({self.name})"
+            tangent_program = self._tangents.setdefault(places, tangent_program)
+        value, tangent = tangent_program(plain_args, plain_options, tangents)
         results, rebuild = flatten(value)
         for place, slope in enumerate(leaves(tangent)):
             if slope is not None:
@@ -566,8 +566,8 @@ class Recorded:
 
     def refuse_loop(self, loop: Any, reason: str) -> None:
         """Do not use a `CompiledLoop` any more."""
-        for key, known in self._loops.items():
-            if known is loop:
+        for key, recorded_loop in self._loops.items():
+            if recorded_loop is loop:
                 self._loops[key] = None
         self.jitted.note_not_compiled(reason)
 
@@ -635,31 +635,31 @@ def check_program(name: str, expected: Any, result: Any, eps: float) -> None:
             )
 
 
-def _agree(expected, found, eps=0.0):
+def _agree(expected, actual, eps=0.0):
     """Return whether two leaves are equal up to rounding, numbers in any precision."""
-    if is_variable(expected) and is_variable(found) and np.ndim(expected) == np.ndim(found) == 0:
-        dtypes = dtype_of(expected), dtype_of(found)
+    if is_variable(expected) and is_variable(actual) and np.ndim(expected) == np.ndim(actual) == 0:
+        dtypes = dtype_of(expected), dtype_of(actual)
         eps = max(eps, *[np.finfo(dtype).eps for dtype in dtypes])
         common = np.result_type(*dtypes)
         expected = np.asarray(expected, common)
-        found = np.asarray(found, common)
-    return gap(expected, found, eps) <= VALUE_TOLERANCE
+        actual = np.asarray(actual, common)
+    return gap(expected, actual, eps) <= VALUE_TOLERANCE
 
 
-def gap(expected: Any, found: Any, eps: float = 0.0) -> float:
+def gap(expected: Any, actual: Any, eps: float = 0.0) -> float:
     """Return the largest difference of two leaves relative to the largest entry, in units of the machine epsilon.
 
     The gap is infinite if shapes, dtypes, entries that are not finite, or leaves that are not floating differ. `eps` is
     the machine epsilon of a less precise leaf, from which both have been computed.
     """
     if not is_variable(expected):
-        if isinstance(expected, np.ndarray) or isinstance(found, np.ndarray):
-            is_equal = np.array_equal(expected, found)
+        if isinstance(expected, np.ndarray) or isinstance(actual, np.ndarray):
+            is_equal = np.array_equal(expected, actual)
         else:
-            is_equal = expected is found or expected == found
+            is_equal = expected is actual or expected == actual
         return 0.0 if is_equal else inf
     a = np.asarray(expected)
-    b = np.asarray(found)
+    b = np.asarray(actual)
     if a.shape != b.shape or a.dtype != b.dtype:
         return inf
     if np.array_equal(a, b, equal_nan=True):
@@ -783,13 +783,13 @@ class PullbackProgram:
             n_forward = len(trace.calls)
             results = [trace.samples[slot.number] for slot in self.outputs.slots]
             self.floating = [k for k, value in enumerate(results) if is_variable(value)]
-            given: list = [None] * len(tape.values)
+            result_cotangents: list = [None] * len(tape.values)
             cotangent_slots = []
             for k in self.floating:
                 slot = trace.slot(random_like(results[k]))
                 cotangent_slots.append(slot)
-                given[self.outputs.places[k]] = trace.box(slot)
-            pulled = tape.pull(given)
+                result_cotangents[self.outputs.places[k]] = trace.box(slot)
+            pulled = tape.pull(result_cotangents)
             cotangents = []
             for num in nums:
                 cotangent = pulled[recorded.places[num]]
@@ -797,9 +797,9 @@ class PullbackProgram:
                     cotangent = trace.unboxed(gradient_of(boxes[num], cotangent))
                 cotangents.append(cotangent)
             trace.check()
-        found = [cotangent for cotangent in cotangents if type(cotangent) is Slot]
-        backward_calls = needed_calls(trace.calls[n_forward:], found)
-        used = free_slots(backward_calls) | {slot.number for slot in found}
+        slots = [cotangent for cotangent in cotangents if type(cotangent) is Slot]
+        backward_calls = needed_calls(trace.calls[n_forward:], slots)
+        used = free_slots(backward_calls) | {slot.number for slot in slots}
         computed = {call.result.number for call in backward_calls}
         of_cotangents = {slot.number for slot in cotangent_slots}
         self._saved = [Slot(number) for number in sorted(used - of_cotangents - computed)]
@@ -837,8 +837,8 @@ class PullbackProgram:
         check_program(recorded.name, tape.rebuild(tape.values), self.outputs.build(results), recorded.eps)
         cotangents = [random_like(results[k]) for k in self.floating]
         expected = self._pull_tape(tape, cotangents, variables)
-        found = self.pull(saved, cotangents, variables)
-        check_program(f"the gradient of {recorded.name}", expected, found, recorded.eps)
+        actual = self.pull(saved, cotangents, variables)
+        check_program(f"the gradient of {recorded.name}", expected, actual, recorded.eps)
 
     def _tape(self, variables):
         """Return the function on a tape at some variables, plain or of a program."""
@@ -873,12 +873,12 @@ class PullbackProgram:
 
 def _bytes_of(trace, slots, inputs):
     """Return the bytes of the values of some slots; for the pullback of a rule those of the arguments of its call."""
-    wanted = {slot.number for slot in slots}
+    numbers = {slot.number for slot in slots}
     for call in trace.calls:
-        if call.result.number in wanted and not isinstance(trace.sample(call.result), (np.ndarray, np.generic)):
-            wanted.update(arg.number for arg in call.args if type(arg) is Slot)
-    wanted -= {slot.number for slot in inputs}
-    return sum(getattr(trace.samples[number], "nbytes", 0) for number in wanted)
+        if call.result.number in numbers and not isinstance(trace.sample(call.result), (np.ndarray, np.generic)):
+            numbers.update(arg.number for arg in call.args if type(arg) is Slot)
+    numbers -= {slot.number for slot in inputs}
+    return sum(getattr(trace.samples[number], "nbytes", 0) for number in numbers)
 
 
 @contextmanager
@@ -1045,9 +1045,9 @@ class OpaqueCall(Rule):
         """Return the cotangents of the differentiated variables, from the tape of a call."""
         _, tape = call
         n = len(self._result.places)
-        given = placed([None] * len(tape.values), self._result.places, cotangents_and_variables[:n])
+        tape_cotangents = placed([None] * len(tape.values), self._result.places, cotangents_and_variables[:n])
         variables = cotangents_and_variables[n:]
-        pulled = tape.pull(given)
+        pulled = tape.pull(tape_cotangents)
         return [gradient_of(variables[num], pulled[self._structure.places[num]]) for num in self._nums]
 
 

@@ -46,12 +46,12 @@ IN_PLACE = {"+": np.add, "-": np.subtract, "*": np.multiply, "/": np.true_divide
 
 def needed_calls(calls: Iterable[ProgramCall], results: Iterable[Slot]) -> list[ProgramCall]:
     """Return the calls that some results need, and all checks, in order."""
-    wanted = {slot.number for slot in results}
+    numbers = {slot.number for slot in results}
     needed = []
     for call in reversed(list(calls)):
-        if call.result.number in wanted or call.has_effect:
+        if call.result.number in numbers or call.has_effect:
             needed.append(call)
-            wanted.update(arg.number for arg in call.args if type(arg) is Slot)
+            numbers.update(arg.number for arg in call.args if type(arg) is Slot)
     needed.reverse()
     return needed
 
@@ -128,11 +128,11 @@ class _Writer:
         """Return the name of a slot or constant."""
         if type(value) is Slot:
             return f"v{value.number}"
-        known = self._names.get(id(value))
-        if known is None:
-            known = self._names[id(value)] = f"k{len(self._names)}"
-            self.constants[known] = value
-        return known
+        constant = self._names.get(id(value))
+        if constant is None:
+            constant = self._names[id(value)] = f"k{len(self._names)}"
+            self.constants[constant] = value
+        return constant
 
     def line(self, position: int, call: ProgramCall) -> str:
         """Return the line of code of a call."""
@@ -191,10 +191,10 @@ class _Writer:
             return f"{self.name(np.concatenate)}(({names[0]}[{-shift}:], {names[0]}[:{-shift}]))"
         samples = list(map(self._trace.sample, call.args))
         function, args = executed_function(call.function, call.args, samples)
-        given = ", ".join(map(self.name, args))
+        arguments = ", ".join(map(self.name, args))
         if call.options:
-            given = f"{given}, **{self.name(call.options)}"
-        return f"{self.name(function)}({given})"
+            arguments = f"{arguments}, **{self.name(call.options)}"
+        return f"{self.name(function)}({arguments})"
 
     def _shift_of_roll(self, call: ProgramCall) -> int:
         """Return by how much a call of roll shifts an array with one axis, between 1 and its size; 0 for other calls.

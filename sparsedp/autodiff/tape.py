@@ -402,12 +402,12 @@ class ReverseNode(VJPNode):
         """Set the pullback to that of a function of autograd, or of a rule."""
         if len(nums) < len(args) and function not in sparing:
             args = constant_args(args, nums)
-        known = replaced_functions.get(function, function)
+        primitive = replaced_functions.get(function, function)
         options = constant(options)
         if function not in (_primitive, _operator, through) and _is_program_level((value, *args)):
-            self.vjp = _recorded_pullback_of_autograd(value, known, args, options, nums)
+            self.vjp = _recorded_pullback_of_autograd(value, primitive, args, options, nums)
         else:
-            self.vjp = VJPNode(value, known, args, options, nums, ()).vjp
+            self.vjp = VJPNode(value, primitive, args, options, nums, ()).vjp
         self.held = ()
         if function is _primitive and args[0].adds:
             self.held = SUMS
@@ -839,12 +839,12 @@ def _entry_of_program(box, array, index, take):
     Its cotangents are then added as numbers, and put into the cotangent of the array once.
     """
     node = box._node
-    known = node.recorder.entries
-    entry = known.get((node, index))
+    entries = node.recorder.entries
+    entry = entries.get((node, index))
     if entry is None:
         answer = take(array, index)
         entry = new_box(answer, box._trace, ReverseNode(answer, ITEM, (array, index), {}, FIRST, (node,)))
-        known[node, index] = entry
+        entries[node, index] = entry
     return entry
 
 
@@ -973,10 +973,10 @@ def differentiable(
     (8.0, 12.0)
     """
     keywords = tuple(keywords)
-    made = differentiable, (name, forward, vjp, jvp, keywords)
+    constructor_call = differentiable, (name, forward, vjp, jvp, keywords)
     isolated_vjp = None if vjp is None else _isolated_vjp(name, vjp)
     isolated_jvp = None if jvp is None else _isolated_jvp(name, jvp)
-    return Rule(name, _isolated(forward), isolated_vjp, isolated_jvp, keywords, made)
+    return Rule(name, _isolated(forward), isolated_vjp, isolated_jvp, keywords, constructor_call)
 
 
 VJP_FORM = "vjp=lambda nums, ans, *args: lambda g: (...,)"
@@ -1053,14 +1053,14 @@ class Rule(Reconstructible):
         vjp: Callable | None = None,
         jvp: Callable | None = None,
         keywords: tuple[str, ...] = (),
-        made: tuple | None = None,
+        constructor_call: tuple | None = None,
     ):
         self.name = name
         self.forward = forward
         self.vjp = vjp
         self.jvp = jvp
         self.keywords = keywords
-        self.constructor_call = made or (Rule, (name, forward, vjp, jvp, keywords))
+        self.constructor_call = constructor_call or (Rule, (name, forward, vjp, jvp, keywords))
         self._bound: dict[tuple, Callable] = {}
         self._bound_vjps: dict[tuple, Callable | None] = {}
 
@@ -1287,10 +1287,10 @@ def _call_jvp(argnums, tangents, ans, args, options):
         args = constant_args(args, argnums)
     count(rule.name, "jvp")
     nums = tuple(num - 1 for num in argnums)
-    given = (*tangents, ans, *args[1:])
-    if not rule.accepts_traced and _is_program_level(given):
-        trace = recording_trace(given)
-        tangent = trace.box(trace.call(partial(_pushed, rule, nums), *map(trace.unboxed, given)))
+    inputs = (*tangents, ans, *args[1:])
+    if not rule.accepts_traced and _is_program_level(inputs):
+        trace = recording_trace(inputs)
+        tangent = trace.box(trace.call(partial(_pushed, rule, nums), *map(trace.unboxed, inputs)))
     else:
         tangent = rule.jvp(nums, tangents, ans, *args[1:])
     if isinstance(sample(ans), tuple):  # rules with several results check the tangents themselves
@@ -1298,9 +1298,9 @@ def _call_jvp(argnums, tangents, ans, args, options):
     return fit(rule.name, ans, tangent, tangents[0])
 
 
-def _pushed(rule, nums, *given):
+def _pushed(rule, nums, *inputs):
     """Call the JVP of a rule with the tangents of the arguments `nums`, the result and the arguments."""
-    return rule.jvp(nums, given[: len(nums)], *given[len(nums) :])
+    return rule.jvp(nums, inputs[: len(nums)], *inputs[len(nums) :])
 
 
 defvjp_argnums(_primitive, _call_vjp)

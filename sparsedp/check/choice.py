@@ -71,17 +71,17 @@ def check_derivative(
     """
     __tracebackhide__ = True  # pytest shows the line of the test
     derivatives = {"gradient": gradient, "vjp": vjp, "jvp": jvp, "jacobian": jacobian, "hessian": hessian}
-    given = {name for name, derivative in derivatives.items() if derivative is not None}
-    if len(given) > 1 and given not in PAIRS:
-        names = " and ".join(name for name in DERIVATIVES if name in given)
+    names_of_derivatives = {name for name, derivative in derivatives.items() if derivative is not None}
+    if len(names_of_derivatives) > 1 and names_of_derivatives not in PAIRS:
+        names = " and ".join(name for name in DERIVATIVES if name in names_of_derivatives)
         raise TypeError(f"one derivative is checked at a time, got {names}; write one call for each")
-    kind = _kind(f, x, given, options)
+    kind = _kind(f, x, names_of_derivatives, options)
     if kind == "gradient":
         with plain_numpy_refused("gradient"):
             return check_gradient(f, x, gradient, quick=quick, **options)
     if not quick:
         options = {"directions": DIRECTIONS, **options}
-    if given == {"gradient"}:
+    if names_of_derivatives == {"gradient"}:
         return gradient_as_vjp(f, gradient, x, **options)
     if kind == "hessian":
         return check_hessian(f, hessian, x, gradient=gradient, **options)
@@ -92,21 +92,23 @@ def check_derivative(
     return check_vjp(f, vjp, x, jvp=jvp, **options)
 
 
-def _kind(f: Any, x: Any, given: set[str], options: dict[str, Any]) -> str:
+def _kind(f: Any, x: Any, names_of_derivatives: set[str], options: dict[str, Any]) -> str:
     """Return the check for the derivatives that are given. Raise an error for an option that it does not have."""
     __tracebackhide__ = True
     for name in options:
         if name not in ALL_ARGUMENTS:
             raise TypeError(f"no check of a derivative has the argument {name!r}{advice_near(name, ALL_ARGUMENTS)}")
-    kind = next((kind for kind in ("hessian", "jacobian") if kind in given), "vjp")
-    if given == {"jvp"}:
+    kind = next((kind for kind in ("hessian", "jacobian") if kind in names_of_derivatives), "vjp")
+    if names_of_derivatives == {"jvp"}:
         kind = "jvp"
-    elif (given == {"gradient"} and library_of(f, *leaves(x)).name == "numpy") or (not given and _is_loss(f, x)):
+    elif (names_of_derivatives == {"gradient"} and library_of(f, *leaves(x)).name == "numpy") or (
+        not names_of_derivatives and _is_loss(f, x)
+    ):
         kind = "gradient"
     for name in options:
         if name not in ARGUMENTS[kind] or name in POSITIONAL:
-            known = [word for word in ARGUMENTS[kind] if word not in (*DERIVATIVES, *POSITIONAL)]
-            raise TypeError(f"check.{kind} has no argument {name!r}; it takes {', '.join(known)}")
+            options_of_kind = [word for word in ARGUMENTS[kind] if word not in (*DERIVATIVES, *POSITIONAL)]
+            raise TypeError(f"check.{kind} has no argument {name!r}; it takes {', '.join(options_of_kind)}")
     return kind
 
 

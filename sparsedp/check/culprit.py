@@ -320,12 +320,12 @@ def _entries_of_operator(op: Operator, rng: np.random.Generator) -> str:
     in_argument = largest_gaps(gap_in_argument, [u.shape], 1)
     in_result = largest_gaps(gap_in_result, [g.shape], 1)
     words = ""
-    for name, found, space in (("argument", in_argument, op.domain), ("result", in_result, op.codomain)):
+    for name, entries, space in (("argument", in_argument, op.domain), ("result", in_result, op.codomain)):
         if space.grid is not None:
             spaces = [space]
         else:
             spaces = []
-        words += "".join(f"; largest gap in its {_named(name, one, space.shape, spaces)}" for one in found)
+        words += "".join(f"; largest gap in its {_named(name, one, space.shape, spaces)}" for one in entries)
     return words
 
 

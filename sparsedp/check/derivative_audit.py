@@ -511,13 +511,13 @@ class DerivativeAudit:
             return [eps * norm(vector * self.base)] * len(self.point.values)
         return [eps * norm(part) for part in self.program.result.split(self.base)]
 
-    def relative_gap(self, found: NDArray[Any], terms: Sequence[NDArray[Any]], vector: NDArray[Any]) -> float:
+    def relative_gap(self, result: NDArray[Any], terms: Sequence[NDArray[Any]], vector: NDArray[Any]) -> float:
         """Return the largest relative gap between a result of `derivative` and a sum of others, over all leaves.
 
         It is infinite if the result contains NaN.
         """
         split = self.point.split if self.kind == "vjp" else self.program.result.split
-        parts = zip(split(found), *(split(term) for term in terms))
+        parts = zip(split(result), *(split(term) for term in terms))
         gap = 0.0
         for hidden, (value, *leaf_terms) in zip(self.hidden_sizes(vector), parts):
             size = sum(norm(term) for term in leaf_terms)
@@ -544,8 +544,8 @@ class DerivativeAudit:
             results = [slopes[name], self.derivative(vectors[1])]
             combined = self.tangent(a * vectors[0] + b * vectors[1])
         self.pairs = list(zip(vectors, results))
-        found = self.derivative(combined)
-        self.linear_gap = self.relative_gap(found, [a * results[0], b * results[1]], combined)
+        result = self.derivative(combined)
+        self.linear_gap = self.relative_gap(result, [a * results[0], b * results[1]], combined)
         allowed = self.allowed(REVIEW.linear_share)
         name = f"linear in {self.program.argument_of(self.kind)}"
         self.rows.append(Row(name, self.linear_gap, allowed, self.linear_gap <= allowed))
@@ -662,9 +662,9 @@ class DerivativeAudit:
             overall_verdict(directions, self.findings, self.program.value_name, self.title)
             for directions in [group.directions for group in with_directions] or [[]]
         ]
-        for wanted in ("disagrees", "inconclusive", "agrees"):
+        for severest in ("disagrees", "inconclusive", "agrees"):
             for verdict, reason in verdicts:
-                if verdict == wanted:
+                if verdict == severest:
                     self.verdict = verdict
                     self.reason = reason
                     break

@@ -310,10 +310,10 @@ def transposed_products(op: Operator) -> DerivativeCheck:
         return op.T.apply(g)
 
     program = Program(op.apply, x, pull, None, "transpose")
-    found = _audited(DerivativeAudit(program, options, "vjp", False, "the transpose"), "transpose")
-    if found.culprit:
-        return _changed(found, culprit=found.culprit.replace("the Jacobian", "the operator"))
-    return found
+    summary = _audited(DerivativeAudit(program, options, "vjp", False, "the transpose"), "transpose")
+    if summary.culprit:
+        return _changed(summary, culprit=summary.culprit.replace("the Jacobian", "the operator"))
+    return summary
 
 
 def hessian(
@@ -477,11 +477,11 @@ def _checked(
     name = f"check.{kind}"
     if convention is not None:
         check_choice("convention", convention, CONVENTIONS)
-    given = {word: function for word, function in derivatives.items() if function is not None}
-    for word, function in given.items():
+    own_derivatives = {word: function for word, function in derivatives.items() if function is not None}
+    for word, function in own_derivatives.items():
         check_function(f"{word} of {name}", function, EXAMPLES[word], 2)
     subject = _subject(name, f, x, options.rng)
-    chosen = {**subject.methods, **given}
+    chosen = {**subject.methods, **own_derivatives}
     program = Program(
         subject.function, subject.x, chosen.get("vjp"), chosen.get("jvp"), convention or subject.convention
     )
@@ -504,17 +504,17 @@ def _with_stage(
     """Return the result of a check of a program that is wrong, with the first stage that is wrong."""
     undecided = []
     for stage, point in chain.inputs(x):
-        found = _checked(chain.kind, stage.function, {chain.kind: stage.derivative}, point, options, convention)
-        if found.verdict == "disagrees":
-            gaps = tuple(f"{stage.name}: {gap}" for gap in found.gaps)
-            result_gaps = tuple(f"{stage.name}: {gap}" for gap in found.result_gaps)
-            note = f"{stage.name}: {found.reason}"
-            if found.culprit:
-                note += f"; {found.culprit}"
+        summary = _checked(chain.kind, stage.function, {chain.kind: stage.derivative}, point, options, convention)
+        if summary.verdict == "disagrees":
+            gaps = tuple(f"{stage.name}: {gap}" for gap in summary.gaps)
+            result_gaps = tuple(f"{stage.name}: {gap}" for gap in summary.result_gaps)
+            note = f"{stage.name}: {summary.reason}"
+            if summary.culprit:
+                note += f"; {summary.culprit}"
             notes = (f"culprit: {note}", *_gap_notes(gaps, result_gaps))
             return _changed(result, culprit=stage.name, gaps=gaps, result_gaps=result_gaps, notes=notes)
-        if found.verdict == "inconclusive":
-            undecided.append((stage.name, found.reason))
+        if summary.verdict == "inconclusive":
+            undecided.append((stage.name, summary.reason))
     if len(undecided) == 1:
         name, reason = undecided[0]
         note = f"culprit: {name}, as all other stages agree: {reason}"

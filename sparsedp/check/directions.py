@@ -225,8 +225,8 @@ def reclassify_kinks(evaluations: Evaluations, directions: Sequence[DirectionEvi
         shift = SHIFT * point.random(audit_generator(SHIFT_SEED))
         beside = Point(point.unpack(point.vector + shift))
         evaluations_beside = evaluations.at(beside)
-        found = examine_directions(evaluations_beside, RANDOM_DIRECTIONS, audit_generator(None))
-        if overall_verdict(*found)[0] == "disagrees":
+        evidence = examine_directions(evaluations_beside, RANDOM_DIRECTIONS, audit_generator(None))
+        if overall_verdict(*evidence)[0] == "disagrees":
             return
         for direction in directions:
             if direction.word in WRONG_WORDS:

@@ -265,8 +265,8 @@ class _Auditor:
                 most = 1
             else:
                 most = MOST_ENTRIES
-            found = gaps_along_entries(self.evaluations, self.directions, most)
-            self.gaps = tuple(listed(found, self.point, self.evaluations.slopes, spaces))
+            gaps = gaps_along_entries(self.evaluations, self.directions, most)
+            self.gaps = tuple(listed(gaps, self.point, self.evaluations.slopes, spaces))
         if self.gaps:
             self.notes.append(f"largest gaps: {'; '.join(self.gaps)}")
 

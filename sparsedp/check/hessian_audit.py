@@ -237,5 +237,5 @@ class LossHessianAudit(DerivativeAudit):
             return (bends[0] - bends[1]) / 4 - float(product @ v)
 
         noise = NOISE_FACTOR * float(line.rounding(np.array([step]), np.zeros((2, 1)))[0]) / step
-        found = largest_gaps(gap_along, [x.shape for x in point.values], MOST_ENTRIES, noise)
-        return Places(listed(found, point, None, self.options.spaces), [], False, 0.0)
+        gaps = largest_gaps(gap_along, [x.shape for x in point.values], MOST_ENTRIES, noise)
+        return Places(listed(gaps, point, None, self.options.spaces), [], False, 0.0)

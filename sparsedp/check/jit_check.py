@@ -148,8 +148,8 @@ class _Comparison:
             if place == PLACES[0]:
                 raise
             return [Row(f"result at {place}", note=f"not compared, the function raised {error_text(error)}")]
-        found = self.jitted(*copied(args), **options)
-        rows = [_row(f"result at {place}", "result", expected, found)]
+        actual = self.jitted(*copied(args), **options)
+        rows = [_row(f"result at {place}", "result", expected, actual)]
         for name, derivative in _derivatives(expected, args, options).items():
             rows.append(_row(f"gradient at {place}", name, derivative(self.plain), derivative(self.jitted)))
         return rows
@@ -192,15 +192,15 @@ def _gradient(args: tuple[Any, ...], place: int, function: Callable[..., Any]) -
     return gradient
 
 
-def _row(name: str, root: str, expected: Any, found: Any) -> Row:
+def _row(name: str, root: str, expected: Any, actual: Any) -> Row:
     """Return the row of two trees: the largest gap of their leaves, with the name of the leaf as a note."""
     names = labels(expected, root)
     leaf = root
     gap = 0.0
-    if names != labels(found, root):
+    if names != labels(actual, root):
         gap = inf
     else:
-        gaps = list(map(largest_gap, leaves(expected), leaves(found)))
+        gaps = list(map(largest_gap, leaves(expected), leaves(actual)))
         if gaps:
             largest = int(np.argmax(gaps))
             leaf = names[largest]

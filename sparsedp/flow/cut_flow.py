@@ -345,7 +345,7 @@ class CutFlow(Reconstructible):
             check_walls("cut_flow", walls, self._walls_space)
         return self._weights, self._solid, viscosity, v, walls
 
-    def _rates(self, convection, x, weights, solid, viscosity, given, walls):
+    def _rates(self, convection, x, weights, solid, viscosity, boundary_velocity, walls):
         """Return the residual; `weights` is the dict of all numbers that depend on the level."""
         v = x["v"]
         apertures = weights["apertures"]
@@ -356,7 +356,7 @@ class CutFlow(Reconstructible):
             rate = rate - self._gain(self._fluxes.carried(v, walls) * self._fluxes.carrier(apertures * v))
         outflow = self._divergence(apertures * v) + solid["outflow"]
         return {
-            "v": self.is_free * rate + ~self.is_free * (self._is_open * given - v),
+            "v": self.is_free * rate + ~self.is_free * (self._is_open * boundary_velocity - v),
             "p": outflow + self._pin * x["p"],
         }
 
@@ -373,7 +373,7 @@ class CutFlow(Reconstructible):
         slopes = self._walls_of_terms(self._walls_of_pairs.T(pairs))
         return weights["factors"] * slopes + weights["tangential"] * self._walls_of_terms(solid["slopes"])
 
-    def _jacobian(self, convection, x, weights, solid, viscosity, given, walls):
+    def _jacobian(self, convection, x, weights, solid, viscosity, boundary_velocity, walls):
         """Return the derivative of the residual in the flow."""
         numbers = {name: np.asarray(sample(value)) for name, value in weights.items()}
         v = np.asarray(sample(x["v"]))
@@ -600,12 +600,12 @@ class CutFlow(Reconstructible):
         excess = regions(outflow) / anp.where(np.asarray(sample(all_areas)) > 0, all_areas, 1.0)
         return anp.reshape(outflow - areas / volumes**2 * regions.T(excess), grid.shape)
 
-    def _check_balance(self, given):
+    def _check_balance(self, velocity):
         """Raise IncompatibleError if more enters a closed region than leaves it."""
-        given = np.asarray(sample(self.apertures)) * ~self.is_free * np.asarray(sample(given))
-        left = self._closed_regions @ (self._divergence.matrix @ given)
-        size = self._closed_regions @ (abs(self._divergence.matrix) @ abs(given))
-        if np.any(abs(left) > LARGEST_IMBALANCE * size):
+        prescribed = np.asarray(sample(self.apertures)) * ~self.is_free * np.asarray(sample(velocity))
+        excess = self._closed_regions @ (self._divergence.matrix @ prescribed)
+        size = self._closed_regions @ (abs(self._divergence.matrix) @ abs(prescribed))
+        if np.any(abs(excess) > LARGEST_IMBALANCE * size):
             raise IncompatibleError(
                 "cut_flow: inflow and outflow through the walls of a region differ; make the given velocity balance, "
                 "or open a wall with dp.outflow"
@@ -637,8 +637,8 @@ def _has_fluid(grid, component, geometry):
         at_middle = np.concatenate([middle, none]) | np.concatenate([none, middle])
     upper = np.roll(outer, -1, 1) if grid.periodic[1 - component] else outer[:, 1:]
     at_outer = outer[:, : upper.shape[1]] | upper
-    found = (np.asarray(sample(geometry.apertures)) > 0) | at_middle | at_outer
-    return (found.T if component else found).reshape(-1)
+    has_fluid = (np.asarray(sample(geometry.apertures)) > 0) | at_middle | at_outer
+    return (has_fluid.T if component else has_fluid).reshape(-1)
 
 
 def _check_viscosity(viscosity):

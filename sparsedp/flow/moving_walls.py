@@ -170,7 +170,7 @@ class ChangingWalls(WallsAtRest):
         return velocities
 
 
-def velocities_from_lift(lifted: Any, grid: Grid, sides: tuple, wanted: NDArray) -> Any:
+def velocities_from_lift(lifted: Any, grid: Grid, sides: tuple, required: NDArray) -> Any:
     """Recover wall velocities from the result of `face_lift`; those on faces that are not free get 0.
 
     Parameters
@@ -180,7 +180,7 @@ def velocities_from_lift(lifted: Any, grid: Grid, sides: tuple, wanted: NDArray)
     grid : Grid
     sides : tuple
         The flow conditions as `resolve` returns them.
-    wanted : bool array on the domain of `face_lift`
+    required : bool array on the domain of `face_lift`
         The velocities to recover; all others get 0.
 
     Returns
@@ -190,17 +190,17 @@ def velocities_from_lift(lifted: Any, grid: Grid, sides: tuple, wanted: NDArray)
     Raises
     ------
     ValueError
-        If a face with a wanted velocity also touches another wall with a velocity. The array then holds only the sum of
-        both contributions, from which they cannot be separated.
+        If a face with a required velocity also touches another wall with a velocity. The array then holds only the sum
+        of both contributions, from which they cannot be separated.
     """
     lift = compose(Mask(free_face_mask(grid, sides, None)), wall_stresses(grid, sides)).explicit().tocsr()
     walls = wall_velocities(grid, sides)
     wall_count = np.diff(lift.indptr)  # number of wall velocities that each face depends on
-    needed = abs(lift) @ wanted > 0
+    needed = abs(lift) @ required > 0
     check_values(partial(_check_separate, needed & (wall_count > 1)), lifted)
     # If a face depends on a single wall velocity, this velocity is the value on the face divided by the coefficient.
     face, wall = lift.nonzero()
-    invertible = (wall_count[face] == 1) & wanted[wall]
+    invertible = (wall_count[face] == 1) & required[wall]
     coefficients = 1.0 / lift.data[invertible]
     inverse = sp.csr_array((coefficients, (wall[invertible], face[invertible])), shape=lift.shape[::-1])
     return Operator(Matrix(inverse), grid.faces, walls, "wall velocities")(lifted)

@@ -51,7 +51,7 @@ class FlowSettings:
         return ("shear_rate",)
 
 
-def needs_fields(argument: str, given: Any, fields: tuple[str, ...]) -> bool:
+def needs_fields(argument: str, argument_value: Any, fields: tuple[str, ...]) -> bool:
     """Return whether an argument of `flow_step` is a function of fields and params, and not of params alone.
 
     This depends on how many positional arguments it accepts, by its signature: one, or one more than there are fields.
@@ -61,7 +61,7 @@ def needs_fields(argument: str, given: Any, fields: tuple[str, ...]) -> bool:
     ----------
     argument : str
         Name of the argument.
-    given : Any
+    argument_value : Any
     fields : tuple of str
         The names of the fields; empty if the argument may be a function of params alone.
 
@@ -70,12 +70,12 @@ def needs_fields(argument: str, given: Any, fields: tuple[str, ...]) -> bool:
     TypeError
         If it is a function that accepts neither number of arguments, or both.
     """
-    if not callable(given):
+    if not callable(argument_value):
         return False
     examples = {1: f"{argument}=lambda params: ..."}
     if fields:
         examples[1 + len(fields)] = f"{argument}=lambda {', '.join(fields)}, params: ..."
-    expected = _signature(given)
+    expected = _signature(argument_value)
     if expected is None and not fields:
         return False
     accepted = [count for count in examples if expected is None or _accepts(expected, count)]

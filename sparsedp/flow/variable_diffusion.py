@@ -111,7 +111,7 @@ class Coefficient:
     ----------
     name : str
         Name in error messages, such as "viscosity".
-    given : number, array or callable
+    coefficient : number, array or callable
         A function is called with the params, or with the fields and the params; see `needs_fields`.
     settings : FlowSettings
     needs : str
@@ -125,16 +125,16 @@ class Coefficient:
         Whether it is a function of fields.
     """
 
-    def __init__(self, name: str, given: Any, settings: FlowSettings, needs: str) -> None:
+    def __init__(self, name: str, coefficient: Any, settings: FlowSettings, needs: str) -> None:
         self.name = name
         self._cells = settings.grid.cells
         self._needs = needs
         self.fluid = FluidPart.of_cells(settings.grid, settings.solid)
         argument = name.split()[0]
-        self.needs_fields = needs_fields(argument, given, settings.fields_of(argument))
-        if not callable(given):
-            given = self._checked(given)
-        self._given = given
+        self.needs_fields = needs_fields(argument, coefficient, settings.fields_of(argument))
+        if not callable(coefficient):
+            coefficient = self._checked(coefficient)
+        self._coefficient = coefficient
 
     def __call__(self, fields: Callable[[], tuple], params: Any, dtype: np.dtype, batch: tuple[int, ...] = ()) -> Any:
         """Return the coefficient, a number or one value for each cell.
@@ -149,7 +149,7 @@ class Coefficient:
         batch : tuple of int
             The leading axes of the flow, which a function of fields may return too.
         """
-        value = self._given
+        value = self._coefficient
         if callable(value):
             if self.needs_fields:
                 value = value(*mapped(frozen, fields()), params)

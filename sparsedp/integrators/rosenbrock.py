@@ -274,13 +274,13 @@ class Rosenbrock(Embedded):
         first, second, third = DENSE @ step.middle
         return 0.5 * (step.u + step.new) + 0.25 * (first + 0.5 * (second + 0.5 * third)), 0.5
 
-    def stages(self, v: Any, params: Any, t: Any, h: Any, known: np.ndarray | None = None) -> list:
+    def stages(self, v: Any, params: Any, t: Any, h: Any, solutions: np.ndarray | None = None) -> list:
         """Return the stages of a step, as functions of all arguments.
 
         Parameters
         ----------
         v, params, t, h : traced or not
-        known : array, shape (8, n), optional
+        solutions : array, shape (8, n), optional
             The values of the stages.
         """
         variables = self.equation.variables((h, params, t))
@@ -293,17 +293,17 @@ class Rosenbrock(Embedded):
             b = combined(b, [weight / h for weight in C[i]], stages)
             if slope is not None and D[i]:
                 b = b + D[i] * h * slope
-            value = None if known is None else known[i]
+            value = None if solutions is None else solutions[i]
             solve = solve_rule(f"{self.name}.solve", partial(self._solve, value), negative_gradient, product_with)
             stages.append(solve(b, self.equation, v, *variables))
         return stages
 
     def _solve(
-        self, known: Any, transposed: bool, checked: bool, b: Any, equation: Equation, v: Any, *variables: Any
+        self, solution: Any, transposed: bool, checked: bool, b: Any, equation: Equation, v: Any, *variables: Any
     ) -> Any:
-        """Return the solution of W x = b, or of W^T x = b; `known` is the solution of the first solve of a rule."""
-        if checked and known is not None:
-            return known
+        """Return the solution of W x = b, or of W^T x = b; `solution` is the one of the first solve of a rule."""
+        if checked and solution is not None:
+            return solution
         return self._solved(transposed, b, equation, v, variables)
 
     def solve_transposed(self, g: np.ndarray, v: np.ndarray, variables: Sequence) -> np.ndarray:

@@ -362,19 +362,19 @@ class SceneWithUnits(Reconstructible):
                 f"pint.Quantity(value, {name!r})"
             )
         units = type(leaf.units._units)(dict(leaf.unit_items()))  # as text, an exponent of 1/3 would be rounded
-        given = self._registry.Quantity(leaf.magnitude, units)  # it may belong to another registry
+        quantity = self._registry.Quantity(leaf.magnitude, units)  # it may belong to another registry
         if name is None:
             raise TypeError(
-                f"{place} of {self.name} must have no unit, as declared by None, got {given.units}; declare its unit, "
-                "or give its magnitude"
+                f"{place} of {self.name} must have no unit, as declared by None, got {quantity.units}; declare its "
+                "unit, or give its magnitude"
             )
-        wanted = self._units[name]
-        if _exponents(given) != wanted.exponents:
+        unit = self._units[name]
+        if _exponents(quantity) != unit.exponents:
             raise ValueError(
-                f"{place} of {self.name} must have the dimension of {wanted.name}, got {given.units}; give such a "
+                f"{place} of {self.name} must have the dimension of {unit.name}, got {quantity.units}; give such a "
                 "quantity, or declare another unit"
             )
-        value = given.to(wanted.base).magnitude
+        value = quantity.to(unit.base).magnitude
         if np.asarray(value).dtype.kind in "iu":
             value = np.multiply(value, 1.0)
         return value
@@ -426,17 +426,19 @@ def _is_unit(entry: Any) -> bool:
 
 def _compared(dimension: str, place: str, expected: float, one: Any, other: Any) -> ScaledRun:
     """Compare an entry of the result with that in the other system of units."""
-    wanted = np.asarray(one) * FACTOR**expected
-    found = np.asarray(other)
-    if wanted.shape != found.shape:
-        return ScaledRun(dimension, place, expected, np.nan, np.inf, f"shape {found.shape} for {wanted.shape}")
-    size = float(np.max(np.abs(wanted), initial=0.0))
+    expected_result = np.asarray(one) * FACTOR**expected
+    result = np.asarray(other)
+    if expected_result.shape != result.shape:
+        return ScaledRun(
+            dimension, place, expected, np.nan, np.inf, f"shape {result.shape} for {expected_result.shape}"
+        )
+    size = float(np.max(np.abs(expected_result), initial=0.0))
     length = float(np.linalg.norm(one))
     other_length = float(np.linalg.norm(other))
     exponent = np.nan
     if length and other_length:
         exponent = float(np.log(other_length / length) / np.log(FACTOR))
-    deviation = float(np.max(np.abs(found - wanted), initial=0.0))
+    deviation = float(np.max(np.abs(result - expected_result), initial=0.0))
     if size:
         deviation = deviation / size
     return ScaledRun(dimension, place, expected, exponent, deviation)

@@ -51,13 +51,13 @@ def check_fields(
     return times, content
 
 
-def check_names(name: str, argument: str, entries: Any, known: Any) -> None:
-    """Raise ValueError if an argument is not a dict, or has a key that is not in `known`. None is allowed."""
+def check_names(name: str, argument: str, entries: Any, valid: Any) -> None:
+    """Raise ValueError if an argument is not a dict, or has a key that is not in `valid`. None is allowed."""
     unknown = entries
     if isinstance(entries or {}, dict):
-        unknown = sorted(set(entries or ()) - set(known), key=str)
+        unknown = sorted(set(entries or ()) - set(valid), key=str)
     if unknown:
-        raise ValueError(f"{name} takes {argument} as a dict with keys from {[*known]}, got {unknown}; leave them out")
+        raise ValueError(f"{name} takes {argument} as a dict with keys from {[*valid]}, got {unknown}; leave them out")
 
 
 def _numbers(name, field, value, dtypes):

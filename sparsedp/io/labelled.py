@@ -143,15 +143,15 @@ def dataset_of(name: str, grid: Grid, attrs: dict | None, times: Any, content: d
                 f"{name} takes units as a str, or a dict of str, numbers and arrays, in attrs, got {one!r} for {key}; "
                 f"write {{{key!r}: 'm'}}"
             )
-    given = {key: {"units": one} if isinstance(one, str) else one for key, one in (attrs or {}).items()}
+    attributes = {key: {"units": one} if isinstance(one, str) else one for key, one in (attrs or {}).items()}
     coords: dict[str, Any] = {}
     variables: dict[str, Any] = {}
     for number, axis in enumerate(grid.axes):
-        coords[axis] = axis, grid.coordinates(number), given.get(axis)
-        coords[f"{axis}_nodes"] = f"{axis}_nodes", grid.coordinates(number, "nodes"), given.get(axis)
-        variables[f"{axis}_widths"] = axis, grid.widths[number], given.get(axis)
+        coords[axis] = axis, grid.coordinates(number), attributes.get(axis)
+        coords[f"{axis}_nodes"] = f"{axis}_nodes", grid.coordinates(number, "nodes"), attributes.get(axis)
+        variables[f"{axis}_widths"] = axis, grid.widths[number], attributes.get(axis)
     if times is not None:
-        coords["time"] = "time", times, given.get("times")
+        coords["time"] = "time", times, attributes.get("times")
     notes: dict[str, Any] = {"format": KIND, "origin": grid.origin, "periodic": grid.periodic, "fields": {}}
     series = [] if times is None else ["time"]
     for field, (space, values) in content.items():
@@ -166,7 +166,7 @@ def dataset_of(name: str, grid: Grid, attrs: dict | None, times: Any, content: d
                 raise ValueError(f"{name} would store {field} as {label}, which exists; write another name")
             on_nodes = node_axes(space.kind, number, grid.dim) or ()
             places = [f"{axis}_nodes" if n in on_nodes else axis for n, axis in enumerate(grid.axes)]
-            variables[label] = batch + places, part.reshape(*lead, *space.parts[number]), given.get(field)
+            variables[label] = batch + places, part.reshape(*lead, *space.parts[number]), attributes.get(field)
         notes["fields"][field] = space.kind, labels
     return xarray.Dataset(variables, coords, {"sparsedp": json.dumps(notes)})
 

@@ -270,7 +270,7 @@ def to_velocity(
     u: NDArray,
     inflow: NDArray,
     slopes: NDArray,
-    given: NDArray,
+    cotangents: NDArray,
     ratio: float,
     flux: float,
     a: int,
@@ -281,7 +281,7 @@ def to_velocity(
 ) -> Any:
     """Compute the cotangent of w on the sides of a piece, and return how many of its values are not finite.
 
-    It is written to `gw` if `fresh`, else added to `gw`. `given` holds cotangents of cells, which start at the four
+    It is written to `gw` if `fresh`, else added to `gw`. `cotangents` are those of cells, which start at the four
     indices `places`: of the cells themselves, weighted for their lower and for their upper sides, and of the cells
     beyond these sides. The value at a side is the value of the upstream cell, or the mean of both cells where w is 0.
     """
@@ -294,8 +294,8 @@ def to_velocity(
     if not on_sides:  # the velocity of a cell applies to both its sides
         for j in range(below.begin, below.end):
             near = share(w[m + j])
-            low = (below.shown * u[below.beyond + j] - u[c + j]) * given[places[0] + j]
-            high = (above.shown * u[q + j] - u[c + j]) * given[places[1] + j]
+            low = (below.shown * u[below.beyond + j] - u[c + j]) * cotangents[places[0] + j]
+            high = (above.shown * u[q + j] - u[c + j]) * cotangents[places[1] + j]
             total = ratio * (near * low - (1.0 - near) * high)
             total = total if fresh else total + gw[m + j]
             bad += not abs(total) < np.inf
@@ -314,20 +314,20 @@ def to_velocity(
                 value = near * (shown * u[z + j]) + (1.0 - near) * u[c + j]
                 mine = value - rest * u[c + j]
                 theirs = value - rest * u[z + j]
-                total = sign * ratio * (mine * given[x + j] - back * given[i + j] * theirs)
+                total = sign * ratio * (mine * cotangents[x + j] - back * cotangents[i + j] * theirs)
                 total = total if fresh else total + gw[m + j]
                 bad += not abs(total) < np.inf
                 gw[m + j] = total
         if not shown:
             for j in range(b, e):
-                gw[m + j] += sign * ratio * given[x + j] * (share(sign * w[m + j]) * inflow[wall + j])
+                gw[m + j] += sign * ratio * cotangents[x + j] * (share(sign * w[m + j]) * inflow[wall + j])
                 bad += not abs(gw[m + j]) < np.inf
         if slopes.size:
             for j in range(b, e):
                 near = share(sign * w[m + j])
                 theirs = inner * slopes[a, (1 - upper) % slopes_per_axis, z + j]
                 slope = near * theirs - (1.0 - near) * slopes[a, upper % slopes_per_axis, c + j]
-                gw[m + j] += ratio * (given[x + j] - back * given[i + j]) * slope
+                gw[m + j] += ratio * (cotangents[x + j] - back * cotangents[i + j]) * slope
                 bad += not abs(gw[m + j]) < np.inf
     return bad
 
@@ -488,9 +488,9 @@ def vjp(
     of_slopes = memory[1:]
     uneven = axes[0, IS_UNEVEN]
     if uneven:
-        given = lines
+        cotangents = lines
     else:
-        given = g
+        cotangents = g
     last = slopes.shape[1] - 1
     for part in range(start, stop):
         tile = _, _, _, c, size = tile_of(axes, part)
@@ -517,7 +517,7 @@ def vjp(
                 sides = (below, above)
                 if b == e:
                     continue
-                # Starts in `given` of the cotangents of the cells (x, y: for lower and upper sides) and of the cells
+                # Starts in `cotangents` of those of the cells (x, y: for lower and upper sides) and of the cells
                 # beyond these sides (i, k).
                 x = c
                 y = c
@@ -543,10 +543,10 @@ def vjp(
                     for j in range(b, e):
                         low = ratio * w[m + j]  # Courant numbers into the cells
                         high = -ratio * w[h + j]
-                        more = below.inner * max(-ratio * w[o + j], 0.0) * given[i + j]
-                        more += above.inner * max(ratio * w[p + j], 0.0) * given[k + j]
-                        less = (max(low, 0.0) - flux * low) * given[x + j]
-                        less += (max(high, 0.0) - flux * high) * given[y + j]
+                        more = below.inner * max(-ratio * w[o + j], 0.0) * cotangents[i + j]
+                        more += above.inner * max(ratio * w[p + j], 0.0) * cotangents[k + j]
+                        less = (max(low, 0.0) - flux * low) * cotangents[x + j]
+                        less += (max(high, 0.0) - flux * high) * cotangents[y + j]
                         field[j] += more - less
                 for upper in range(2):
                     if upper:
@@ -573,14 +573,14 @@ def vjp(
                         at = wall
                     if gu.size and not inner:
                         for j in range(b, e):
-                            target[at + j] += max(into * w[m + j], 0.0) * given[x + j]
+                            target[at + j] += max(into * w[m + j], 0.0) * cotangents[x + j]
                     if partials.size:
                         for j in range(b, e):
-                            more = inner * max(-into * w[o + j], 0.0) * given[i + j]
-                            of_slopes[upper, j] = sign * (max(-into * w[m + j], 0.0) * given[x + j] - more)
+                            more = inner * max(-into * w[o + j], 0.0) * cotangents[i + j]
+                            of_slopes[upper, j] = sign * (max(-into * w[m + j], 0.0) * cotangents[x + j] - more)
                 if gw.size:
                     bad += to_velocity(
-                        w, gw, fresh, u, inflow, slopes, given, ratio, flux, a, on_sides, c, sides, places
+                        w, gw, fresh, u, inflow, slopes, cotangents, ratio, flux, a, on_sides, c, sides, places
                     )
             if partials.size:  # cotangents of a and b from those of `behind` and `ahead`
                 for difference in range(2):
@@ -673,7 +673,7 @@ def _slopes(u, inflow, free, table, axes, slopes, partials, start, stop):
 def slope_loop(name: str, function: Callable[..., tuple[Any, ...]], **options: Any) -> Kernel:
     """Return the loop `_slopes` for a limiter as a `Kernel`, to which `options` are passed."""
     words = "read1 read1 mask2 read2 index2 write3 write4"
-    return Kernel(_slopes, words, given={"limiter": function}, name=f"slopes_{name}", **{**OPTIONS, **options})
+    return Kernel(_slopes, words, functions={"limiter": function}, name=f"slopes_{name}", **{**OPTIONS, **options})
 
 
 slope_loops = {name: slope_loop(name, scheme.limiter) for name, scheme in SCHEMES.items() if scheme.limiter is not None}

@@ -161,10 +161,10 @@ def interpolate(
         if slopes:
             for axis in range(dim):
                 result = out[axis, left:right]
-                given = g[left:right]
+                cotangents = g[left:right]
                 factor = -scale[axis]
                 for j in range(result.size):
-                    result[j] *= factor * given[j]
+                    result[j] *= factor * cotangents[j]
 
 
 @kernel("read2 read1 index2 read3 read1 write1")
@@ -180,16 +180,16 @@ def scatter(
     for left in range(start * TILE, min(stop * TILE, w.shape[1]), TILE):
         right = min(left + TILE, w.shape[1])
         _stencils(w, scale, axes, tables, left, right, first, begin, weights, rows)
-        given = g[left:right]
+        cotangents = g[left:right]
         share = rows[0]
         for i in range(begin[0], axes[0, 4]):
             for k in range(begin[1], axes[1, 4]):
                 a = weights[0, 0, i]
                 b = weights[0, 1, k]
-                for j in range(given.size):
-                    share[j] = a[j] * b[j] * given[j]
+                for j in range(cotangents.size):
+                    share[j] = a[j] * b[j] * cotangents[j]
                 for m in range(begin[2], axes[2, 4]):
                     line = samples[i * axes[0, 1] + k * axes[1, 1] + m :]
                     weight = weights[0, 2, m]
-                    for j in range(given.size):
+                    for j in range(cotangents.size):
                         line[np.uint64(first[j])] += weight[j] * share[j]

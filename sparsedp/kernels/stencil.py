@@ -170,9 +170,9 @@ def along_rows(
                 if a < b:
                     result = out[row, a:b]
                     weights = values[d, a:b]
-                    given = u[row, a + offsets[d] : b + offsets[d]]
+                    values_in_row = u[row, a + offsets[d] : b + offsets[d]]
                     for j in range(result.size):
-                        result[j] += scale * weights[j] * given[j]
+                        result[j] += scale * weights[j] * values_in_row[j]
 
 
 @kernel("read3 read3 read3 read3 read2 read2 read2 write3 flag")

@@ -146,11 +146,11 @@ class Kernel:
     uses : tuple of functions
         The functions that the loop calls, including those that they call. They are compiled once for all loops that
         use them, and must be in the same file as the loop: numba invalidates its cache by the time stamp of that file.
-    given : dict, optional
+    functions : dict, optional
         {name: function}. The loop calls these functions by these names; other loops may use the names for other
         functions.
     name : str, optional
-        Name of the loop, to distinguish loops with the same code but different `given` functions.
+        Name of the loop, to distinguish loops with the same code but different `functions`.
     **options
         Passed to numba's ``njit``.
 
@@ -170,14 +170,14 @@ class Kernel:
         loop: Callable,
         words: str,
         uses: tuple[Callable, ...] = (),
-        given: dict[str, Callable] | None = None,
+        functions: dict[str, Callable] | None = None,
         name: str | None = None,
         **options: Any,
     ) -> None:
         self.loop = loop
         self.words = words
         self.uses = uses
-        self.given = given or {}
+        self.functions = functions or {}
         self.options = options
         self.name = name or loop.__name__
         self.__doc__ = loop.__doc__
@@ -186,9 +186,9 @@ class Kernel:
         self.single = self
         self.complex = self
         if "~" in words:
-            self.single = Kernel(loop, words.replace("~", "^"), uses, given, name, **options)
+            self.single = Kernel(loop, words.replace("~", "^"), uses, functions, name, **options)
         if "+" in words:
-            self.complex = Kernel(loop, words.replace("+", "*"), uses, given, name, **options)
+            self.complex = Kernel(loop, words.replace("+", "*"), uses, functions, name, **options)
         loops.append(self)
 
     @property
@@ -218,7 +218,7 @@ class Kernel:
         use_cache = options.pop("cache", True)
         signature = tuple(_types(self.words + " int int"))
         names = dict(_with_compiled(self.uses) if self.uses else self.loop.__globals__)
-        for name, function in self.given.items():
+        for name, function in self.functions.items():
             names[name] = njit(forceinline=True, **options)(function)
         loop = FunctionType(self.loop.__code__, names, self.name)
         loop.__qualname__ = self.name  # numba uses it as the key of its cache

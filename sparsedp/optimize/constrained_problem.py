@@ -282,8 +282,8 @@ class ConstrainedProblem:
             matrix = np.concatenate([jacobian[:, free].T, np.diag(slack)])
             target = np.concatenate([-point.gradient[free], np.zeros(near.size)])
             orthogonal, triangular = np.linalg.qr(matrix)
-            found = lsq_linear(triangular, orthogonal.T @ target, (least, np.inf), method="bvls", tol=1e-15)
-            multipliers[near] = found.x
+            solution = lsq_linear(triangular, orthogonal.T @ target, (least, np.inf), method="bvls", tol=1e-15)
+            multipliers[near] = solution.x
             lagrangian_gradient = point.gradient + multipliers[near] @ jacobian
             held = self.projected_step(point, lagrangian_gradient) != lagrangian_gradient
             wrong = ~free & ~held

@@ -372,16 +372,16 @@ class Constraints:
     root mean square of the norms of their gradients in the units of x.
     """
 
-    def __init__(self, given: Any, packing: Packing):
+    def __init__(self, constraints: Any, packing: Packing):
         self._packing = packing
-        self._tree = given
+        self._tree = constraints
         entries: list[Any] = []
         names: list[str] = []
         self._build = None
-        if given is not None:
-            _check_no_dict_of_scipy(given)
-            entries, self._build = flatten(given)
-            names = labels(given, "constraints")
+        if constraints is not None:
+            _check_no_dict_of_scipy(constraints)
+            entries, self._build = flatten(constraints)
+            names = labels(constraints, "constraints")
         self.functions = [_constraint_function(entry, packing, name) for entry, name in zip(entries, names)]
         self.count = 0
         self.equality = np.zeros(0, dtype=bool)
@@ -489,9 +489,9 @@ class ConstraintValues:
         return np.concatenate(blocks)
 
 
-def _check_no_dict_of_scipy(given):
+def _check_no_dict_of_scipy(constraints):
     """Raise TypeError for the dicts that scipy.optimize.minimize takes, whose inequalities have the other sign."""
-    candidates = given if isinstance(given, (list, tuple)) else [given]
+    candidates = constraints if isinstance(constraints, (list, tuple)) else [constraints]
     for one in candidates:
         if isinstance(one, dict) and SCIPY_DICT <= set(one):
             raise TypeError(

@@ -183,14 +183,14 @@ def eigenpairs_of_products(
     least = min(FIRST_BLOCKS * count, prior.size)
     while True:
         threshold = space.threshold
-        known = space.count_above(threshold)
+        previous_count = space.count_above(threshold)
         outside = space.start(_random_rows(prior, rng, count), prior.has_root)
         if outside <= space.threshold:
             return space.result(is_verified=True, outside=outside)
         if not space.grow_until_converged(least):
             outside = space.start(_random_rows(prior, rng, count), are_samples=True)
             return space.result(is_verified=False, outside=outside)
-        if space.count_above(threshold) == known:  # new random samples did not show another eigenpair
+        if space.count_above(threshold) == previous_count:  # new random samples did not show another eigenpair
             return space.result(is_verified=True)
 
 
@@ -284,11 +284,11 @@ class KrylovSpace:
     @property
     def has_converged(self) -> bool:
         """Whether all eigenpairs above the threshold have converged."""
-        wanted = np.abs(self.values) > CLEARLY_ABOVE * self.threshold
+        clearly_above = np.abs(self.values) > CLEARLY_ABOVE * self.threshold
         # Each start leaves the components outside of the last space as they are, so the next one has a looser goal.
-        count = max(1, int(np.count_nonzero(wanted)))
+        count = max(1, int(np.count_nonzero(clearly_above)))
         goal = self._starts * SHARE_OF_RESIDUALS * self._tolerance / np.sqrt(count)
-        return bool(np.all(2 * self.residuals[wanted] <= max(goal, self._rounding)))
+        return bool(np.all(2 * self.residuals[clearly_above] <= max(goal, self._rounding)))
 
     def start(self, rows: NDArray, are_samples: bool) -> float:
         """Begin a new sequence of blocks with H times random rows; return an estimate of the norm of H C outside.
@@ -378,7 +378,7 @@ class KrylovSpace:
         shorter than the longest one by up to six digits. If there are others, they are found in the remainder.
         """
         dropped = max(0.01 * SHARE_OF_RESIDUALS * self._tolerance, self._rounding)
-        found: list[Block] = []
+        blocks: list[Block] = []
         components = np.zeros((len(rows), 0))
         has_more = True
         while has_more:
@@ -387,12 +387,12 @@ class KrylovSpace:
                 break
             rows = rows - coefficients @ basis.rows
             # Small directions have components in the space because of rounding: remove them and normalize again.
-            basis, change, _ = self._by_gram_matrix(self._projected(self._projected(basis.rows), found), 0.5)
-            found.append(basis)
+            basis, change, _ = self._by_gram_matrix(self._projected(self._projected(basis.rows), blocks), 0.5)
+            blocks.append(basis)
             components = np.concatenate([components, coefficients @ change], axis=1)
-        if not found:
+        if not blocks:
             return Block(rows[:0], rows[:0]), components
-        return Block(*map(np.concatenate, zip(*found, strict=True))), components
+        return Block(*map(np.concatenate, zip(*blocks, strict=True))), components
 
     def _by_gram_matrix(self, rows, dropped):
         """Return a Block for the longest directions, the components, and whether there are shorter directions."""
@@ -419,10 +419,10 @@ class KrylovSpace:
         """
         magnitudes = np.abs(self.values)
         is_whole = self.dimension == self._prior.size
-        wanted = 2 * self.residuals <= max(self._tolerance, self._rounding)
+        accurate = 2 * self.residuals <= max(self._tolerance, self._rounding)
         if not is_whole:
-            wanted &= magnitudes > self._least_threshold
-        kept = np.flatnonzero(wanted)
+            accurate &= magnitudes > self._least_threshold
+        kept = np.flatnonzero(accurate)
         kept = kept[np.argsort(-magnitudes[kept], kind="stable")][: self._rank]
         others = np.ones(len(self.values), bool)
         others[kept] = False

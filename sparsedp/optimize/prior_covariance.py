@@ -270,9 +270,9 @@ def lanczos(apply: Any, start: NDArray, most: int) -> Iterator[tuple[list, list,
         image = apply(basis[-1][None])[0]
         diagonal.append(float(basis[-1] @ image))
         scale = np.linalg.norm(image)
-        known = np.array(basis)
+        vectors = np.array(basis)
         for _ in range(2):
-            image = image - (known @ image) @ known
+            image = image - (vectors @ image) @ vectors
         length = float(np.linalg.norm(image))
         if length <= 100 * EPS * scale or len(basis) == start.size:
             length = 0.0

@@ -343,11 +343,11 @@ def _advice(error: float, causes: dict[str, float], rows: list[dict[str, Any]], 
     name = worst["solver"]
     rtol = worst["rtol"]
     goal = f"for {100 * target:g} %"
-    wanted = min(rtol * target / error, LOOSEST_ADVICE) / 2
+    advised = min(rtol * target / error, LOOSEST_ADVICE) / 2
     if error > target:
-        return f"tighten the {side} of {name} from {rtol:.0e} to {wanted:.0e} {goal}"
-    if wanted > rtol:
-        return f"{name} may stop at {wanted:.0e} in place of {rtol:.0e} {goal}"
+        return f"tighten the {side} of {name} from {rtol:.0e} to {advised:.0e} {goal}"
+    if advised > rtol:
+        return f"{name} may stop at {advised:.0e} in place of {rtol:.0e} {goal}"
     return f"the tolerances are as they should be {goal}"
 
 

@@ -72,8 +72,8 @@ FIRST_STEP = 0.05  # of the range of the parameter, if none is given
 LARGEST_STEP = 0.1  # the same of the largest step
 SMALLEST_STEP = 1e-7  # share of the largest step; a shorter one has failed
 CORRECTOR_STEPS = 15  # largest number of Newton steps of a corrector
-WANTED_STEPS = 7.0  # Newton steps of a corrector for which the step keeps its length
-WANTED_ANGLE = 0.15  # angle between successive tangents for which the step keeps its length
+NEWTON_STEPS_AT_EQUAL_LENGTH = 7.0  # Newton steps of a corrector after which the next step has the same length
+ANGLE_AT_EQUAL_LENGTH = 0.15  # angle between successive tangents after which the next step has the same length
 LARGEST_ANGLE = 0.5  # a step that turns the tangent by more is repeated with half its length
 GROWTH = 2.0  # largest factor from one step to the next
 NUDGE = 1e-7  # arc length by which the point of a singular Jacobian is moved
@@ -83,7 +83,7 @@ SLOPE_NOISE = 1e-13  # component along p of a unit tangent below which its sign 
 RECHECKS = 3  # solves of a corrector, each of which starts with the Jacobian at the end of the one before
 FOLD_ACCURACY = 1e-6  # factor on the tolerance for points near a fold, whose parameter becomes the one of the fold
 SMALL_SLOPE = 0.25  # share of the larger slope at the ends of a step: a smaller slope between them is computed
-KNOWN_SLOPE = 0.5  # largest relative difference of a computed slope and its prediction if no further one is needed
+SLOPE_TOLERANCE = 0.5  # largest relative error of a predicted slope for which the search for folds ends
 SLOPE_STEPS = 10  # largest depth of the search for two folds within a step
 SHORTEST_RANGE = 1e4 * EPS  # of the parameter, as a share of its values
 FOLD_MARGIN = 10.0  # in units of the square root of rtol: component along p below which a state has no derivative
@@ -919,7 +919,7 @@ class Follower:
         slope = middle.tangent[-1] / (row @ middle.tangent) * np.sign(slopes[1])
         if slope <= 0:
             return [middle, following]
-        if abs(slope - least) <= KNOWN_SLOPE * slope or slope * self.curve.units[-1] <= FOLD_TOLERANCE:
+        if abs(slope - least) <= SLOPE_TOLERANCE * slope or slope * self.curve.units[-1] <= FOLD_TOLERANCE:
             return [following]
         before = self._path(point, middle, depth + 1)
         after = self._path(middle, following, depth + 1)
@@ -1015,6 +1015,6 @@ def _smallest_slope(mean, first, last):
 
 def _growth(iterations, angle):
     """Return the factor from the length of a step to that of the next one."""
-    by_iterations = WANTED_STEPS / max(iterations, 1)
-    by_angle = WANTED_ANGLE / max(angle, 1e-12)
+    by_iterations = NEWTON_STEPS_AT_EQUAL_LENGTH / max(iterations, 1)
+    by_angle = ANGLE_AT_EQUAL_LENGTH / max(angle, 1e-12)
     return float(np.clip(min(by_iterations, by_angle), 1 / GROWTH, GROWTH))

@@ -306,13 +306,13 @@ class Pencil:
         """The vector with which iterations start: random numbers from a fixed seed."""
         return self.start_of_search(0)
 
-    def start_of_search(self, known: int) -> NDArray[Any]:
+    def start_of_search(self, count: int) -> NDArray[Any]:
         """Return the vector with which a search in the complement of a number of known vectors starts.
 
         The component of one start in an eigenspace is the copy that its Krylov space contains. In the complement of
         this copy the same start has nothing of the eigenspace but rounding errors, so each search needs another one.
         """
-        seed = 1 + known
+        seed = 1 + count
         return self.masked(np.random.default_rng(seed).standard_normal(self.size)).astype(self.dtype)
 
     @property
@@ -610,9 +610,9 @@ def _by_arpack(pencil, k, which, maxiter):
         sigma = which - OFFSET_OF_SHIFT * pencil.scale
     solve = pencil.shifted_inverse(sigma, INNER_RTOL, isinstance(which, str) and pencil.is_positive)
 
-    def search(known, count):
-        tolerance = SEARCH_TOLERANCE if len(known) else ARPACK_TOLERANCE
-        return _shift_invert(pencil, sigma, solve, known, count, maxiter, tolerance)
+    def search(basis, count):
+        tolerance = SEARCH_TOLERANCE if len(basis) else ARPACK_TOLERANCE
+        return _shift_invert(pencil, sigma, solve, basis, count, maxiter, tolerance)
 
     def is_nearer(value, last):
         return abs(value - sigma) < abs(last - sigma) * (1.0 - TIE)
@@ -630,7 +630,7 @@ def _with_missing_copies(search, is_nearer, distances, pencil, k, most):
     Parameters
     ----------
     search : callable
-        ``search(known, count)`` returns the values and vectors of `count` pairs in the complement of the known vectors.
+        ``search(basis, count)`` returns the values and vectors of `count` pairs in the complement of the basis.
     is_nearer : callable
         ``is_nearer(value, last)`` returns whether a new eigenvalue belongs before the last one of the k + 1 pairs.
     distances : callable
@@ -673,19 +673,19 @@ def _arpack_errors(count: int) -> Iterator[None]:
         ) from None
 
 
-def _shift_invert(pencil, sigma, solve, known, count, maxiter, tolerance):
+def _shift_invert(pencil, sigma, solve, basis, count, maxiter, tolerance):
     """Return pairs near a shift, in the complement of the known vectors."""
     from scipy.sparse.linalg import LinearOperator, eigsh
 
     shape = pencil.size, pencil.size
-    images = np.array([pencil.apply_mass(vector) for vector in known]).reshape(known.shape)
+    images = np.array([pencil.apply_mass(vector) for vector in basis]).reshape(basis.shape)
 
     def complement(x):
-        return x - known.T @ (images.conj() @ x)
+        return x - basis.T @ (images.conj() @ x)
 
     def solved(b):
         b = np.asarray(b).reshape(-1)
-        return complement(solve(b - images.T @ (known.conj() @ b)))
+        return complement(solve(b - images.T @ (basis.conj() @ b)))
 
     dtype = pencil.dtype
     with _arpack_errors(count):
@@ -694,7 +694,7 @@ def _shift_invert(pencil, sigma, solve, known, count, maxiter, tolerance):
             count,
             LinearOperator(shape, pencil.apply_mass, dtype=dtype),
             sigma,
-            v0=complement(pencil.start_of_search(len(known))),
+            v0=complement(pencil.start_of_search(len(basis))),
             ncv=min(pencil.unknowns, max(2 * count + 1, 20)),
             maxiter=maxiter,
             tol=tolerance,
@@ -719,16 +719,16 @@ def _by_products(pencil, k, which, maxiter):
     # A bound of the width of the spectrum: known vectors are moved by it to the other end.
     width = direction * 4.0 * pencil.scale * max(1.0, float(np.max(masses) / np.min(masses))) * pencil.size
 
-    def search(known, count):
+    def search(basis, count):
         def product(x):
             x = np.asarray(x).reshape(-1)
             y = pencil.apply_stiffness(x / roots) / roots
-            return y + width * (known.T @ (known.conj() @ x))
+            return y + width * (basis.T @ (basis.conj() @ x))
 
         op = LinearOperator((pencil.size, pencil.size), product, dtype=pencil.dtype)
         ncv = min(pencil.size, max(2 * count + 1, 20))
         limit = maxiter or 100 * pencil.size
-        start = pencil.start_of_search(len(known))
+        start = pencil.start_of_search(len(basis))
         with _arpack_errors(count):
             values, vectors = eigsh(op, count, which=ends[which], v0=start, ncv=ncv, maxiter=limit)
         return values.real, vectors.T
@@ -1069,19 +1069,19 @@ def _with_missing_values(pencil, k, which, maxiter, values, vectors, act, value_
         return x - basis @ (basis.conj().T @ x)  # of all vectors that are known at this time
 
     for _ in range(MOST_RESTARTS):
-        known = basis.shape[1]
-        if known + 3 > pencil.unknowns:
+        dimension = basis.shape[1]
+        if dimension + 3 > pencil.unknowns:
             break
         last = np.sort(distances(values))[k - 1]
 
         def compressed(x):
             return complement(act(complement(x)))
 
-        start = complement(pencil.start_of_search(known)).astype(basis.dtype)
+        start = complement(pencil.start_of_search(dimension)).astype(basis.dtype)
         with _arpack_errors(1):
             operator = LinearOperator((pencil.size, pencil.size), compressed, dtype=basis.dtype)
-            found, vector = eigs(operator, 1, which=end, v0=start, maxiter=maxiter, tol=ARPACK_TOLERANCE)
-        new = value_of(found)
+            nearest, vector = eigs(operator, 1, which=end, v0=start, maxiter=maxiter, tol=ARPACK_TOLERANCE)
+        new = value_of(nearest)
         if not distances(new)[0] < last - TIE * max(abs(last), pencil.scale * TIE):
             break
         values = np.concatenate([values, new])

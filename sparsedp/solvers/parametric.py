@@ -636,8 +636,10 @@ def _common_size(sizes):
     """Return the size of a batch, given that of each argument or None; raise ShapeError if the sizes differ."""
     sizes = {name: size for name, size in sizes.items() if size is not None}
     if len({*sizes.values()}) > 1:
-        given = ", ".join(f"{size} of {name}" for name, size in sizes.items())
-        raise ShapeError(f"elliptic_solver needs one batch size, got {given}; give each the same leading axis, or none")
+        sizes_by_name = ", ".join(f"{size} of {name}" for name, size in sizes.items())
+        raise ShapeError(
+            f"elliptic_solver needs one batch size, got {sizes_by_name}; give each the same leading axis, or none"
+        )
     return next(iter(sizes.values()))
 
 

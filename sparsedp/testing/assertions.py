@@ -185,11 +185,11 @@ def _difference_of_shapes(operator: Operator, transpose: Callable[[Any], Any] | 
     """Return a result that disagrees if a function returns another shape than that of u; None if not."""
     if transpose is None:
         return None
-    found = np.shape(transpose(np.zeros(operator.codomain.shape)))
+    shape = np.shape(transpose(np.zeros(operator.codomain.shape)))
     expected = operator.domain.shape
-    if found == expected:
+    if shape == expected:
         return None
-    note = f"transpose(g) has shape {found}, expected {expected}, the shape of u"
+    note = f"transpose(g) has shape {shape}, expected {expected}, the shape of u"
     return Summary(f"transpose of {operator.name}", [Row("shape", inf, None, False, note)])
 
 
@@ -218,10 +218,10 @@ def _with_entries(result: Summary, operator: Operator) -> Summary:
     try:
         if np.any(operator.apply(np.zeros(operator.domain.shape))):
             return Summary(result.title, result.rows, culprit="A is not linear: it does not map zeros to zeros")
-        found = transposed_products(operator)
+        summary = transposed_products(operator)
     except Exception:  # a wrong function may raise any exception; its transpose is wrong anyway
         return result
-    return Summary(result.title, result.rows, culprit=found.culprit, gaps=found.gaps)
+    return Summary(result.title, result.rows, culprit=summary.culprit, gaps=summary.gaps)
 
 
 def _conclude(result: Result, seconds: float, allow_inconclusive: bool = False, complete: bool = False) -> None:
@@ -262,9 +262,9 @@ def kind_of(result: Result) -> str:
 def reason_of(result: Result) -> str:
     """Return why a check failed, and on further lines the culprit and the entries with the largest gaps."""
     reason = _reason_of_transpose(result) if isinstance(result, Summary) else result.reason
-    given = vars(result)
-    culprit = [f"culprit: {given['culprit']}"] if given.get("culprit") else []
-    gaps = [f"largest gap: {gap}" for gap in given.get("gaps", ())]
+    attributes = vars(result)
+    culprit = [f"culprit: {attributes['culprit']}"] if attributes.get("culprit") else []
+    gaps = [f"largest gap: {gap}" for gap in attributes.get("gaps", ())]
     return "\n  ".join([reason, *culprit, *gaps])
 
 

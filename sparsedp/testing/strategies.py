@@ -64,8 +64,8 @@ def grids(
     check_choice("max_dimensions of testing.grids", max_dimensions, (1, 2, 3))
     check_whole("max_cells of testing.grids", max_cells, 1, "; the default is 6")
 
-    def choice(given: bool | None) -> SearchStrategy[bool]:
-        return st.booleans() if given is None else st.just(given)
+    def choice(value: bool | None) -> SearchStrategy[bool]:
+        return st.booleans() if value is None else st.just(value)
 
     @st.composite
     def drawn(draw: Any) -> Grid:

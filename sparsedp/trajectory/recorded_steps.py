@@ -184,10 +184,10 @@ class RecordedStepRunner(StepRunner):
             return True
         g = [random_like(value) for value in state.values]
         inputs = [block[:n] for block in self.inputs]
-        found = loop.backward(trajectories, params, inputs, saved_blocks, g, None, n, 0, 0, 0, n)
-        if found is None:
+        result = loop.backward(trajectories, params, inputs, saved_blocks, g, None, n, 0, 0, 0, n)
+        if result is None:
             return True
-        backs, input_cotangents, _ = found
+        backs, input_cotangents, _ = result
         sums: dict[int, Any] = {}
         rows: dict[int, list] = {}
         for saved in reversed(tapes):
@@ -346,7 +346,7 @@ class CompiledRun:
         total = [
             zero_like(value) if back is None else back for back, value in zip(total, self.last.values, strict=True)
         ]
-        found = self._loop.backward(
+        result = self._loop.backward(
             self.trajectories,
             self._params,
             runner.inputs,
@@ -359,9 +359,9 @@ class CompiledRun:
             specification.truncate or 0,
             interval,
         )
-        if found is None:
+        if result is None:
             return None
-        backs, input_cotangents, sizes = found
+        backs, input_cotangents, sizes = result
         norms = [(n, largest(total))]
         for i in range((n - 1) // interval * interval, low - 1, -interval):
             if i not in cuts and i >= specification.first_traced:
