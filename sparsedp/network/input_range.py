@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.calls import frames_inside
-from sparsedp._utils.validation import check_finite, check_number
+from sparsedp._utils.validation import check_finite, check_kind, check_number, check_plain
 from sparsedp.autodiff.program_trace import check_values
+from sparsedp.autodiff.tape import plain
 from sparsedp.errors import RangeWarning, ShapeError
 
 __all__ = ["TrainingRange", "training_range"]
@@ -22,7 +23,7 @@ def training_range(inputs: ArrayLike, axis: int | None = None, margin: float = 0
 
     Parameters
     ----------
-    inputs : array
+    inputs : real array
         The inputs of a network in training, with any leading axes, such as samples and times.
     axis : int < 0, optional
         The axis of features or channels, counted from the end: -1 for `dense`, -2 or -3 for `convolution` in one or two
@@ -38,6 +39,8 @@ def training_range(inputs: ArrayLike, axis: int | None = None, margin: float = 0
 
     Raises
     ------
+    TypeError
+        If `inputs` does not hold real numbers; on use, if x does not.
     NonFiniteError
         If `inputs` contains NaN or infinity.
     ShapeError
@@ -66,20 +69,32 @@ def training_range(inputs: ArrayLike, axis: int | None = None, margin: float = 0
     array([[ True, False],
            [False,  True]])
     """
-    inputs = np.asarray(inputs)
+    inputs = _real_array("inputs of training_range", inputs)
     check_finite("inputs of training_range", inputs)
     check_number("margin of training_range", margin, ">= 0", "; the default is 0.1")
     if axis is not None and not (isinstance(axis, (int, np.integer)) and axis < 0):
         raise ValueError(f"axis of training_range must be a negative integer, got {axis!r}; write -1 for the last axis")
-    if inputs.size == 0 or (axis is not None and inputs.ndim < -axis):
-        raise ShapeError(f"training_range needs inputs with values and with axis {axis}, got shape {inputs.shape}")
+    if inputs.size == 0:
+        raise ShapeError(f"training_range needs inputs with values, got shape {inputs.shape}")
+    if axis is not None and inputs.ndim < -axis:
+        raise ShapeError(f"training_range needs inputs with axis {axis}, got shape {inputs.shape}")
     others = None
     if axis is not None:
         others = tuple(number for number in range(inputs.ndim) if number != inputs.ndim + axis)
     least = np.min(inputs, axis=others)
     largest = np.max(inputs, axis=others)
-    slack = margin * (largest - least)
-    return TrainingRange(least - slack, largest + slack, axis)
+    with np.errstate(over="ignore"):  # a range that overflows is unbounded
+        slack = np.multiply(margin, 0.5 * largest - 0.5 * least) * 2.0
+        return TrainingRange(least - slack, largest + slack, axis)
+
+
+def _real_array(name: str, values: Any) -> NDArray:
+    """Return values as a float64 array; raise TypeError if they are not real numbers."""
+    check_plain("training_range", values)
+    array = np.asarray(plain(values))
+    check_kind(name, array.dtype, "real numbers")
+    with np.errstate(over="ignore"):  # a longdouble beyond the range of float64 is outside
+        return array.astype(float)
 
 
 class TrainingRange(Reconstructible):
@@ -120,6 +135,13 @@ class TrainingRange(Reconstructible):
         Returns
         -------
         array
+
+        Raises
+        ------
+        ShapeError
+            If x does not have the features of training.
+        TypeError
+            If x does not hold real numbers.
         """
         check_values(self._warn, x)
         return x
@@ -134,19 +156,32 @@ class TrainingRange(Reconstructible):
         Returns
         -------
         bool array like x
+
+        Raises
+        ------
+        ShapeError
+            If x does not have the features of training.
+        TypeError
+            If x does not hold real numbers.
         """
-        x = np.asarray(x)
+        x = self._checked(x)
         lower, upper = self.lower, self.upper
         if self.axis is not None:
-            if x.ndim < -self.axis or x.shape[self.axis] != lower.size:
-                raise ShapeError(
-                    f"training_range needs {lower.size} features along axis {self.axis}, got shape {x.shape}"
-                )
             shape = (-1, *[1] * (-1 - self.axis))
             lower, upper = lower.reshape(shape), upper.reshape(shape)
         return ~((x >= lower) & (x <= upper))
 
+    def _checked(self, x: Any) -> NDArray:
+        """Return an array as float64; raise an error if it does not have the features of training."""
+        x = _real_array("x of training_range", x)
+        if self.axis is not None:
+            count = self.lower.size
+            if x.ndim < -self.axis or x.shape[self.axis] != count:
+                raise ShapeError(f"training_range needs {count} features along axis {self.axis}, got shape {x.shape}")
+        return x
+
     def _warn(self, x: Any) -> None:
+        x = self._checked(x)
         if self.has_warned:
             return
         outside = self.outside(x)
@@ -163,7 +198,7 @@ class TrainingRange(Reconstructible):
         warnings.warn(
             RangeWarning(
                 f"{np.count_nonzero(outside)} of {outside.size} inputs of a network are outside the range of training, "
-                f"the first is {np.asarray(x)[first]:.6g}{of_feature}, outside {lower:.6g} to {upper:.6g}; its results "
+                f"the first is {x[first]:.6g}{of_feature}, outside {lower:.6g} to {upper:.6g}; its results "
                 "there are not supported by data: train on longer rollouts or on more states"
             ),
             stacklevel=frames_inside() + 1,

@@ -26,7 +26,32 @@ TABLE = [
     (
         lambda: training_range(np.ones(3), axis=-2),
         dp.errors.ShapeError,
-        "training_range needs inputs with values and with axis -2, got shape (3,)",
+        "training_range needs inputs with axis -2, got shape (3,)",
+    ),
+    (
+        lambda: training_range(np.ones((3, 0)), axis=-1),
+        dp.errors.ShapeError,
+        "training_range needs inputs with values, got shape (3, 0)",
+    ),
+    (
+        lambda: training_range(np.array([1.0 + 2.0j])),
+        TypeError,
+        "inputs of training_range must hold real numbers, got dtype complex128",
+    ),
+    (
+        lambda: training_range(["a", "b"]),
+        TypeError,
+        "inputs of training_range must hold real numbers, got dtype <U1",
+    ),
+    (
+        lambda: training_range(np.ma.array([1.0, 2.0], mask=[False, True])),
+        TypeError,
+        "training_range takes plain arrays, got a masked array; fill it first",
+    ),
+    (
+        lambda: training_range(SEEN).outside(np.array([1.0 + 2.0j])),
+        TypeError,
+        "x of training_range must hold real numbers, got dtype complex128",
     ),
     (
         lambda: training_range(np.array([1.0, np.nan])),
@@ -78,6 +103,37 @@ def test_ranges_of_channels_of_all_values_and_of_nan():
     assert not np.any(of_all.outside(fields[:, ::-1]))
     with pytest.warns(dp.errors.RangeWarning, match="the first is nan, outside 0 to 7"):
         of_all(np.array([1.0, np.nan]))
+
+
+@pytest.mark.parametrize(
+    ("inputs", "lower", "upper"),
+    [
+        (np.float16([-60000, 60000]), -72000, 72000),
+        (np.int8([-128, 127]), -153.5, 152.5),
+        (np.uint8([0, 250]), -25, 275),
+        (np.array([False, True]), -0.1, 1.1),
+        (np.array([-1e308, 1e308]), -1.2e308, 1.2e308),
+        (np.array([-1.7e308, 1.7e308]), -np.inf, np.inf),
+    ],
+)
+def test_the_range_does_not_overflow_in_the_dtype_of_the_data(inputs, lower, upper):
+    guarded = training_range(inputs)
+    assert (guarded.lower, guarded.upper) == pytest.approx((lower, upper), rel=1e-15)
+    assert not np.any(guarded.outside(inputs))
+
+
+def test_values_are_compared_in_double_precision():
+    guarded = training_range(SEEN * 1e4, margin=0.0)
+    assert np.array_equal(guarded.outside(np.float16([0.0, 6e4, np.inf, -1.0])), [False, False, True, True])
+    assert np.array_equal(training_range([0, 300], margin=0.0).outside(np.int8([-1, 100])), [True, False])
+
+
+def test_features_are_checked_after_the_warning():
+    guarded = training_range(SEEN, axis=-1)
+    with pytest.warns(dp.errors.RangeWarning):
+        guarded(SEEN + 100.0)
+    with pytest.raises(dp.errors.ShapeError, match="training_range needs 2 features along axis -1"):
+        guarded(np.ones((2, 3)))
 
 
 def drift(guarded):
