@@ -376,6 +376,24 @@ TABLE = [
         "sponge needs a number of cells or a pair for axes of ['x'], got {'y': (2, 2)}",
     ),
     (
+        lambda: dp.matched_layer(dp.Grid((8, 9), periodic=True), 6, 1.0),
+        ValueError,
+        "matched_layer needs an axis that is not periodic, got Grid(8 x 9 cells, size 8 x 9, periodic in x, y), which "
+        "is periodic along every axis; write Grid(..., periodic=False)",
+    ),
+    (
+        lambda: dp.sponge(dp.Grid((8, 9), periodic=(True, False)), {"x": 3, "y": 3}, 1.0),
+        ValueError,
+        "sponge got cells for x, which is periodic and has no ends; leave it out of cells, or write periodic=False for "
+        "this axis of the grid",
+    ),
+    (
+        lambda: dp.matched_layer(dp.Grid(20, size=1e-300), 6, 1e10),
+        ValueError,
+        "the rates of matched_layer overflow: they grow with the speed divided by the thickness of the layer; give "
+        "lengths and times in other units",
+    ),
+    (
         lambda: dp.matched_layer(LINE, {"y": (2, 2)}, 1.0),
         VALUE,
         "matched_layer needs a number of cells or a pair for axes of ['x'], got {'y': (2, 2)}",

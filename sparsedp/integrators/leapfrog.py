@@ -213,7 +213,8 @@ def sponge(
     Raises
     ------
     ValueError
-        If a sponge is thicker than its axis, if `cells` names a periodic axis, or if speed or echo is out of range.
+        If a sponge is thicker than its axis, if `cells` names a periodic axis or is a number and all axes are periodic,
+        or if speed or echo is out of range.
 
     See Also
     --------
@@ -244,7 +245,10 @@ def sponge(
         """Return the rates at places, given as a list with the coordinates along each axis."""
         return sum(rate(axis, places[axis]) for axis in range(grid.dim))
 
-    return rates(grid.centres()), grid.join(*(rates(grid.face_centres(axis)) for axis in range(grid.dim)))
+    in_cells = rates(grid.centres())
+    on_faces = grid.join(*(rates(grid.face_centres(axis)) for axis in range(grid.dim)))
+    _check_rates("sponge", in_cells, on_faces)
+    return in_cells, on_faces
 
 
 def matched_layer(grid: Grid, cells: int | Mapping[str, Any], speed: float, echo: float = 1e-8) -> MatchedLayer:
@@ -271,7 +275,7 @@ def matched_layer(grid: Grid, cells: int | Mapping[str, Any], speed: float, echo
     ------
     ValueError
         If a layer has 1 to 5 cells, if the layers of an axis leave no cell between them, if `cells` names a periodic
-        axis, or if speed or echo is out of range.
+        axis or is a number and all axes are periodic, or if speed or echo is out of range.
 
     See Also
     --------
@@ -313,6 +317,7 @@ def matched_layer(grid: Grid, cells: int | Mapping[str, Any], speed: float, echo
     rate = _rates("matched_layer", grid, counts, speed, echo, "1e-8", MATCHED_POWER)
     in_cells = tuple(rate(axis, grid.centres()[axis]) for axis in axes)
     on_faces = tuple(tuple(rate(axis, grid.face_centres(normal)[axis]) for axis in axes) for normal in axes)
+    _check_rates("matched_layer", *in_cells, *(rates for lines in on_faces for rates in lines))
     return MatchedLayer(grid, in_cells, on_faces)
 
 
@@ -371,6 +376,11 @@ class MatchedLayer(Value):
             The product of the stretches of all axes.
         on_faces : complex array of grid.faces.shape
             The same on faces, divided by the square of the stretch across the face.
+
+        Raises
+        ------
+        ValueError
+            If omega is not one finite number other than 0, or so small beside the rates that stretches overflow.
         """
         rates_along = zip(self.in_cells, *self.on_faces, strict=True)
         largest = np.array([max(np.max(rate, initial=0.0) for rate in rates) for rates in rates_along])
@@ -421,8 +431,19 @@ def _check_layers(grid: Grid, axis: int, counts: tuple[int, int]) -> None:
 
 def _counts(name: str, grid: Grid, cells: Any) -> list[tuple[int, int]]:
     """Return the cells of the layers at both ends of each axis; `name` is the caller."""
-    bounded = [axis for axis, periodic in zip(grid.axes, grid.periodic, strict=True) if not periodic]
+    bounded = [str(axis) for axis, periodic in zip(grid.axes, grid.periodic, strict=True) if not periodic]
     depths: dict[str, Any] = dict(cells) if isinstance(cells, Mapping) else dict.fromkeys(bounded, cells)
+    if not bounded and not (isinstance(cells, Mapping) or is_whole(cells, 0) and cells == 0):
+        raise ValueError(
+            f"{name} needs an axis that is not periodic, got {grid!r}, which is periodic along every axis; write "
+            "Grid(..., periodic=False)"
+        )
+    for word in grid.axes:
+        if word in depths and word not in bounded:
+            raise ValueError(
+                f"{name} got cells for {word}, which is periodic and has no ends; leave it out of cells, or write "
+                "periodic=False for this axis of the grid"
+            )
     if set(depths) - set(bounded) or any(np.shape(deep) not in ((), (2,)) for deep in depths.values()):
         raise ValueError(f"{name} needs a number of cells or a pair for axes of {bounded}, got {cells!r}")
     counts = []
@@ -452,11 +473,21 @@ def _rates(
         total: Any = 0.0 * x
         for is_upper, count in enumerate(counts[axis]):
             if count:
-                shape = _rate(grid, axis, is_upper, count, x, power)
-                total = total + shape * (power + 1) / 2 * speed * log(1 / echo)
+                with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # the caller checks
+                    shape = _rate(grid, axis, is_upper, count, x, power)
+                    total = total + shape * (power + 1) / 2 * speed * -log(echo)
         return total
 
     return rate
+
+
+def _check_rates(name: str, *rates: np.ndarray) -> None:
+    """Raise ValueError for rates that overflow."""
+    if not all(np.all(np.isfinite(array)) for array in rates):
+        raise ValueError(
+            f"the rates of {name} overflow: they grow with the speed divided by the thickness of the layer; give "
+            "lengths and times in other units"
+        )
 
 
 def _rate(grid: Grid, axis: int, is_upper: int, count: int, x: Any, power: int) -> np.ndarray:
