@@ -92,7 +92,7 @@ SAFE_COURANT = 0.5  # Courant number up to which steps are accepted; without vis
 
 def flow_step(
     grid: Grid,
-    dt: float,
+    dt: float | Callable[[Any], Any],
     viscosity: Any = 0.0,
     force: Callable | None = None,
     boundary: Any = no_slip,

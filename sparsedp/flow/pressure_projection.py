@@ -182,6 +182,21 @@ class Projection(Operator):
             Leading axes are a batch.
         density : number, array on cells or array on faces, optional
             > 0; see `projection`. One leading axis is a batch. Default: the same everywhere.
+
+        Returns
+        -------
+        array like v
+
+        Raises
+        ------
+        ShapeError
+            If v is not a field on faces, or the density has another shape than those of cells and faces.
+        ValueError
+            If the density is not > 0.
+        NonFiniteError
+            If v or the density holds NaN or infinity.
+        ConvergenceError
+            If the solve does not meet `rtol`.
         """
         if density is None:
             return super().__call__(v)

@@ -215,6 +215,21 @@ class SceneWithUnits(Reconstructible):
         value : Quantity
         gradient : tree of Quantities
             Like the argument, in the unit of the result divided by the unit declared for the argument.
+
+        Raises
+        ------
+        TypeError
+            If the number of arguments is another one, or an argument has no unit, or one that is not declared.
+        ValueError
+            If an argument has another dimension than declared, or there is no argument `argnum`.
+        DerivativeError
+            If the result declared is not one number with one unit.
+        ShapeError
+            If the result is an array and not a number.
+
+        See Also
+        --------
+        check
         """
         argnum = check_whole("argnum", argnum, 0, f"; write the number of an argument of {self.name}")
         if argnum >= len(self.arguments):
@@ -241,7 +256,18 @@ class SceneWithUnits(Reconstructible):
         Returns
         -------
         DimensionCheck
-            ``print(report)`` shows a row for each dimension; `report.passed` says whether all agree.
+            ``print(report)`` shows a row for each dimension; `report.passed` says whether all agree. An error of the
+            scene in another system of units is part of the report.
+
+        Raises
+        ------
+        TypeError
+            If the number of arguments is another one, an argument has no unit, or one that is not declared, or the
+            result is another tree than the units declared for it.
+        ValueError
+            If an argument has another dimension than declared, or rtol is out of range.
+        NonFiniteError
+            If the result holds NaN or infinity.
 
         Notes
         -----
