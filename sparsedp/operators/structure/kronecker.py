@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from sparsedp import kernels
 from sparsedp.grid.space import components
-from sparsedp.operators.structure.base import BoundProduct, Structure, compact, rows_of
+from sparsedp.operators.structure.base import INT32_LIMIT, BoundProduct, Structure, compact, rows_of
 from sparsedp.operators.structure.factor import Factor
 
 if TYPE_CHECKING:
@@ -194,7 +194,7 @@ class Kronecker(Structure):
             return compact(sp.csr_array(self.shape))
         columns = list(enumerate(self.in_parts))
         rows = [[_block(self.blocks.get((r, c), ()), m, n) for c, n in columns] for r, m in enumerate(self.out_parts)]
-        return compact(sp.block_array(rows))
+        return compact(rows[0][0] if len(rows) == len(columns) == 1 else sp.block_array(rows))
 
     def act(self, x: NDArray, out: NDArray) -> None:
         """Write A x into `out`: see `Structure.act`."""
@@ -336,7 +336,30 @@ def _product_matrix(term, in_part):
             sides.append(sp.eye_array(n, format="csr"))
         else:
             sides.append(factor.matrix)
-    return term.scale * reduce(partial(sp.kron, format="csr"), sides)
+    return term.scale * reduce(_kronecker_product, sides)
+
+
+def _kronecker_product(left, right):
+    """Return the Kronecker product of two canonical csr_arrays, with the entries of ``scipy.sparse.kron``.
+
+    Each entry is written to its place. SciPy sorts them, which takes three times as long for small factors.
+    """
+    shape = (left.shape[0] * right.shape[0], left.shape[1] * right.shape[1])
+    index_type = np.int32 if max(*shape, left.nnz * right.nnz) < INT32_LIMIT else np.int64
+    lengths = np.diff(right.indptr).astype(index_type)  # of the rows of the right factor
+    starts = np.zeros(shape[0] + 1, index_type)
+    np.cumsum(np.outer(np.diff(left.indptr), lengths), out=starts[1:])
+    left_rows = rows_of(left)
+    right_rows = rows_of(right)
+    rank_in_left_row = np.arange(left.nnz, dtype=index_type) - left.indptr[left_rows]
+    rank_in_right_row = np.arange(right.nnz, dtype=index_type) - right.indptr[right_rows]
+    places = starts[:-1].reshape(left.shape[0], right.shape[0])[left_rows[:, None], right_rows]
+    places += rank_in_left_row[:, None] * lengths[right_rows] + rank_in_right_row
+    columns = np.empty(places.size, index_type)
+    columns[places] = left.indices.astype(index_type)[:, None] * index_type(right.shape[1]) + right.indices
+    values = np.empty(places.size, np.result_type(left.data, right.data))
+    values[places] = left.data[:, None] * right.data
+    return sp.csr_array((values, columns, starts), shape)
 
 
 def _merge(terms):
