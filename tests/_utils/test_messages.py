@@ -9,7 +9,7 @@ import re
 from functools import cache
 
 import pytest
-from sources import FUNCTION, called, modules, trees_of_tests, walked
+from sources import FUNCTION, called, enclosing, modules, trees_of_tests, walked
 
 pytestmark = pytest.mark.xdist_group("sources")  # of the tests that parse all files
 
@@ -57,8 +57,10 @@ def assigned(tree):
         if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
             scope.setdefault(node.targets[0].id, []).append(node.value)
         elif isinstance(node, FUNCTION):
-            returned = [n.value for n in walked(node) if isinstance(n, ast.Return) and n.value is not None]
-            scope.setdefault(node.name, []).extend(returned)
+            scope.setdefault(node.name, [])
+        elif isinstance(node, ast.Return) and node.value is not None:
+            for function in enclosing(node, tree):
+                scope.setdefault(function.name, []).append(node.value)
     return scope
 
 
@@ -70,10 +72,10 @@ def makes_error(call):
 def errors_in(tree):
     """Pairs (line, text) of every error that is made, raised on the spot or not."""
     outer = assigned(tree)
-    owners = {id(n): f for f in walked(tree) if isinstance(f, FUNCTION) for n in walked(f)}  # the innermost wins
     for node in walked(tree):
         if isinstance(node, ast.Call) and makes_error(node):
-            scope = {**outer, **assigned(owners[id(node)])} if id(node) in owners else outer
+            owner = next(enclosing(node, tree), None)
+            scope = {**outer, **assigned(owner)} if owner else outer
             for text in sentences(node.args[0], scope):
                 yield node.lineno, text
         elif isinstance(node, ast.Raise) and isinstance(node.exc, ast.Name):
@@ -95,7 +97,7 @@ def expected():
     """Every expected message the tests state."""
     found = set()
     for path, tree in trees_of_tests():
-        nodes = [*ast.walk(tree)]
+        nodes = walked(tree)
         if path.name.startswith("test_errors"):
             found |= {n.value for n in nodes if isinstance(n, ast.Constant) and isinstance(n.value, str)}
         keywords = [n for n in nodes if isinstance(n, ast.keyword) and n.arg == "match"]
