@@ -151,7 +151,7 @@ def test_complex_and_integer_arguments(scheme, kind):
         assert [part.dtype for part in g] == [np.float32] * 3
 
 
-@pytest.mark.sampled
+@pytest.mark.sampled(1)
 @SCHEMES
 @pytest.mark.parametrize("of", ["cells", "faces"])
 @pytest.mark.parametrize("shape", [(0,), (0, 4), (3, 0), (1,), (1, 1), (1, 7), (7, 1), (2, 2), (2, 1, 3), (0, 2, 2)])

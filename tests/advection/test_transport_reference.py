@@ -39,7 +39,7 @@ def arguments(move, rng):
     return rng.normal(size=move.space.shape), rng.normal(size=shape), 0.015, rng.normal(size=move.walls.shape)
 
 
-@pytest.mark.sampled
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("dim", SHAPES)
 @pytest.mark.parametrize("velocity, form", FORMS)
 @pytest.mark.parametrize("of", ["cells", "faces"])

@@ -157,7 +157,7 @@ def test_a_body_may_cross_a_periodic_side():
 def test_tiny_cells_do_no_harm():
     """Wherever the wall passes, force and velocities change little."""
     found = []
-    for shift in (0.0, 1e-13, 1e-9, 1e-5, 1e-3):
+    for shift in (0.0, 1e-13, 1e-9, 1e-3):
         grid = dp.Grid((24, 16), size=(3.0, 2.0))
         flow = dp.cut_flow(grid, disc(1.0, 1.0, 0.375 + shift), CHANNEL)
         x = flow.steady(0.05, parabola(grid))

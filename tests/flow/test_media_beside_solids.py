@@ -136,6 +136,7 @@ def test_the_stress_has_a_twin(rng):
     assert np.all(np.isfinite(tangent))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("where", ["cells", "faces"])
 @IN_SOLIDS
 def test_density_in_solids(where, in_solids, rng):
@@ -164,6 +165,7 @@ def test_density_in_solids(where, in_solids, rng):
         np.testing.assert_allclose(ends[1], ends[0], rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("implicit", [False, True])
 @IN_SOLIDS
 def test_diffusivity_in_solids(implicit, in_solids, rng):

@@ -11,7 +11,7 @@ from pairwise import sample
 import sparsedp as dp
 from sparsedp.grid.boundary_conditions import resolve
 
-SHAPES = [(1,), (2,), (1, 4), (4, 1), (1, 1), (2, 1), (1, 1, 4), (3, 1, 3), (1, 2, 1)]
+SHAPES = [(1,), (1, 4), (4, 1), (1, 1), (2, 1), (3, 1, 3), (1, 2, 1)]
 SHAPES += [pytest.param(shape, marks=pytest.mark.whole) for shape in ((3,), (3, 2), (2, 2, 3))]  # no thin ones
 WORDS = (dp.no_slip, dp.free_slip, dp.inflow, dp.outflow)
 

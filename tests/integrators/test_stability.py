@@ -28,6 +28,7 @@ def growth(op, h, order):
     return np.max(np.abs(sum(z**k / math.factorial(k) for k in range(order + 1))))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", EXPLICIT)
 @pytest.mark.parametrize("grid", GRIDS.values(), ids=GRIDS)
 @pytest.mark.parametrize("boundary", CONDITIONS.values(), ids=CONDITIONS)

@@ -135,7 +135,7 @@ def rows_agree(J, known, digits):
     return np.all(np.abs(J - known).max(axis=1) <= digits * size)
 
 
-SEEDS = [*range(2), *(pytest.param(seed, marks=pytest.mark.whole) for seed in range(2, 20))]
+SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.whole) for seed in range(1, 8))]
 
 
 @pytest.mark.parametrize("seed", SEEDS)

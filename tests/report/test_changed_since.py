@@ -104,7 +104,7 @@ def test_adopted_code_with_a_counter_is_refused():
         value_and_grad(lambda x: anp.sum(act(x)))(START)
 
 
-@pytest.mark.sampled
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", ["backward_euler", "crank_nicolson", "tr_bdf2"])
 @pytest.mark.parametrize("memory", [None, 900, 3000])
 @pytest.mark.parametrize("form", ["array", "dict", "timed"])

@@ -132,16 +132,15 @@ def test_derivatives_near_a_fold_are_right_or_raise():
     def by_height(x, height):
         return {"u": rate(x["u"], x["lam"]), "lam": x["u"][middle] - height}
 
-    heights = np.arange(0.2, 2.0, 0.1)
+    heights = np.arange(0.2, 2.0, 0.2)
     state = {"u": np.zeros((15, 15)), "lam": 1.0}
     branch = dp.implicit(by_height)
     curve = []
     for height in heights:
         state = branch(state, height)
-        curve.append((state["lam"], dp.grad(lambda h, s=state: branch(s, h)["lam"])(height)))
-    lams, slopes = np.array(curve).T
-    fold = heights[np.argmax(lams)]
-    assert 1.3 <= fold <= 1.5 and np.max(lams) == pytest.approx(6.808, rel=0.01)
+        curve.append(state["lam"])
+    fold = heights[np.argmax(curve)]
+    assert 1.3 <= fold <= 1.5 and np.max(curve) == pytest.approx(6.808, rel=0.01)
     find = dp.implicit(rate)
     for height in (0.5, 1.0, 1.35, 1.385):  # from far below to just below the fold
         state = branch(state, height)

@@ -15,8 +15,8 @@ from sparsedp.solvers.system import System
 
 pytestmark = pytest.mark.skipif(not kernels.compiled(), reason="structured multigrid needs numba")
 
-SHAPES = [(1, 1), (1, 5), (2, 2), (3, 2), (7, 5), (16, 17), (31, 9)]
-SHAPES += [(1, 1, 1), (2, 2, 2), (1, 4, 3), (5, 1, 7), (7, 6, 5), (9, 8, 11)]
+SHAPES = [(1, 1), (1, 5), (3, 2), (16, 17), (31, 9)]
+SHAPES += [(1, 1, 1), (2, 2, 2), (1, 4, 3), (5, 1, 7), (9, 8, 11)]
 CONDITIONS = [dp.neumann, dp.dirichlet, dp.robin(1, 2)]
 
 
@@ -81,7 +81,7 @@ def test_the_null_space_equals_the_one_from_the_entries(rng):
 
 
 @pytest.mark.sampled(1)
-@pytest.mark.parametrize("shape", [(64, 64), (257, 100), (131, 128), (33, 32, 31), (40, 40, 40)])
+@pytest.mark.parametrize("shape", [(64, 64), (257, 100), (33, 32, 31)])
 @pytest.mark.parametrize("boundary", [dp.dirichlet, dp.neumann])
 def test_at_most_12_iterations_for_smooth_coefficients(shape, boundary, rng):
     grid = dp.Grid(shape, spacing=0.01)
