@@ -41,7 +41,7 @@ from sparsedp.solvers.eigen_rules import (
 )
 from sparsedp.solvers.eigensolver import METHODS, ROUNDING, EigenSettings
 from sparsedp.solvers.general_eigenpairs import GeneralEigenpairs, GeneralEigenProblem, JacobianMember
-from sparsedp.solvers.parametric import ParametricSolver
+from sparsedp.solvers.parametric import CutEllipticSolver, ParametricSolver
 from sparsedp.solvers.roots import Root
 
 if TYPE_CHECKING:
@@ -111,7 +111,8 @@ def eigenpairs(
         `coefficients`, `mass` and `mass_coefficients`, to every order.
     GeneralEigenpairs
         With symmetric=False: `.values`, complex, in ascending order of the real parts, with first and second
-        derivatives; `.vectors` and `.left_vectors`, without derivatives, which are computed when they are read.
+        derivatives; `.vectors`, `.left_vectors` and `.condition_numbers`, without derivatives, which are computed when
+        they are read.
 
     Raises
     ------
@@ -120,7 +121,8 @@ def eigenpairs(
     ShapeError
         If `op` is not square, or the mass does not fit.
     ValueError
-        If k is not between 1 and the number of unknowns, the mass is not positive, or an option is out of range.
+        If k is not between 1 and the number of unknowns, the mass is not positive, A - lambda M is singular for every
+        lambda, or an option is out of range.
     NonFiniteError
         If the mass or a coefficient holds NaN or infinity.
     ConvergenceError
@@ -168,9 +170,13 @@ def eigenpairs(
     **Multiple eigenvalues** are complete: iterations are repeated in the complement of the pairs that are known.
 
     **Operators that are not symmetric.** With right vectors v of norm 1 and left vectors w, w^H A = lambda w^H M,
-    scaled so that w^H M v = 1, a simple eigenvalue changes by ::
+    scaled so that w^H M v = 1 (`scipy.linalg.eig` scales both to norm 1), a simple eigenvalue changes by ::
 
         dlambda = w^H (dA - lambda dM) v .
+
+    `.condition_numbers` are |w| |M v| / |w^H M v|. A multiple eigenvalue with enough vectors (semisimple) has bases
+    with w_i^H M v_j = 1 for i = j and 0 otherwise, without derivatives. A defective one has fewer vectors, of which
+    some are repeated, w^H M v = 0, an infinite condition number, and left vectors of norm 1.
 
     The vectors take one sparse LU factorisation for each eigenvalue. Near a number `which` ARPACK iterates with the LU
     factors of A - which M, in complex arithmetic if `which` is complex. A singular M has infinite eigenvalues; they are
@@ -196,6 +202,12 @@ def eigenpairs(
     >>> print(np.round(value, 12), np.round(slope, 12) + 0.0)
     2.0 [1. 0. 1.]
     """
+    for solver in (op, mass):
+        if isinstance(solver, CutEllipticSolver):
+            raise TypeError(
+                f"eigenpairs takes no solver with a body of cut_cells, got {solver!r}; represent the body by solid "
+                "cells of the grid, or write the matrix as an Operator"
+            )
     differentiable = leaves((mass, coefficients, mass_coefficients))
     if recording_trace(differentiable) is not None:
         raise JitError("dp.jit cannot record eigenpairs, which decides by values; call the function without dp.jit")

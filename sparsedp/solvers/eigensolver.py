@@ -79,6 +79,7 @@ LARGEST_EXPONENT = 200  # an operator or a mass beyond this power of two is scal
 ROUNDING = 1e-12  # eigenvalues that differ by this share of the size of the operator are equal
 SINGULAR_MASS = 1e12  # condition number beyond which a mass counts as singular
 LARGEST_FINITE = 1e3  # in units of the largest row of A over the mean of M: a larger eigenvalue is one at infinity
+LARGEST_RESIDUAL = 1e-2  # relative, of a solve with A - sigma M; more if it is singular and errors are projected out
 AT_ROUNDOFF = 128 * EPS  # residuals below this share of the terms are rounding errors
 ZERO_AT_ROUNDOFF = 4 * EPS  # lambda M v below this share of the terms of A v is 0
 LARGE_CONTRAST = 1e6  # of the mass; beyond it, errors name it as the reason
@@ -975,8 +976,28 @@ def _general_dense(pencil, which):
     sigma = which - OFFSET_OF_GENERAL_SHIFT * pencil.scale
     if which.imag == 0:
         sigma = sigma.real
+    shifted = stiffness - sigma * mass
+    if _is_singular(shifted):
+        raise _singular_pencil(pencil)
     with np.errstate(all="ignore"):
-        return sigma + 1.0 / la.eigvals(la.solve(stiffness - sigma * mass, mass))
+        return sigma + 1.0 / la.eigvals(np.linalg.solve(shifted, mass))
+
+
+def _singular_pencil(pencil):
+    return ValueError(
+        f"eigenpairs of {pencil.name} with this mass are not defined: A - lambda M is singular for every lambda; "
+        "remove the unknowns on which neither A nor M acts, or give them a mass"
+    )
+
+
+def _is_singular(matrix):
+    """Return whether a matrix is singular up to rounding, whatever the units of its rows and columns."""
+    for axis in (1, 0):
+        largest = np.max(np.abs(matrix), axis=axis, keepdims=True, initial=0.0)
+        if not np.all(largest):
+            return True
+        matrix = matrix / largest
+    return bool(np.linalg.cond(matrix) * EPS * len(matrix) > 1)
 
 
 def _check_finite_ones(pencil, values):
@@ -1031,6 +1052,10 @@ def _general_by_arpack(pencil, k, which, maxiter):
 
     start = pencil.start
     if pencil.mass is not None:
+        x = solve(start)
+        residual = pencil.apply_stiffness(x) - sigma * pencil.apply_mass(x) - start
+        if not np.linalg.norm(residual) <= LARGEST_RESIDUAL * np.linalg.norm(start):
+            raise _singular_pencil(pencil)
         start = inverse(inverse(start))  # has no part in the space of eigenvalues at infinity
     with _arpack_errors(k):
         act_op = LinearOperator(shape, inverse, dtype=dtype)

@@ -29,6 +29,10 @@ with (M v)^T z = 0 and t = v^T (g_v - s M^T u). One LU factorisation of a border
 b and c are the unit vectors of the largest entries of u and v, which a few steps of inverse iteration estimate: the
 matrix stays sparse, and is regular at a simple eigenvalue.
 
+At a multiple eigenvalue, inverse iteration with a block gives orthonormal bases V and U of the right and the left
+eigenspace. With the singular value decomposition U^T M V = P S Q^H, the vectors of V Q and U conj(P) form pairs with
+u^T M v = s. An eigenvalue is semisimple if no s is 0.
+
 References
 ----------
 J. R. Magnus, On differentiating eigenvalues and eigenvectors, Econometric Theory 1 (1985) 179-191.
@@ -40,7 +44,7 @@ F. Giannetti, P. Luchini, Structural sensitivity of the first instability of the
 from __future__ import annotations
 
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import autograd.numpy as anp
 import numpy as np
@@ -76,6 +80,8 @@ RESIDUAL = 1e3 * AT_ROUNDOFF  # share of the terms below which the residual of a
 NEAR = 1e-9  # distance of the shift of inverse iteration from the eigenvalue, in units of the mean row of A
 START_STEPS = 3  # of inverse iteration
 GAP_STEPS = 3  # steps of inverse iteration that estimate the distance of the nearest other eigenvalue
+SAME = 1e-9  # distance below which eigenvalues may have a common eigenspace, in units of the mean row of A
+SPACE_STEPS = 4  # of inverse iteration with a block, for the eigenspace of a multiple eigenvalue
 DEFECTIVE = 1e-7  # |u^T M v| / (|u| |M v|) below which the eigenvalue is a multiple one without enough vectors
 
 
@@ -328,14 +334,34 @@ class GeneralSolution:
         self.settings = settings
         self.shape = pencil.op.domain.shape
         self.values = general_values(pencil, settings)
-        self._pairs: dict[int, Pair] = {}
+        self._pairs: dict[int, Any] = {}
         self._refusals: dict[int, DerivativeError | None] = {}
 
-    def pair(self, number: int) -> Pair:
-        """Return the vectors of an eigenvalue."""
+    def pair(self, number: int) -> Any:
+        """Return the vectors of an eigenvalue: a Pair, or a PairOfSpace if the eigenspace has more dimensions."""
         if number not in self._pairs:
-            self._pairs[number] = Pair(self.pencil, self.values[number], number, self.settings.rtol)
+            self._find(number)
         return self._pairs[number]
+
+    def _find(self, number):
+        """Compute the vectors of an eigenvalue, and those of its copies."""
+        least = SAME * float(np.ldexp(self.pencil.scale, self.pencil.exponent))
+        copies = np.flatnonzero(np.abs(self.values - self.values[number]) <= least)
+        failure = None
+        pair = None
+        try:
+            pair = Pair(self.pencil, self.values[number], number, self.settings.rtol)
+        except ConvergenceError as error:
+            failure = error
+        if pair is None or pair.is_defective or len(copies) > 1 or pair.gap <= least:
+            space = _eigenspace(self.pencil, complex(np.mean(self.values[copies])), number)
+            if space and (len(space) > 1 or pair is None):
+                for place, copy in enumerate(copies):
+                    self._pairs[int(copy)] = space[place % len(space)]
+                return
+        if failure is not None:
+            raise failure
+        self._pairs[number] = pair
 
     def refusal(self, number: int) -> DerivativeError | None:
         """Return the error for the derivative of an eigenvalue that is not simple; None if it is simple."""
@@ -384,6 +410,9 @@ class Pair:
     mass_v, mass_u : complex arrays
         M v and M^T u.
     is_defective : bool
+        Whether u^T M v is 0 up to rounding. Then u has norm 1.
+    condition_number : float
+        |u| |M v| / |u^T M v|.
     """
 
     def __init__(self, pencil: Pencil, value: complex, number: int, rtol: float) -> None:
@@ -431,8 +460,9 @@ class Pair:
         self._dtype = bordered.dtype
         self.value = value * 2.0**pencil.exponent
         right = with_fixed_sign(v)
-        scale_u = 2.0**-pencil.mass_exponent
-        safe = product if product != 0 else 1.0
+        self.condition_number = np.inf if self.is_defective else float(1 / cosine)
+        scale_u = 1.0 if self.is_defective else 2.0**-pencil.mass_exponent
+        safe = 1.0 if self.is_defective else product
         self._scaled = v, u / safe, mass_v, mass_u / safe
         # In the units of the operators as given, M is 2^mass_exponent times the mass of the pencil.
         self.v = self._embedded(v)
@@ -495,6 +525,84 @@ class Pair:
         return self._embedded(self._singular_solve(data, transposed) * 2.0**-self._pencil.system.exponent)
 
 
+class PairOfSpace(NamedTuple):
+    """A right and a left vector of an eigenvalue whose eigenspace has more dimensions; they have no derivatives.
+
+    Attributes
+    ----------
+    right, left : complex arrays, shape (n,)
+    condition_number : float
+    is_defective : bool
+    gap : float
+        Distance of the nearest other eigenvalue: 0.
+    """
+
+    right: NDArray[Any]
+    left: NDArray[Any]
+    condition_number: float
+    is_defective: bool
+    gap: float = 0.0
+
+
+def _eigenspace(pencil, value, number):
+    """Return pairs of vectors that are bases of the eigenspaces of a multiple eigenvalue; none if there are none."""
+    stiffness, mass = pencil.matrices
+    value = value * 2.0**-pencil.exponent
+    if not pencil.complex and value.imag == 0:
+        value = value.real
+    shifted = stiffness - value * mass
+    try:
+        factors = _factors(shifted - NEAR * pencil.scale * mass, number)
+    except ConvergenceError:
+        return []
+    bases = []
+    for transposed in (False, True):
+        basis = _null_space(shifted, mass, factors, value, stiffness, transposed)
+        if not basis.shape[1]:
+            return []
+        bases.append(basis)
+    V, U = bases
+    if V.shape != U.shape:
+        return []
+    P, sizes, Q = np.linalg.svd(U.T @ (mass @ V))
+    V = V @ Q.conj().T
+    U = U @ P.conj()
+    pairs = []
+    for v, u, size in zip(V.T, U.T, sizes, strict=True):
+        cosine = size / max(np.linalg.norm(mass @ v), 1e-300)
+        is_defective = bool(cosine <= DEFECTIVE)
+        right = with_fixed_sign(v)
+        left = np.conj(u / np.vdot(v, right))
+        if not is_defective:
+            left = left / size * 2.0**-pencil.mass_exponent
+        right, left = pencil.embedded(np.array([right, left], complex))
+        pairs.append(PairOfSpace(right, left, np.inf if is_defective else float(1 / cosine), is_defective))
+    return pairs
+
+
+def _null_space(shifted, mass, factors, value, stiffness, transposed):
+    """Return an orthonormal basis, shape (n, m), of the null space of A - lambda M, or of its transpose."""
+    n = mass.shape[0]
+    terms = abs(stiffness) + abs(value) * abs(mass)
+    if transposed:
+        shifted, mass, terms = shifted.T, mass.T, terms.T
+    bound = RESIDUAL * float(np.max(terms @ np.ones(n), initial=0.0))
+    width = min(n, 4)
+    while True:
+        x = np.random.default_rng(width).standard_normal((n, width)).astype(shifted.dtype)
+        for _ in range(SPACE_STEPS):
+            x = factors.solve(mass @ x, "T" if transposed else "N")
+            if not np.all(np.isfinite(x)):
+                return x[:, :0]
+            x = np.linalg.qr(x)[0]
+        _, sizes, rows = np.linalg.svd(shifted @ x, full_matrices=False)
+        is_null = sizes <= bound
+        if np.all(is_null) and width < n:
+            width = min(n, 2 * width)
+            continue
+        return x @ rows[is_null].conj().T
+
+
 def _factors(matrix, number):
     """Return the LU factors of a matrix."""
     try:
@@ -522,8 +630,7 @@ def _largest_entries(stiffness, mass, value, scale, number):
 
 def _no_vector(number, reason):
     return ConvergenceError(
-        f"eigenpairs found no vectors for eigenvalue {number}, which may be a multiple one: {reason}; write a number "
-        "near it as which",
+        f"eigenpairs found no vectors for eigenvalue {number}: {reason}; write a number near it as which",
         info=failure("stagnated"),
     )
 
@@ -546,6 +653,9 @@ class GeneralEigenpairs:
         Complex, in ascending order of their real parts; differentiable.
     vectors, left_vectors : array, shape (k, *domain.shape), or trees of them
         Computed when they are first read.
+    condition_numbers : array, shape (k,)
+        Computed when they are first read. Infinite for a defective eigenvalue, which has fewer vectors than its
+        multiplicity: some are repeated, and left ones with w^H M v = 0 have norm 1.
     """
 
     def __init__(self, problem: GeneralEigenProblem, split: Callable | None) -> None:
@@ -569,8 +679,16 @@ class GeneralEigenpairs:
 
     @cached_property
     def left_vectors(self) -> Any:
-        """The left eigenvectors, w^H A = lambda w^H M, with w^H M v = 1 (adjoint modes)."""
+        """The left eigenvectors, w^H A = lambda w^H M, with w^H M v = 1 (adjoint modes).
+
+        If w^H M v is 0, as for a defective eigenvalue, w has norm 1.
+        """
         return self._fields(self._problem.all_vectors(left=True))
+
+    @cached_property
+    def condition_numbers(self) -> NDArray[Any]:
+        """The condition numbers |w| |M v| / |w^H M v| of the eigenvalues, shape (k,); inf for a defective one."""
+        return np.array([self._solution.pair(number).condition_number for number in range(self._count)])
 
     def _fields(self, rows):
         return rows if self._split is None else self._split(rows)

@@ -6,7 +6,7 @@ import pytest
 
 import sparsedp as dp
 from sparsedp.autodiff.derivative import grad
-from sparsedp.solvers import eigen_rules, eigensolver
+from sparsedp.solvers import eigen_rules, eigensolver, general_eigenpairs
 
 SHAPE = dp.errors.ShapeError
 TYPE = TypeError
@@ -27,6 +27,7 @@ LONG = dp.upwind(dp.Grid(40, periodic=True), 0, 1)
 FACES = np.ones(GRID.faces.shape)
 ENTRIES = dp.matrix_solver.from_coo([0, 0, 1, 1], [0, 1, 0, 1])
 HALF = dp.from_matrix(np.diag([0.0, 1.0, 1.0, 1.0, 1.0, -1.0]))  # neither positive nor regular
+DISC = dp.cut_cells(GRID, np.ones((6, 6)), dp.dirichlet, dp.dirichlet)
 LIGHT = np.where(np.arange(25) == 12, 1e-12, 1.0).reshape(5, 5)
 HEAVY = np.where(np.arange(25) == 12, 1e20, 1.0).reshape(5, 5)
 
@@ -197,10 +198,29 @@ TABLE = [
         "eigenvalues of eigenpairs with symmetric=False have first and second derivatives, no third ones",
     ),
     (
-        lambda: dp.eigenpairs(DOUBLE, symmetric=False, which=2.0).vectors,
-        FAILED,
-        "eigenpairs found no vectors for eigenvalue 0, which may be a multiple one: the matrix is singular; write a "
-        "number near it as which",
+        pairs(dp.from_matrix(np.diag([1.0, 0.0])), which=0.5, mass=np.array([1.0, 0.0]), symmetric=False),
+        VALUE,
+        "eigenpairs of matrix with this mass are not defined: A - lambda M is singular for every lambda; remove the "
+        "unknowns on which neither A nor M acts, or give them a mass",
+    ),
+    (
+        pairs(
+            dp.from_matrix(np.diag(np.r_[1.0:30.0, 0.0]), name="A"),
+            which=0.5,
+            mass=np.r_[np.ones(29), 0.0],
+            symmetric=False,
+            method="arpack",
+        ),
+        VALUE,
+        "eigenpairs of A with this mass are not defined: A - lambda M is singular for every lambda; remove the "
+        "unknowns on which neither A nor M acts, or give them a mass",
+    ),
+    (
+        pairs(dp.elliptic_solver(dp.divergence(GRID), DISC), coefficients=(np.ones(25), FACES), symmetric=False),
+        TYPE,
+        "eigenpairs takes no solver with a body of cut_cells, got <elliptic_solver: <cut_cells: 25 of 25 cells hold "
+        "fluid, 0 are cut, dirichlet on the wall>>; represent the body by solid cells of the grid, or write the matrix "
+        "as an Operator",
     ),
     (
         lambda: dp.eigenpairs(REGULAR, symmetric=False, mass=np.array([1.0, 0.0])),
@@ -355,3 +375,11 @@ def test_messages_of_failures(monkeypatch):
     )
     with pytest.raises(FAILED, match=message):
         slope(lambda pairs: anp.sum(pairs.vectors[0] ** 3), 1)()
+
+
+def test_vectors_that_are_not_found(monkeypatch):
+    monkeypatch.setattr(general_eigenpairs, "_eigenspace", lambda *args: [])
+    message = "eigenpairs found no vectors for eigenvalue 0: the matrix is singular; write a number near it as which"
+    with pytest.raises(FAILED) as caught:
+        dp.eigenpairs(DOUBLE, symmetric=False, which=2.0).vectors
+    assert str(caught.value) == message

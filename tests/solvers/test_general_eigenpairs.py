@@ -233,6 +233,86 @@ def test_units_do_not_matter(of_matrix, of_mass):
     np.testing.assert_allclose(slope(of_matrix, of_mass) * of_mass, slope(1.0, 1.0), rtol=1e-11, atol=1e-14)
 
 
+# ---- multiple eigenvalues --------------------------------------------------------------------------------------------
+
+
+def similar(blocks):
+    """S D S^-1 for a matrix D of blocks on the diagonal and a random S."""
+    D = la.block_diag(*blocks)
+    S = np.random.default_rng(2).standard_normal(D.shape)
+    return S @ D @ np.linalg.inv(S)
+
+
+TURN = np.array([[1.0, 2.0], [-2.0, 1.0]])
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        np.eye(3),
+        np.diag([2.0, 3.0, 2.0]),
+        np.zeros((2, 2)),
+        similar([1.0, 1.0, 1.0, 2.0, 2.0, 5.0]),
+        similar([TURN] * 3),
+    ],
+    ids=["identity", "diagonal", "zero", "similar", "complex"],
+)
+@pytest.mark.parametrize("unit", [1.0, 2.0**300])
+def test_semisimple_eigenvalues_have_dual_bases(matrix, unit):
+    n = len(matrix)
+    mass = np.linspace(1.0, 2.0, n)
+    A = mass[:, None] * matrix * unit
+    for k in (1, n):
+        pairs = dp.eigenpairs(dp.from_matrix(A), k, mass=mass, symmetric=False)
+        values, V, W = pairs.values, pairs.vectors, pairs.left_vectors
+        size = np.max(np.abs(A))
+        np.testing.assert_allclose(V @ A.T, values[:, None] * mass * V, rtol=0, atol=1e-13 * size)
+        left_size = max(1.0, np.max(np.abs(W)))
+        np.testing.assert_allclose(
+            W.conj() @ A, values[:, None] * mass * W.conj(), rtol=0, atol=1e-13 * left_size * size
+        )
+        np.testing.assert_allclose(W.conj() @ (mass * V).T, np.eye(k), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(np.linalg.norm(V, axis=1), 1.0, rtol=1e-14)
+        sizes = np.linalg.norm(W, axis=1) * np.linalg.norm(mass * V, axis=1)
+        np.testing.assert_allclose(pairs.condition_numbers, sizes, rtol=1e-12)
+    assert np.linalg.matrix_rank(V, 1e-3) == n
+
+
+def test_all_copies_of_an_eigenvalue_on_a_periodic_grid():
+    grid = dp.Grid((8, 8), periodic=True)
+    L = -dp.laplacian(grid)
+    for method in ("dense", "arpack"):
+        pairs = dp.eigenpairs(L, 4, 0.6, symmetric=False, method=method)
+        V = pairs.vectors.reshape(4, -1)
+        np.testing.assert_allclose(pairs.values, 4 * np.sin(np.pi / 8) ** 2, rtol=1e-12)
+        np.testing.assert_allclose(pairs.left_vectors.reshape(4, -1).conj() @ V.T, np.eye(4), atol=1e-12)
+        np.testing.assert_allclose(
+            [L(v.real) for v in pairs.vectors], pairs.values.real[:, None, None] * pairs.vectors.real, atol=1e-12
+        )
+
+
+def test_a_defective_eigenvalue_has_left_vectors_of_norm_one():
+    """As scipy.linalg.eig: of a Jordan block, the right vector is e_1 and the left one e_n, which are perpendicular."""
+    for n, mass in ((2, 1.0), (3, 1e200)):
+        pairs = dp.eigenpairs(dp.from_matrix(np.eye(n) + np.eye(n, k=1)), n, mass=mass, symmetric=False)
+        np.testing.assert_allclose(np.abs(pairs.vectors), np.tile(np.eye(n)[0], (n, 1)), atol=1e-12)
+        np.testing.assert_allclose(np.abs(pairs.left_vectors), np.tile(np.eye(n)[-1], (n, 1)), atol=1e-12)
+        assert np.all(pairs.condition_numbers == np.inf)
+    block = la.block_diag([[1.0, 1.0], [0.0, 1.0]], 1.0)
+    pairs = dp.eigenpairs(dp.from_matrix(block), 3, symmetric=False)
+    assert sorted(np.unique(pairs.condition_numbers)) == pytest.approx([1.0, np.inf])
+    np.testing.assert_allclose(pairs.vectors @ block.T, pairs.vectors, atol=1e-14)
+    np.testing.assert_allclose(pairs.left_vectors @ block, pairs.left_vectors, atol=1e-14)
+    np.testing.assert_allclose(np.linalg.norm(pairs.left_vectors, axis=1), 1.0)
+
+
+def test_condition_numbers_are_those_of_scipy():
+    matrix = np.array([[1.0, 1.0], [1e-6, 1.0]])
+    pairs = dp.eigenpairs(dp.from_matrix(matrix), 2, symmetric=False)
+    _, left, right = la.eig(matrix, left=True)
+    np.testing.assert_allclose(pairs.condition_numbers, 1 / np.abs(np.sum(left.conj() * right, axis=0)), rtol=1e-8)
+
+
 # ---- what has no derivative ------------------------------------------------------------------------------------------
 
 
