@@ -75,7 +75,7 @@ INNER, OUTER, OMEGA, CENTRE = 0.31, 0.93, 1.3, (0.013, -0.021)
 
 
 def between_cylinders(n):
-    """Root mean square and largest error of the velocity."""
+    """Return (rms error of v, largest error of v, error of p up to a constant, force on both walls)."""
     grid = dp.Grid((n, n), size=2.0, origin=-1.0)
     radius = disc(*CENTRE, 0.0)
 
@@ -85,14 +85,20 @@ def between_cylinders(n):
 
     level = lambda x, y: np.minimum(radius(x, y) - INNER, OUTER - radius(x, y))
     flow = dp.cut_flow(grid, level, solid_velocity=wall)
-    v = flow.steady(0.5)["v"]
+    state = flow.steady(0.5)
     px, py = flow.face_positions
     r = radius(px, py)
     b = OMEGA * INNER**2 / (1 - INNER**2 / OUTER**2)
+    a = -b / OUTER**2
     is_x = np.arange(r.size) < grid.faces.offsets[1]
     turning = np.where(is_x, CENTRE[1] - py, px - CENTRE[0])
-    error = (v - (b / r**2 - b / OUTER**2) * turning) * (flow.apertures > 0)
-    return np.array([np.sqrt(np.sum(flow.apertures * grid.faces.volumes * error**2)), np.max(abs(error))])
+    error = (state["v"] - (a + b / r**2) * turning) * (flow.apertures > 0)
+    root_mean_square = np.sqrt(np.sum(flow.apertures * grid.faces.volumes * error**2))
+
+    r = radius(*grid.centres())
+    inside = (r > INNER + 0.1) & (r < OUTER - 0.1)
+    error_of_p = state["p"] - (a * a * r * r / 2 + 2 * a * b * np.log(r) - b * b / 2 / r**2)
+    return root_mean_square, np.max(abs(error)), np.std(error_of_p[inside]), np.max(abs(flow.force(state, 0.5)))
 
 
 def drag_of(q):
@@ -111,7 +117,7 @@ if __name__ == "__main__":
     print("\ncells  rms error  order  max error  order")
     older = None
     for n in (16, 32, 64, 128):
-        errors = between_cylinders(n)
+        errors = np.array(between_cylinders(n)[:2])
         orders = [np.nan, np.nan] if older is None else np.log2(older / errors)
         print(f"{n:5}  {errors[0]:9.1e}  {orders[0]:5.2f}  {errors[1]:9.1e}  {orders[1]:5.2f}", flush=True)
         older = errors
