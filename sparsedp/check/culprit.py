@@ -1,7 +1,7 @@
 """Find the call with a wrong derivative when a gradient is wrong: each recorded call is examined separately.
 
 A call f is examined at the arguments x that it was called with, by the loss <g, f(x)> with a fixed random g. The
-gradient of this loss by the VJP of the call is audited like that of any other loss. For an Operator no finite
+gradient of this loss by the VJP of the call is audited like the gradient of any other loss. For an Operator no finite
 differences are needed: it is linear, so <A u, g> - <u, A^T g> and A (u + v) - A u - A v show all errors.
 """
 

@@ -54,7 +54,7 @@ def _as_numpy(leaf: Any) -> Any:
 
 
 def is_random(name: str) -> bool:
-    """Return whether a name is that of a random direction in all leaves together."""
+    """Return whether a name denotes a random direction in all leaves together."""
     return name.removeprefix("random ").isdigit()
 
 

@@ -173,7 +173,7 @@ class ReviewThresholds:
     linear_share : float
         A gap of linearity up to this value is allowed: above single precision, below solves that are called loose.
     nonlinear_gap : float
-        A larger gap of linearity is an error. A smaller one may be that of an inexact solve; tolerances above 1 % are
+        A larger gap of linearity is an error. A smaller one may come from an inexact solve; tolerances above 1 % are
         unusual.
     inexact_shares : float
         A gap along a direction up to this multiple of the gap of linearity may be due to the same inexact solve, whose
@@ -216,7 +216,7 @@ class ReviewThresholds:
     clear_of_rounding : float
         A change above this number of roundings of f should be visible.
     amplified_share : float
-        A change of a derivative in other rounding modes is that of an ill-conditioned problem only if the differences
+        A change of a derivative in other rounding modes indicates an ill-conditioned problem only if the differences
         of f change by at least this share of it. It is between the ratio of double to single precision, 2e-9, amplified
         by steps and sums, and the ratio of 1/20 that was measured for Vandermonde matrices and their transposes.
     same_gap_share : float

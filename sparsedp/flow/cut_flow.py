@@ -10,8 +10,9 @@ volumes V of whole cells,
 The mass is exact, the gradient of the pressure is the transpose of the divergence, and the momentum fluxes are those
 of `convection` for the velocity A v. The stress on a side is the difference of two velocities. Along the axis of the
 component the centres of two cut faces are not on a line across the side: each value is moved to this line with the
-slope at the wall. The stress at the wall is that of `wall_fit`. A closed face whose control volume holds fluid has an
-unknown too, the continuation of the velocity, which no mass follows: otherwise the equations would jump when it opens.
+slope at the wall. The stress at the wall is computed by `wall_fit`. A closed face whose control volume holds fluid has
+an unknown too, the continuation of the velocity, which no mass follows: otherwise the equations would jump when it
+opens.
 
 What the fluid loses at the walls is the force on the body. Its sum equals the balance over any control volume around
 the body, because all fluxes are conservative. Where the wall cuts cells, the truncation error is of first order or
@@ -125,7 +126,7 @@ def cut_flow(
     -----
     **Derivatives.** In the viscosity, the given velocities, the level and the velocity of the body, forward and
     reverse, to every order: the derivative of the force in the shape of the body. Where the wall passes a node or a
-    centre of the grid, the derivative in the level is that of one side, and the force may jump by about 1e-4 of it.
+    centre of the grid, the derivative in the level is one-sided, and the force may jump by about 1e-4 of it.
 
     **Resolution.** Parts of a body that are thinner than a cell, and gaps that are narrower than two, are not resolved.
 

@@ -17,7 +17,7 @@ There are two ghost cells beyond each end of an axis. On a periodic axis they ho
 outflow they repeat the last cell; at a wall (free_slip) they mirror the cells, with the sign of the normal momentum
 reversed; at an inflow they hold the given state.
 
-Steady states: if an equilibrium e is given, the slopes of u - e are limited instead of those of u, and the rate of e
+Steady states: if an equilibrium e is given, the limited slopes are taken of u - e instead of u, and the rate of e
 (by the same formulas) is subtracted from the rate of u. For u = e both rates are equal bit for bit, so that e is
 preserved exactly: for example a lake at rest over uneven ground, or a gas at rest under gravity. The ghost cells of e
 at an inflow boundary repeat its last cell. Therefore e is preserved if the inflow equals this last cell, as for a
@@ -642,7 +642,7 @@ def check_positive(what: str, values: Any, slack: float | None = None, argument:
     slack : float, optional
         If it is given, 0 is valid, and so are negative values of at most this size.
     argument : str, optional
-        The argument of the law that the values come from, if they are not those of the state in the cells.
+        The argument of the law that the values come from, if they do not come from the state in the cells.
     advice : str, optional
         Further advice for values of the state.
     """

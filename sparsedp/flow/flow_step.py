@@ -558,7 +558,7 @@ class FlowStep(Reconstructible):
         return new
 
     def _step_length(self, params: Any, dtype: np.dtype) -> Any:
-        """Return the length of the step; that of a function has the precision of the flow."""
+        """Return the length of the step; the result of a function is converted to the precision of the flow."""
         if not callable(self.dt):
             return self.dt
         dt = self.dt(params)

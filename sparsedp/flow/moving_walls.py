@@ -6,8 +6,8 @@ They are given in one of two forms:
   `face_lift` (`ChangingWalls`);
 - an array on faces, ``face_lift(grid, boundary)(velocities)``: the contribution of constant velocities to the
   Laplacian of the flow (`ConstantWalls`). A viscosity that is one number uses this array directly. Convection needs the
-  velocities at inflow boundaries, and a viscosity that varies in space those of all walls; `velocities_from_lift`
-  recovers them from the array.
+  velocities at inflow boundaries, and a viscosity that varies in space needs the velocities of all walls;
+  `velocities_from_lift` recovers them from the array.
 """
 
 from __future__ import annotations

@@ -95,9 +95,9 @@ def forces(
     Forces
         ``on(v, p, viscosity)`` takes a face field [velocity], a cell field [velocity^2] and a number [length^2 / time].
         It returns an array of shape (1,) in 1-D, (3,) in 2-D or (6,) in 3-D: the components of the force
-        [velocity^2 length^(dim - 1)], then those of the torque [velocity^2 length^dim] (none in 1-D, one in 2-D). The
-        density is 1. Differentiable. The Operators ``on.viscous`` (for viscosity 1) and ``on.pressure`` are its linear
-        terms; the Operator ``on.total`` integrates any acceleration on faces to its force and torque.
+        [velocity^2 length^(dim - 1)], then the components of the torque [velocity^2 length^dim] (none in 1-D, one in
+        2-D). The density is 1. Differentiable. The Operators ``on.viscous`` (for viscosity 1) and ``on.pressure`` are
+        its linear terms; the Operator ``on.total`` integrates any acceleration on faces to its force and torque.
         ``on(v, p, viscosity, walls)`` also takes tangential wall velocities, one flat array on
         ``face_lift(grid, boundary).domain``. They matter only if the cells touch a moving wall, or an inflow boundary
         where the flow enters at an angle. Default: 0.

@@ -101,7 +101,8 @@ def projection(
     Raises
     ------
     ShapeError
-        If `solid` has another shape than the grid; on use, if the density has one other than those of cells and faces.
+        If `solid` has another shape than the grid; on use, if the density has neither the shape of the cells nor of the
+        faces.
     ValueError
         If an axis is named that is periodic or does not exist, or an inflow enters a region without an outflow. On use,
         if the density is not > 0.

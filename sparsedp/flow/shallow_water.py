@@ -36,7 +36,7 @@ with k from the beginning of the stage. With the other terms f this is u + dt f 
 
     q <- (q + dt^2 k f) / (1 + (dt k)^2),
 
-makes the step second-order. Where f = k q nothing changes: steady flows are those of the law, for every dt.
+makes the step second-order. Where f = k q nothing changes: steady flows satisfy the law exactly, for every dt.
 
 The velocity is q / h. Below the depth `dry` it is multiplied by a factor that decreases to 0 with the depth, since
 q / h is the quotient of two rounding errors there.

@@ -4,9 +4,9 @@ With the mask K of open faces, the divergence D, the pressure gradient G and the
 
     w = K v + G q / rho,    -D (G q / rho) = D K v.
 
-The density of a face is that of its control volume: half of each adjacent cell. 1 / rho on faces is then the harmonic
-average of 1 / rho in the cells. Both cells of a face through which fluid flows are fluid; the density of solid cells,
-and of faces that touch one, has no effect.
+The density of a face is the mean density of its control volume: half of each adjacent cell. 1 / rho on faces is then
+the harmonic average of 1 / rho in the cells. Both cells of a face through which fluid flows are fluid; the density of
+solid cells, and of faces that touch one, has no effect.
 """
 
 from __future__ import annotations

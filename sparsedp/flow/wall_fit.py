@@ -45,7 +45,7 @@ class WallFit(NamedTuple):
     Attributes
     ----------
     walls, faces : int arrays, shape (pairs,)
-        Number of the wall, and flat number of the face among those of the component.
+        Number of the wall, and flat number of the face among the faces of the component.
     weights : array, shape (pairs,)
     """
 

@@ -7,10 +7,10 @@ f_i = f(u + z_i, t + c_i h) and c_3 = 1,
 
 The method is L-stable: stiff components decay for any h. The order is 5 for smooth problems and at least 3 for stiff
 problems with time-dependent data, where Rosenbrock methods such as Rodas have a lower order. The discrete adjoint needs
-only first derivatives of f, while that of Rosenbrock methods needs derivatives of the Jacobian. Newton's method uses
-one Jacobian J of f for all stages, and for further steps as long as it converges with this J. In the basis of the
-eigenvectors of A^-1 its linear system of 3 n unknowns splits into a real and a complex system of n unknowns each. The
-error of a step is estimated by an embedded formula of order 3, multiplied by the inverse of the real matrix,
+only first derivatives of f, while the derivative of a Rosenbrock step needs derivatives of the Jacobian. Newton's
+method uses one Jacobian J of f for all stages, and for further steps as long as it converges with this J. In the basis
+of the eigenvectors of A^-1 its linear system of 3 n unknowns splits into a real and a complex system of n unknowns
+each. The error of a step is estimated by an embedded formula of order 3, multiplied by the inverse of the real matrix,
 
     e = (g/h - J)^-1 (f(u, t) + sum_i e_i z_i / h),          g the real eigenvalue of A^-1.
 
@@ -309,7 +309,7 @@ class Radau(Embedded):
         """Return the deviations at the end, a linear map of the initial deviations of (u, moving params, t, h).
 
         The vectors inside this function also contain the sum of all d so far, between u and the params. If an event
-        ends the path, the deviation of its time is that of t plus the sum of all d.
+        ends the path, the deviation of its time is the deviation of t plus the sum of all d.
         """
         if len(traces_of([initial_deviations])) > 1:
             return self._recorded_deviations(path, arguments, start, end, initial_deviations, event)

@@ -18,7 +18,7 @@ stage to the gradient is
     y_i . d f(u + sum_j a_ij U_j, t + c_i h) + d h d_i y_i . f_t + y_i . (dJ) U_i + ...,
 
 so that the derivative of J is applied to a pair of vectors, by a second derivative of f. The adjoints of all stages
-take one factorisation: that of the forward step, or a new one if too many steps lie between. One recording of each
+take one factorisation: the one of the forward step, or a new one if too many steps lie between. One recording of each
 rate serves the solution and both perturbed solutions of embedded.py.
 
 References

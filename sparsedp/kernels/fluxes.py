@@ -281,9 +281,10 @@ def to_velocity(
 ) -> Any:
     """Compute the cotangent of w on the sides of a piece, and return how many of its values are not finite.
 
-    It is written to `gw` if `fresh`, else added to `gw`. `cotangents` are those of cells, which start at the four
-    indices `places`: of the cells themselves, weighted for their lower and for their upper sides, and of the cells
-    beyond these sides. The value at a side is the value of the upstream cell, or the mean of both cells where w is 0.
+    It is written to `gw` if `fresh`, else added to `gw`. `cotangents` contains the cotangents of cells, which start at
+    the four indices `places`: of the cells themselves, weighted for their lower and for their upper sides, and of the
+    cells beyond these sides. The value at a side is the value of the upstream cell, or the mean of both cells where w
+    is 0.
     """
     below, above = sides
     rest = 1.0 - flux
@@ -517,7 +518,7 @@ def vjp(
                 sides = (below, above)
                 if b == e:
                     continue
-                # Starts in `cotangents` of those of the cells (x, y: for lower and upper sides) and of the cells
+                # Starts in `cotangents` of the cells (x, y: for lower and upper sides) and of the cells
                 # beyond these sides (i, k).
                 x = c
                 y = c

@@ -54,9 +54,9 @@ def training_range(inputs: ArrayLike, axis: int | None = None, margin: float = 0
 
     Notes
     -----
-    A network that corrects a solver in each time step is trained on states near those of the data. Its own errors lead
+    A network that corrects a solver in each time step is trained on states near the data. Its own errors lead
     it to other states, for which it was not trained, and there they may grow without bound. The range is necessary for
-    a state to be like those of training, not sufficient. To raise an error instead of the warning, call
+    a state to be like the training states, not sufficient. To raise an error instead of the warning, call
     ``warnings.filterwarnings("error", category=sparsedp.errors.RangeWarning)``.
 
     Examples

@@ -1,7 +1,7 @@
 """Values of a cell field on both sides of each open face, of order 1 or 2, for upwind fluxes in cut cells.
 
-With order 1 the value of a side is that of its cell. With order 2 it is extrapolated over half the width of the cell,
-with van Leer's mean s of the slopes a and b on both faces of the cell along an axis,
+With order 1 the value of a side is the value of its cell. With order 2 it is extrapolated over half the width of the
+cell, with van Leer's mean s of the slopes a and b on both faces of the cell along an axis,
 
     s = 2 a b / (a + b) where a b > 0, and 0 elsewhere.
 

@@ -130,7 +130,7 @@ def cut_geometry(grid: Grid, level: Any) -> CutGeometry:
 
 
 def _normals_of_points(corners, widths, has_normal):
-    """Return the normals where the wall touches a cell in a point, those of the wall that appears if the level sinks.
+    """Return the normals where the wall touches a cell in a point: normals of the wall that appears if the level sinks.
 
     The derivative of an integral over the wall is then one-sided. The other cells get the diagonal.
     """

@@ -5,7 +5,7 @@ the area A_w of the wall in it, the mean of div(k grad u) over the fluid of the 
 
     (sum of A_f k_f du/dn over the faces + A_w k_w du/dn) / V,
 
-where n points out of the fluid. The slopes on faces are those of `gradient`, the slope at the wall is that of
+where n points out of the fluid. The slopes on faces are computed by `gradient`, the slope at the wall by
 `wall_slope`. A field holds the value at the centre of each cell, in a cut cell too: if the centre lies in the body, it
 is the smooth continuation of the field.
 """

@@ -15,7 +15,7 @@ wall, which is fitted to the values at the other walls:
 
     du/dn = dl/dn - (u - l(centre of the cell)) / (L/3).
 
-The differences of the values at the walls are those of the condition, (g_j - g_i) / a, times a L / (a L + b): the share
+The values at the walls differ by the values of the condition, (g_j - g_i) / a, times a L / (a L + b): the share
 that falls off between the walls. So linear fields are exact, and so are sources between walls with one value. Between
 L = 0.6 and 0.9 cells the slope changes smoothly into the slope of the fit, so that derivatives in the level exist.
 """

@@ -123,7 +123,7 @@ def continuation(
     maxsteps : int
         Largest number of steps.
     **options
-        Options of `implicit`: rtol, maxiter (of the first point), jacobian, sparsity and those of the linear solves.
+        Options of `implicit`: rtol, maxiter (of the first point), jacobian, sparsity, and options of the linear solves.
 
     Returns
     -------
@@ -338,7 +338,7 @@ class BranchRoot(Root):
     Attributes
     ----------
     units : array, shape (n + 1,), or None
-        Arc length of a unit of each unknown and of the parameter: those of `Curve`, once there is a branch.
+        Arc length of a unit of each unknown and of the parameter; taken from `Curve` once there is a branch.
 
     Notes
     -----
@@ -1014,7 +1014,7 @@ def _smallest_slope(mean, first, last):
 
 
 def _growth(iterations, angle):
-    """Return the factor from the length of a step to that of the next one."""
+    """Return the length of the next step divided by the length of this one."""
     by_iterations = NEWTON_STEPS_AT_EQUAL_LENGTH / max(iterations, 1)
     by_angle = ANGLE_AT_EQUAL_LENGTH / max(angle, 1e-12)
     return float(np.clip(min(by_iterations, by_angle), 1 / GROWTH, GROWTH))

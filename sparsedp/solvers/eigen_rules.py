@@ -206,7 +206,7 @@ class EigenProblem:
     Attributes
     ----------
     coefficients : tuple
-        Those of A, then those of M.
+        The coefficients of A, then the coefficients of M.
     """
 
     def __init__(self, stiffness: PencilMember, mass: PencilMember, settings: EigenSettings) -> None:
@@ -219,7 +219,7 @@ class EigenProblem:
         self._solutions = Cache()
 
     def parts(self, values: Sequence) -> tuple[Any, Any]:
-        """Return the coefficients of A and those of M."""
+        """Return the coefficients of A and M."""
         return values[: self._count], values[self._count :]
 
     def pencil(self, values: Sequence) -> Pencil:

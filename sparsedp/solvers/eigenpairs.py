@@ -152,7 +152,7 @@ def eigenpairs(
         [ A - lambda M   -M v ] [ y ]   [ g ]
         [ -(M v)^T          0 ] [ c ] = [ 0 ]
 
-    whose symmetric matrix is that of the linearized problem (Nelson's method), and dv changes the loss by ::
+    whose symmetric matrix belongs to the linearized problem (Nelson's method), and dv changes the loss by ::
 
         g . dv = -y . (dA - lambda dM) v + c (v . dM v) / 2 .
 
@@ -163,9 +163,9 @@ def eigenpairs(
     arbitrary basis of the eigenspace. Functions that treat the members of a cluster alike have derivatives:
     ``pairs.sum(start, stop)`` and ``pairs.project(u, start, stop)`` of whole clusters to every order, in forward and
     reverse mode; every symmetric function of `values` and every function of `vectors` that no rotation changes to first
-    order, in reverse mode. Other derivatives are refused. So are those of a cluster that continues behind the last of
-    the k pairs; one more eigenvalue is computed to detect that. Other pairs are not affected: ``pairs.values[0]`` and
-    ``pairs[0]`` are differentiable if pair 0 is simple.
+    order, in reverse mode. Other derivatives are refused, and also derivatives of a cluster that continues behind the
+    last of the k pairs; one more eigenvalue is computed to detect that. Other pairs are not affected:
+    ``pairs.values[0]`` and ``pairs[0]`` are differentiable if pair 0 is simple.
 
     **Multiple eigenvalues** are complete: iterations are repeated in the complement of the pairs that are known.
 

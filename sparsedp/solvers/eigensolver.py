@@ -386,7 +386,7 @@ class Pencil:
         return solved
 
     def count_below(self, sigma: float) -> int:
-        """Return the number of eigenvalues below a shift: that of negative pivots of A - sigma M (Sylvester's law)."""
+        """Return the number of eigenvalues below a shift, by the negative pivots of A - sigma M (Sylvester's law)."""
         stiffness, mass = self.matrices
         try:
             return _negative_pivots(stiffness - sigma * mass)

@@ -8,8 +8,8 @@ by
 
     dlambda = u^T (dA - lambda dM) v,
 
-so a cotangent g of lambda gives the cotangents Re(g u v^T) of the entries of A and -Re(g lambda u v^T) of those of M,
-without a solve. (A complex cotangent is dL/dRe - i dL/dIm, as in autograd.)
+so a cotangent g of lambda gives the cotangents Re(g u v^T) of the entries of A and -Re(g lambda u v^T) of the entries
+of M, without a solve. (A complex cotangent is dL/dRe - i dL/dIm, as in autograd.)
 
 Second derivatives need the changes of u and v. With c^T v = 1, c constant, they are the solutions of
 
@@ -272,7 +272,7 @@ class GeneralEigenProblem(EigenProblem):
     # ------------------------------------------------------------ changes of A and M, in complex arithmetic
 
     def _tangents_of(self, nums, tangents):
-        """Return the tangents of the coefficients of A and of those of M, by their places."""
+        """Return the tangents of the coefficients of A and M, by their places."""
         for_stiffness = {num: t for num, t in zip(nums, tangents, strict=True) if num < self._count}
         for_mass = {num - self._count: t for num, t in zip(nums, tangents, strict=True) if num >= self._count}
         return for_stiffness, for_mass

@@ -246,7 +246,7 @@ class Equation:
         return result
 
     def _residual_leaves(self, result):
-        """Return the leaves of a residual; those of dicts and named tuples in the order of the unknowns.
+        """Return the leaves of a residual; leaves of dicts and named tuples are in the order of the unknowns.
 
         A residual of another structure than the unknowns, such as one array or a list, is taken in its own order.
         """

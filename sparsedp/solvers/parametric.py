@@ -633,7 +633,7 @@ def _batch_of_right_hand_sides(b, space):
 
 
 def _common_size(sizes):
-    """Return the size of a batch, given that of each argument or None; raise ShapeError if the sizes differ."""
+    """Return the size of a batch, given the size for each argument or None; raise ShapeError if the sizes differ."""
     sizes = {name: size for name, size in sizes.items() if size is not None}
     if len({*sizes.values()}) > 1:
         sizes_by_name = ", ".join(f"{size} of {name}" for name, size in sizes.items())
@@ -734,7 +734,7 @@ def matrix_solver(
 
     Notes
     -----
-    **Derivatives.** With A^T y = g: the cotangent of the entry (i, j) is -y_i x_j, and that of b is y.
+    **Derivatives.** With A^T y = g: the cotangent of the entry (i, j) is -y_i x_j, and the cotangent of b is y.
 
     **Null space.** As for `inverse`. The derivative in data of a singular system holds for changes that keep its null
     vectors, such as those that keep every row sum 0.
@@ -899,7 +899,7 @@ class MatrixSolver(ParametricSolver):
         """Solve A x = b, where the null vectors of A and of its transpose are constant on each singular component.
 
         On each singular component, the sum of ``weights * x`` is 0, and a multiple of the weights is subtracted from b.
-        The null space of the unweighted call is that of equal weights.
+        The unweighted call has the null space of equal weights.
 
         Parameters
         ----------

@@ -12,8 +12,8 @@ inverse of the Schur complement C - D A^-1 G is approximated by the sum (Cahouet
 
     S^-1 = S_d^-1 + (C - D A_c^-1 G)^-1,        S_d the diagonal of C - D diag(A)^-1 G.
 
-The first term is that of diffusion: for A = nu L on the faces of a grid, S_d is -1 / nu, which has the spectrum of the
-Schur complement on every grid. The second term is that of convection: A_c is the diagonal matrix that upwind
+The first term represents diffusion: for A = nu L on the faces of a grid, S_d is -1 / nu, which has the spectrum of the
+Schur complement on every grid. The second term represents convection: A_c is the diagonal matrix that upwind
 differences add to the diagonal of A, and one cycle approximates the inverse. On 32^2 cells of a cavity at Reynolds
 number 100 the second term reduces 280 iterations to 90. An entry of S_d that cancels, or nearly so, although the Schur
 complement need not be 0, is replaced by the sum of the magnitudes of its terms.
@@ -64,7 +64,7 @@ RESTART = 100
 MOST_NUMBERS = 2**25  # in the basis of GMRES, 0.25 GB
 STRENGTH = 0.25
 LEVELS = 25
-MOST_REGIONS = 20  # regions with constants of their own that are treated; GMRES finds those of further ones
+MOST_REGIONS = 20  # regions with separate constants that are treated; GMRES finds the constants of further regions
 ROUNDING = 1e-12  # a sum below this share of its terms is 0
 CANCELLED = 1e-3  # an entry of the estimate of the Schur complement below this share of its terms says nothing
 WEAK_CONVECTION = 1e-3  # share of the diagonal of A: smaller entries of A_c are replaced by it

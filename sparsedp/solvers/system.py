@@ -55,7 +55,7 @@ class System:
     exponent : int
         Not 0 if entries are beyond 2^+-200. The scaling is exact; the contract scales the solution back.
     size, local_size : int
-        Numbers in a field, and those of them that this process holds.
+        Number of values of a field, and number of values that this process holds.
     """
 
     engine_builder: Callable[[System], Engine] | None = None  # set where there is only one method
@@ -279,7 +279,7 @@ class System:
         return labels, count
 
     def lift(self, b: np.ndarray, size: float) -> np.ndarray | None:
-        """Return, for each entry, the power of two that scales the data of a component of small data to those of all.
+        """Return, for each entry, the power of two that scales components with small data to the size of all data.
 
         None if no component has much smaller data than others. `size` is the norm of b.
         """

@@ -25,7 +25,7 @@ class Observer(Protocol):
         """Note the result of a check that the given line of a file has called."""
 
 
-OBSERVERS: list[Observer] = []  # the last one is that of the running test
+OBSERVERS: list[Observer] = []  # the last one belongs to the running test
 
 
 def are_complete() -> bool:
