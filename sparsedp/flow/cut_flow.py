@@ -254,6 +254,11 @@ class CutFlow(Reconstructible):
             If inflow and outflow of a region without an outflow boundary differ.
         ConvergenceError
             If Newton's method does not find a steady flow; a `guess` for a larger viscosity may help.
+
+        Notes
+        -----
+        Differentiable in the viscosity, v, walls, the level and the velocity of the body, by the implicit function
+        theorem: one solve with the transposed Jacobian. `guess` has no derivative.
         """
         parameters = self._parameters(viscosity, v, walls)
         self._check_balance(parameters[3])

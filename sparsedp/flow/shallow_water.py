@@ -315,6 +315,13 @@ class ShallowWater(FiniteVolumes):
             ``step(u, params=None)`` returns the state after dt, for `rollout`. It is second-order accurate, and keeps
             the steady flows of the law. Differentiable in u and params.
 
+        Raises
+        ------
+        TypeError, ValueError
+            If dt is not a number > 0. On use, if the result of a function dt is not.
+        NonFiniteError
+            If dt is NaN or infinite. On use, if the state is.
+
         See Also
         --------
         stepper : "ssprk3" takes the same step if there is no friction.

@@ -73,6 +73,18 @@ class CutOperators(CutGrid):
         Returns
         -------
         array, a field on the faces
+
+        Raises
+        ------
+        ShapeError
+            If an argument has the wrong shape.
+        NonFiniteError
+            If an argument contains NaN or infinity where it is used.
+
+        Notes
+        -----
+        The slope of a face is the difference of the values in the centres of both cells, divided by their distance,
+        also if the wall cuts the face. It is second-order accurate in the middle of the whole face.
         """
         return in_dtype_of(u, self._slopes_on_faces(self._cell_field("u", u), walls))
 
@@ -117,6 +129,13 @@ class CutOperators(CutGrid):
         Returns
         -------
         array, a field on the cells; 0 in cells without fluid
+
+        Raises
+        ------
+        ShapeError
+            If an argument has the wrong shape.
+        NonFiniteError
+            If an argument contains NaN or infinity where it is used.
         """
         return in_dtype_of(v, self._outflow(self.apertures * self._face_field("v", v)) / self._divisors)
 
@@ -133,6 +152,13 @@ class CutOperators(CutGrid):
         Returns
         -------
         array, a field on the cells; 0 in cells without wall
+
+        Raises
+        ------
+        ShapeError
+            If an argument has the wrong shape.
+        NonFiniteError
+            If an argument contains NaN or infinity where it is used.
         """
         slopes = self._slopes_at_walls(self._cell_field("u", u), self._wall_values(values))
         return in_dtype_of(u, self._at_walls(slopes))
@@ -153,6 +179,15 @@ class CutOperators(CutGrid):
         Returns
         -------
         array, a field on the cells
+
+        Raises
+        ------
+        ShapeError
+            If an argument has the wrong shape.
+        NonFiniteError
+            If an argument contains NaN or infinity where it is used.
+        ValueError
+            If k or wall_k is negative.
         """
         return in_dtype_of(u, self._flux_into_walls(self._cell_field("u", u), values, k, wall_k))
 
@@ -169,6 +204,15 @@ class CutOperators(CutGrid):
         Returns
         -------
         array, a field on the cells
+
+        Raises
+        ------
+        ShapeError
+            If an argument has the wrong shape.
+        NonFiniteError
+            If an argument contains NaN or infinity where it is used.
+        ValueError
+            If k or wall_k is negative.
         """
         field = self._cell_field("u", u)
         through_faces = self.apertures * self._coefficient(k) * self._slopes_on_faces(field, walls)
@@ -203,6 +247,11 @@ class CutOperators(CutGrid):
 
         Cells without fluid are not unknowns: ``inverse(-body.laplacian)(b)`` needs b = 0 there, as
         ``b * body.is_fluid``, and returns 0 there.
+
+        Raises
+        ------
+        DerivativeError
+            If the level is traced: the Operator is constant.
         """
         if isbox(self.fractions):
             raise DerivativeError(
