@@ -194,8 +194,8 @@ def minimize(
         A function ``rate(step)`` is a schedule of adam: it returns the rate of step 0, 1, ... Schedules of optax can be
         used. max_norm, as in optax.clip_by_global_norm, limits the Euclidean norm of the gradient over all leaves of x.
         half_inverse without a rate begins with s^(2 p - 2), where s is the largest singular value of J: the length of a
-        Gauss-Newton step. With batches losses are not compared; the rate is then the smaller of s^(2 p - 2) and 2 / m
-        for a batch with m samples along axis 0 of the residuals.
+        Gauss-Newton step. Its first step is not longer than x, unless x is 0. With batches losses are not compared; the
+        rate is then the smaller of s^(2 p - 2) and 2 / m for a batch with m samples along axis 0 of the residuals.
         absolute_sigma=True states that the residuals were divided by their standard deviations. It selects the formula
         of `covariance`, as in scipy.optimize.curve_fit.
         weight is not multiplied by cell volumes. For a piecewise constant result on a uniform grid write
