@@ -1021,7 +1021,7 @@ class Rule(Reconstructible):
     forward, vjp, jvp : callable
     keywords : tuple of str
         The arguments of `differentiable`.
-    made : (callable, tuple), optional
+    constructor_call : (callable, tuple), optional
         A function and its arguments that construct the rule again, for pickles. Default: this class and its arguments.
 
     Attributes

@@ -581,7 +581,7 @@ class CutFlow(Reconstructible):
         """Return the outflow of each cell through the wall of the body, divided by the volume of the cell.
 
         The wall is a polygon, so that the outflow is not 0 for a velocity that is tangential to a curved wall. The sum
-        over a region without an outflow would be of second order: it is made 0.
+        over a region without an outflow would be of second order: it is set to 0.
         """
         grid = self.grid
         velocity = _wall_velocity(solid_velocity, walls.centroids)

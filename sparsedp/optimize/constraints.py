@@ -349,7 +349,7 @@ class Constraints:
 
     Parameters
     ----------
-    given : callable, Equality, NonlinearConstraint, LinearConstraint, or a tree of them; or None
+    constraints : callable, Equality, NonlinearConstraint, LinearConstraint, or a tree of them; or None
     packing : Packing
 
     Attributes

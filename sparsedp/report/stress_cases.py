@@ -274,7 +274,7 @@ def grade_growth(scene: Scene, changed: Values, outcome: Outcome) -> Grade:
         return FAILED, growth.factor, "grows and changes its sign from step to step: the step is too large"
     name = scene.time_step
     if name is None:
-        return DEGRADED, growth.factor, "grows; name the time step, so that physics and step can be told apart"
+        return DEGRADED, growth.factor, "grows; name the time step, to distinguish physics and step"
     finer: Any = scene.growth_at({name: scene.leaves[name] / FINER_STEP})
     if finer.factor > 1 and log(growth.factor) <= 4 * FINER_STEP * log(finer.factor):
         return PASSED, growth.factor, "grows as the physics does"

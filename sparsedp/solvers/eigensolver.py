@@ -148,7 +148,7 @@ class Pencil:
     rtol : float
         Largest relative residual of a pair.
     symmetric : bool
-        Whether A and M are made symmetric by `weights`.
+        Whether `weights` make A and M symmetric.
 
     Attributes
     ----------

@@ -322,7 +322,7 @@ class Solver(Reconstructible):
                 status = run.assess(residual, goal, data, size_of_matrix * length + data, LARGEST_AT_ROUNDOFF * data)
             if failure or not reduced or not engine.refines or status == "converged":
                 break
-            # If rows differ in size, more accuracy is attainable than the bound with |A| tells: refine further.
+            # If rows differ in size, more accuracy is attainable than the bound with |A| states: refine further.
             if status and x is not None and residual <= 2 * system.rounding(x, data, transposed):
                 break
         if x is None:
