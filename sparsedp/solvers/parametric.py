@@ -223,7 +223,9 @@ def elliptic_solver(
         two are cached.
         A leading axis of k, shift or b is a batch of independent systems, such as an ensemble of coefficients; an
         argument without that axis is the same for all of them. A batch of numbers has the shape (batch, 1) as k, and
-        (batch, 1, ..., 1) as shift. The set-ups of the last two batches are cached.
+        (batch, 1, ..., 1) as shift. It is refused if batch is the length of a field with one axis, such as k: that is
+        more often a field with an axis too many, such as the output of a network. The set-ups of the last two batches
+        are cached.
 
     Raises
     ------
@@ -613,6 +615,11 @@ def _checked_batch(name, parameter, space, advice="", other_space=None):
         elif len(shape) == 1:
             hint = f"; a batch of {shape[0]} numbers has the shape {shape + trailing_ones}"
         return _checked_parameter(name, parameter, space, hint), None
+    if of_numbers and shape[:1] == space.shape != (1,):
+        raise ShapeError(
+            f"{name} of shape {shape} may be a batch of {shape[0]} numbers, or a field on {space.described} with an "
+            f"axis too many; write {name}[:, 0] for the field, or {name} * np.ones((1, {shape[0]})) for the batch"
+        )
     parameter = _finite_numbers(name, parameter)
     if of_numbers:
         parameter = parameter * np.ones((1, *space.shape))

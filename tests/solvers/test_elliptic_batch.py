@@ -130,6 +130,25 @@ def test_a_jitted_loss():
         assert value == other and relative_gap(gradient, slope) < 1e-14
 
 
+def test_a_field_with_an_axis_too_many_is_no_batch():
+    """(faces, 1), as a network returns it, would be a batch of one number for each face."""
+    line = dp.Grid(4, size=1.0)
+    solve = dp.elliptic_solver(dp.divergence(line), dp.gradient(line, dp.dirichlet))
+    b = np.ones(4)
+    with pytest.raises(
+        ShapeError,
+        match=r"k of shape \(5, 1\) may be a batch of 5 numbers, or a field on faces\(4\) of shape \(5,\) with an "
+        r"axis too many; write k\[:, 0\] for the field, or k \* np\.ones\(\(1, 5\)\) for the batch",
+    ):
+        solve(np.ones((5, 1)), b)
+    with pytest.raises(ShapeError, match=r"shift of shape \(4, 1\) may be a batch of 4 numbers, or a field on cells"):
+        solve(1.0, b, np.ones((4, 1)))
+    numbers = np.arange(1.0, 6.0)[:, None]
+    expected = [solve(number, b) for number in numbers[:, 0]]
+    np.testing.assert_allclose(solve(numbers * np.ones((1, 5)), b), expected, rtol=1e-13)
+    np.testing.assert_allclose(solve(numbers[:4], b), expected[:4], rtol=1e-13)
+
+
 def test_fluxes_of_a_batch():
     solve = solver(dp.dirichlet)
     slopes = solve.G(RIGHT)
