@@ -52,7 +52,7 @@ from sparsedp.autodiff.backend import require_arrays
 from sparsedp.autodiff.derivative import push
 from sparsedp.autodiff.program_trace import opaque, recording_trace
 from sparsedp.autodiff.tape import isbox, plain
-from sparsedp.errors import ConvergenceError, DerivativeError, JitError, NonFiniteError, UnstableStepError
+from sparsedp.errors import ConvergenceError, DerivativeError, JitError, NonFiniteError, ShapeError, UnstableStepError
 from sparsedp.solvers.newton import Equation, Newton, Unknowns
 from sparsedp.solvers.roots import Root, implicit
 from sparsedp.solvers.scaling import length
@@ -119,7 +119,8 @@ def continuation(
     step : float, optional
         Length of the first step, in units of p: see Notes; at most `largest_step`. Default: a twentieth of the range.
     largest_step : float, optional
-        Largest length of a step, in units of p. Default: a tenth of the range, or `step` if that is longer.
+        Largest length of a step, in units of p; at most the range. Default: a tenth of the range, or `step` if that is
+        longer.
     maxsteps : int
         Largest number of steps.
     **options
@@ -136,7 +137,7 @@ def continuation(
     TypeError
         If an argument has another type, or a field is distributed over ranks.
     ValueError
-        If `stop` equals `start` up to rounding, or a setting is out of range.
+        If `stop` equals `start` up to rounding, their distance overflows, or a setting is out of range.
     ConvergenceError
         If there is no steady state at `start` near the guess: `error.best` is the best iterate of Newton's method. Or
         if steps become too short, as where a branch ends or goes to infinity: `error.branch` is the branch up to there,
@@ -211,16 +212,24 @@ def continuation(
             f"got start = {start!r} and stop = {stop!r}"
         )
     span = abs(stop - start)
+    if not np.isfinite(span):
+        raise ValueError(
+            f"the range of continuation must be finite, got start = {start!r} and stop = {stop!r}; give the parameter "
+            "in other units"
+        )
     step = FIRST_STEP * span if step is None else check_number("step", step, "> 0")
     if largest_step is None:
         largest_step = max(LARGEST_STEP * span, step)
     else:
         largest_step = check_number("largest_step", largest_step, "> 0")
+    largest_step = min(largest_step, span)
     maxsteps = check_whole("maxsteps", maxsteps, 1)
     root = BranchRoot(*implicit(residual, **options).recipe()[1])
     names = ["p", *(f"param_{number}" for number in range(len(params)))]
     check_takes("continuation", residual, 2 + len(params), f"lambda x, {', '.join(names)}: ...")
     curve = Curve(root, guess, params)
+    if not curve.unknowns.size:
+        raise ShapeError("continuation needs a guess with at least one number, got none")
     steps = Steps(start, stop, min(step, largest_step) / span, largest_step / span, maxsteps)
     return Follower(curve, steps, method == "natural").follow(root, guess, params)
 

@@ -7,7 +7,7 @@ from test_steady import bratu, bratu_exact
 
 import sparsedp as dp
 import sparsedp.solvers.continuation as module
-from sparsedp.errors import ConvergenceError, DerivativeError, JitError, NonFiniteError, UnstableStepError
+from sparsedp.errors import ConvergenceError, DerivativeError, JitError, NonFiniteError, ShapeError, UnstableStepError
 
 BRATU_FOLD = {1: 3.513830719, 2: 6.808124423}
 
@@ -254,6 +254,11 @@ def test_a_step_into_an_undefined_place_is_repeated():
     assert branch.folds[0].parameter == pytest.approx(2.0, rel=1e-14)
 
 
+def test_a_step_is_not_longer_than_the_range():
+    branch = dp.continuation(cubic, -3.0, -4.0, 4.0, step=1e300)
+    assert [fold.parameter for fold in branch.folds] == pytest.approx([2.0, -2.0], rel=1e-14)
+
+
 def test_the_number_of_steps_is_limited():
     branch = dp.continuation(cubic, -3.0, -4.0, 4.0, maxsteps=3)
     assert branch.status == "max_steps"
@@ -358,6 +363,14 @@ def test_wrong_arguments_are_refused():
             "and stop = .*",
         ):
             dp.continuation(cubic, 1.0, 1.0, stop)
+    with pytest.raises(
+        ValueError,
+        match=r"the range of continuation must be finite, got start = -1e\+308 and stop = 1e\+308; give the parameter "
+        "in other units",
+    ):
+        dp.continuation(cubic, 1.0, -1e308, 1e308)
+    with pytest.raises(ShapeError, match="continuation needs a guess with at least one number, got none"):
+        dp.continuation(lambda x, p: x - p, np.zeros(0), 0.0, 1.0)
     with pytest.raises(ValueError, match="method of continuation must be one of arclength, natural, got 'arc'"):
         dp.continuation(cubic, 1.0, 0.0, 1.0, method="arc")
     with pytest.raises(TypeError, match="continuation takes a function, got float"):
