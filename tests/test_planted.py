@@ -1310,8 +1310,8 @@ BUGS = {
     ),
     "derivatives of rodas5p without those of the Jacobian": Bug(
         "integrators",
-        "of_point += of_stage + of_direction",
-        "of_point += of_stage",
+        "of_point += joined([tape.pull([part for y in ys for part in split(y)]) for ys in zip(*adjoints)], base)",
+        "pass",
         "tests/integrators/test_integrators_rosenbrock.py::test_the_backward_pass_is_the_transpose",
     ),
     "adjoint solves of rodas5p that are not transposed": Bug(
