@@ -284,7 +284,7 @@ class Recorder:
     bytes : int or None
         If it is a number, the sizes in bytes of results and of arguments that are not traced are added to it.
     entries : dict
-        While `dp.jit` records: (node of an array, index) -> entry that was taken from it.
+        (node of an array, index) -> entry that was taken from it, see `_entries`.
     ended : bool
         Whether the traced function has returned. Its values cannot be differentiated any more, so that using one of
         them raises a DerivativeError.
@@ -817,9 +817,10 @@ def _binary(function):
             nums = SECOND
             parents = (node,)
         if type(a) is BOX or type(b) is BOX:
-            if function is ITEM and type(node) is ReverseNode and type(b) is int and is_recorded(a):
-                return _entry_of_program(x, a, b, call)
-            answer = call(a, b)
+            if function is ITEM and type(a) is BOX:
+                answer = a[b]
+            else:
+                answer = call(a, b)
             executed = function
         else:
             executed = quick if type(a) in NUMBERS or type(b) in NUMBERS else raw
@@ -833,19 +834,27 @@ def _binary(function):
     return call
 
 
-def _entry_of_program(box, array, index, take):
-    """Return an entry of an array while `dp.jit` records; the same value for each use of an entry.
+def _entries(take):
+    """Return a form of indexing that records the same entry of an array once.
 
-    Its cotangents are then added as numbers, and put into the cotangent of the array once.
+    The cotangents of all uses of the entry are then added as numbers, and put into the cotangent of the array once. It
+    applies to entries that are numbers, and to all while `dp.jit` records.
     """
-    node = box._node
-    entries = node.recorder.entries
-    entry = entries.get((node, index))
-    if entry is None:
-        answer = take(array, index)
-        entry = new_box(answer, box._trace, ReverseNode(answer, ITEM, (array, index), {}, FIRST, (node,)))
-        entries[node, index] = entry
-    return entry
+
+    @wraps(ITEM)
+    def item(box, index):
+        node = box._node
+        if type(index) is not int or type(node) is not ReverseNode:
+            return take(box, index)
+        known = node.recorder.entries
+        entry = known.get((node, index))
+        if entry is None:
+            entry = take(box, index)
+            if type(entry._value) is np.float64 or is_recorded(entry._value):
+                known[node, index] = entry
+        return entry
+
+    return item
 
 
 def _reflected(act):
@@ -862,7 +871,7 @@ def _shape(box):
 def _install():
     """Replace operators of autograd's traced values by the faster ones, which call autograd for all other traces."""
     BOX.shape = property(_shape)
-    BOX.__getitem__ = _binary(ITEM)
+    BOX.__getitem__ = _entries(_binary(ITEM))
     BOX.__neg__ = direct(anp.negative)
     reflected: dict[Callable, Callable] = {}  # function of NumPy -> operator for an array and a traced value
     for name, function in OPERATORS.items():

@@ -12,7 +12,7 @@ import pytest
 
 import sparsedp as dp
 from sparsedp._utils.counters import recording
-from sparsedp.autodiff.derivative import pullback, pushforward, value_and_grad
+from sparsedp.autodiff.derivative import pullback, pushforward, taped, value_and_grad
 from sparsedp.autodiff.tape import linear
 
 SQUARE = dp.differentiable(
@@ -223,6 +223,18 @@ def test_an_exception_in_an_inner_derivative_leaves_the_outer_one_right():
         return x * value_and_grad(lambda y: y**3)(x)[1]
 
     assert value_and_grad(loss)(2.0) == (24.0, 36.0)
+
+
+def test_an_entry_that_is_read_twice_is_recorded_once():
+    """Two entries and the three operations on them, whose derivatives of both orders are exact."""
+    f = lambda u: u[0] * u[1] + u[0] ** 2
+    u = np.array([3.0, 5.0])
+    tape = taped(f, u, [True])
+    assert len(tape.nodes) == 5
+    np.testing.assert_array_equal(tape.pull([1.0])[0], [11, 3])
+    np.testing.assert_array_equal(dp.hvp(f, u, np.array([1.0, 10.0])), [12, 1])
+    slope = lambda u: value_and_grad(f)(u)[1]
+    np.testing.assert_array_equal(value_and_grad(lambda u: anp.sum(slope(u)))(u)[1], [3, 1])
 
 
 def test_linear_rules_are_each_others_derivative():
