@@ -24,6 +24,7 @@ Small cells do no harm, because the solve is implicit: no equation divides by th
 from __future__ import annotations
 
 from functools import partial
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import autograd.numpy as anp
@@ -33,7 +34,7 @@ from scipy.sparse.csgraph import connected_components
 
 from sparsedp._utils.base_classes import Reconstructible
 from sparsedp._utils.pytree import copied, mapped
-from sparsedp._utils.validation import check_finite, check_kind, check_number, check_plain
+from sparsedp._utils.validation import check_choice, check_finite, check_kind, check_number, check_on, check_plain
 from sparsedp.autodiff.program_trace import check_values
 from sparsedp.autodiff.tape import dtype_of, sample
 from sparsedp.errors import IncompatibleError, ShapeError
@@ -49,7 +50,7 @@ from sparsedp.flow.momentum import (
 from sparsedp.flow.wall_fit import wall_fit
 from sparsedp.grid.boundary_conditions import no_slip, resolve
 from sparsedp.grid.grid import Grid, check_grid
-from sparsedp.operators.cut_geometry import level_at_nodes, sum_at_places
+from sparsedp.operators.cut_geometry import level_at_nodes, protect, sum_at_places
 from sparsedp.operators.difference import divergence, gradient
 from sparsedp.operators.given import from_matrix
 from sparsedp.solvers.inverse import inverse
@@ -64,6 +65,8 @@ if TYPE_CHECKING:
 __all__ = ["CutFlow", "cut_flow"]
 
 SHORTEST = 1e-3  # distance of two faces below which their difference is not divided by it, in the smallest cell width
+FARTHEST = 8.0  # largest value of the level far from the wall, relative to those next to it
+HUGE = 1e150  # values of the level beyond are far from the wall: near it they are of order 2^half
 LARGEST_IMBALANCE = 1e-6  # relative imbalance of the given velocities around a region without an outflow
 LARGEST_NORMAL_SHARE = 0.25  # of the velocity of the body, on a wall that is a polygon
 NOT_TANGENTIAL = (
@@ -186,17 +189,18 @@ class CutFlow(Reconstructible):
         if grid.dim != 2 or not grid.cells.size:
             raise ShapeError(f"cut_flow takes a 2-D grid with cells, got {grid}")
         self._sides = resolve(grid, boundary, no_slip, patches=True)
+        check_choice("convection of cut_flow", convection, (True, False))
         level = level_at_nodes("cut_flow", grid, level)
         self._arguments = copied((grid, level, boundary, solid_velocity, convection, options))
         self.grid = grid
-        self._convection = bool(convection)
+        self._convection = convection
         self._root = implicit(
             partial(self._rates, self._convection), partial(self._jacobian, self._convection), **options
         )
 
         self._has_walls = [(entry.axis, entry.side, entry.component) for entry in wall_sides(grid, self._sides)]
         self._walls_space = wall_velocities(grid, self._sides)
-        geometries, walls = cut_faces(grid, level)
+        geometries, walls = cut_faces(grid, _of_order_one(level))
         apertures = [
             anp.reshape(anp.transpose(g.apertures) if c else g.apertures, (-1,)) for c, g in enumerate(geometries)
         ]
@@ -217,6 +221,8 @@ class CutFlow(Reconstructible):
         self._solid = _velocity_at_walls(grid, solid_velocity, geometries)
         self._operators()
         self._solid["outflow"] = self._outflow_through_walls(solid_velocity, walls)
+        self._check_uniform_flows()
+        protect(self.apertures, *self.face_positions, self.is_free)
 
     def recipe(self) -> tuple[type[CutFlow], tuple[Any, ...]]:
         """Return the call that constructs an equal object, without its set-ups."""
@@ -264,6 +270,8 @@ class CutFlow(Reconstructible):
         self._check_balance(parameters[3])
         if guess is None:
             guess = self._stokes_flow(*mapped(lambda leaf: np.asarray(sample(leaf)), parameters))
+        else:
+            self._check_flow("guess", guess)
         return self._root(guess, *parameters)
 
     def _stokes_flow(self, *parameters):
@@ -293,6 +301,7 @@ class CutFlow(Reconstructible):
             "v": rate of the velocity on free faces, difference from the given velocity on all others. "p": the
             divergence.
         """
+        self._check_flow("x", x)
         return self._rates(self._convection, x, *self._parameters(viscosity, v, walls))
 
     def jacobian(self, x: dict, viscosity: Any, v: Any = 0.0, walls: Any = None) -> sp.csr_array:
@@ -311,6 +320,7 @@ class CutFlow(Reconstructible):
         -------
         sparse array
         """
+        self._check_flow("x", x)
         return self._jacobian(self._convection, x, *self._parameters(viscosity, v, walls))
 
     def force(self, x: dict, viscosity: Any) -> Any:
@@ -328,7 +338,8 @@ class CutFlow(Reconstructible):
             Both components [length^3 / time^2 in 2-D].
         """
         check_values(_check_viscosity, viscosity)
-        v = self._field("v", x["v"])
+        self._check_flow("x", x)
+        v = x["v"]
         at_wall = self._at_wall(self._wall_terms(self._weights, v, self._solid))
         pressure = self._sum_of_components(self.apertures * self._pressure_force(x["p"]))
         # What enters control volumes of closed faces without an equation is taken by the body, too.
@@ -349,6 +360,7 @@ class CutFlow(Reconstructible):
             walls = np.zeros(self._walls_space.size)
         else:
             check_walls("cut_flow", walls, self._walls_space)
+            self._check_numbers("walls", walls)
         return self._weights, self._solid, viscosity, v, walls
 
     def _rates(self, convection, x, weights, solid, viscosity, boundary_velocity, walls):
@@ -624,12 +636,63 @@ class CutFlow(Reconstructible):
         space = self.grid.faces
         if shape not in ((), space.shape):
             raise ShapeError(f"{name} of cut_flow takes a number or a field on {space}, got an array of shape {shape}")
-        check_values(partial(check_finite, f"{name} of cut_flow"), value)
+        self._check_numbers(name, value)
         return value * np.ones(space.shape) if shape == () else value
+
+    def _check_flow(self, name, x):
+        """Raise an error unless x is a dict with a velocity and a pressure: real, finite, and of the right shapes."""
+        parts = {"v": self.grid.faces, "p": self.grid.cells}
+        is_dict = isinstance(sample(x), dict)
+        if not is_dict or set(x) != set(parts):
+            described = f"a dict with the keys {sorted(x)}" if is_dict else type(sample(x)).__name__
+            raise TypeError(
+                f'{name} of cut_flow must be a flow {{"v": faces, "p": cells}}, such as steady returns, got {described}'
+            )
+        for key, space in parts.items():
+            check_on(f"x[{key!r}] of cut_flow", x[key], space)
+            self._check_numbers(f"x[{key!r}]", x[key])
+
+    def _check_numbers(self, name, value):
+        """Raise an error unless an argument, traced or not, holds finite real numbers."""
+        name = f"{name} of cut_flow"
+        check_kind(name, dtype_of(value), "real numbers")
+        check_values(partial(check_finite, name), value)
+
+    def _check_uniform_flows(self):
+        """Raise an error if a uniform velocity can be added to every flow, so that none is determined."""
+        rest = mapped(np.zeros_like, mapped(lambda leaf: np.asarray(sample(leaf)), self._solid))
+        for axis in (0, 1):
+            uniform = self.grid.join(*(float(a == axis) for a in (0, 1)))
+            stress = self._stress(self._weights, uniform, rest, np.zeros(self._walls_space.size))
+            if np.all(self.is_free[uniform > 0]) and not np.any(np.asarray(sample(stress))):
+                raise IncompatibleError(
+                    f"cut_flow: no wall, inflow or body determines the velocity along {'xy'[axis]}; give the level a "
+                    "body, or another boundary"
+                )
 
     def __repr__(self) -> str:
         counts = f"{np.count_nonzero(self._is_open)} of {self._is_open.size} faces are open"
         return f"<cut_flow: {counts}, {self._walls_of_pairs.domain.size} control volumes are cut>"
+
+
+def _of_order_one(level):
+    """Return the level, clipped far from the wall, and divided by a power of two.
+
+    Jumps far from the wall would appear as bodies where the level is interpolated. Products of the levels of some nodes
+    do not overflow.
+    """
+    values = np.asarray(sample(level))
+    is_near = np.zeros(values.shape, bool)
+    for step in product((-1, 0, 1), repeat=values.ndim):
+        is_near |= (values > 0) != (np.roll(values, step, range(values.ndim)) > 0)
+    sizes = np.where(is_near, np.abs(values), 0.0) if is_near.any() else np.abs(values)
+    largest = int(np.argmax(sizes))
+    exponent = int(np.frexp(sizes.reshape(-1)[largest])[1])
+    half = exponent // 2  # 2^-exponent alone overflows for the smallest numbers
+    halved = 2.0**-half * anp.clip(level, -(2.0**half) * HUGE, 2.0**half * HUGE)
+    scaled = halved * 2.0 ** (half - exponent)
+    limit = FARTHEST * anp.abs(anp.reshape(scaled, (-1,))[largest])
+    return anp.minimum(anp.maximum(scaled, -limit), limit)
 
 
 def _has_fluid(grid, component, geometry):

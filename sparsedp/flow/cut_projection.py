@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import autograd.numpy as anp
+import numpy as np
+
 from sparsedp._utils.base_classes import Reconstructible
+from sparsedp._utils.validation import check_kind
+from sparsedp.autodiff.tape import dtype_of
+from sparsedp.errors import ShapeError
 from sparsedp.flow.projection_setup import mask_of_faces, pressure_conditions
 from sparsedp.grid.boundary_conditions import neumann, no_slip, resolve
 
@@ -46,11 +52,19 @@ class CutProjection(Reconstructible):
         density : number, or array on faces, optional
             > 0. Default: 1.
         """
-        return self._body.project(self._is_open * v, density)
+        return self._body.project(self._open_part(v), density)
 
     def pressure(self, v: Any, density: Any = None) -> Any:
         """Return the p with P(v) = v + G(p) / density on open faces [velocity length, times the unit of density]."""
-        return -self._body.potential(self._is_open * v, density)
+        return -self._body.potential(self._open_part(v), density)
+
+    def _open_part(self, v):
+        """Return a velocity, or a batch of them, that is 0 on closed walls."""
+        faces = self._body.grid.faces
+        if np.shape(v)[-1:] != faces.shape:
+            raise ShapeError(f"projection takes a field on {faces}, got an array of shape {np.shape(v)}")
+        check_kind("v of projection", dtype_of(v), "numbers")
+        return anp.where(self._is_open, v, 0.0)
 
     @property
     def info(self) -> Any:

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from sparsedp.grid.space import Space
     from sparsedp.operators.operator import Operator
 
-__all__ = ["CutGeometry", "cut_geometry", "level_at_nodes", "sum_at_places"]
+__all__ = ["CutGeometry", "cut_geometry", "level_at_nodes", "protect", "sum_at_places"]
 
 # A level below this share of the largest one around it is taken as 0, so that powers of fractions do not underflow.
 TINY = 1e-10
@@ -95,6 +95,13 @@ def level_at_nodes(name: str, grid: Grid, level: Any) -> Any:
     check_kind(f"the level of {name}", values.dtype, "real numbers", "; write level.real")
     check_finite(f"the level of {name}", values)
     return cast(level if isbox(level) else values, np.dtype(float))
+
+
+def protect(*arrays: Any) -> None:
+    """Make arrays read-only, except traced ones: a body does not change."""
+    for array in arrays:
+        if not isbox(array):
+            array.flags.writeable = False
 
 
 def cut_geometry(grid: Grid, level: Any) -> CutGeometry:

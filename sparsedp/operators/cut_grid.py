@@ -9,7 +9,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp.autodiff.tape import sample
-from sparsedp.operators.cut_geometry import cut_geometry, level_at_nodes, sum_at_places
+from sparsedp.operators.cut_geometry import cut_geometry, level_at_nodes, protect, sum_at_places
 from sparsedp.operators.masks_and_lift import Body
 
 if TYPE_CHECKING:
@@ -51,18 +51,23 @@ class CutGrid(Body):
         self._is_open = np.asarray(sample(self.apertures)) > 0
         self._at_walls = sum_at_places(self._geometry.cut, grid.cells)  # from cut cells to a field
         self.areas = self._at_walls(self._geometry.areas)
+        protect(self.fractions, self.volumes, self.apertures, self.is_fluid, self.areas)
 
     @cached_property
     def normals(self) -> tuple:
         """Unit normal of the wall that points into the fluid: one cell field for each axis, 0 in cells without wall."""
-        return tuple(self._at_walls(normal) for normal in self._geometry.normals)
+        normals = tuple(self._at_walls(normal) for normal in self._geometry.normals)
+        protect(*normals)
+        return normals
 
     @cached_property
     def centroids(self) -> tuple:
         """Where `values` belong: coordinates of the centroid of the wall, and of the centre in cells without wall."""
         cut = self._geometry.cut
         pairs = zip(self.grid.centres(), self._geometry.centroids, strict=True)
-        return tuple(centre + self._at_walls(of_wall - centre.reshape(-1)[cut]) for centre, of_wall in pairs)
+        centroids = tuple(centre + self._at_walls(of_wall - centre.reshape(-1)[cut]) for centre, of_wall in pairs)
+        protect(*centroids)
+        return centroids
 
     @cached_property
     def _divisors(self):

@@ -34,10 +34,11 @@ from sparsedp.operators.masks_and_lift import lift
 
 if TYPE_CHECKING:
     from sparsedp.grid.grid import Grid
+    from sparsedp.grid.space import Space
     from sparsedp.operators.cut_wall_slope import WallSlope
     from sparsedp.operators.operator import Operator
 
-__all__ = ["CutOperators", "in_dtype_of"]
+__all__ = ["CutOperators", "check_batches", "checked_field", "in_dtype_of"]
 
 
 class CutOperators(CutGrid):
@@ -160,6 +161,7 @@ class CutOperators(CutGrid):
         NonFiniteError
             If an argument contains NaN or infinity where it is used.
         """
+        check_batches(("u", u, self.grid.cells), ("values", values, self.grid.cells))
         slopes = self._slopes_at_walls(self._cell_field("u", u), self._wall_values(values))
         return in_dtype_of(u, self._at_walls(slopes))
 
@@ -189,6 +191,7 @@ class CutOperators(CutGrid):
         ValueError
             If k or wall_k is negative.
         """
+        self._check_batches_of_diffusion("u", u, values, None, k, wall_k)
         return in_dtype_of(u, self._flux_into_walls(self._cell_field("u", u), values, k, wall_k))
 
     def diffusion(self, u: Any, values: Any = 0.0, walls: Any = None, k: Any = 1.0, wall_k: Any = None) -> Any:
@@ -214,10 +217,20 @@ class CutOperators(CutGrid):
         ValueError
             If k or wall_k is negative.
         """
+        self._check_batches_of_diffusion("u", u, values, walls, k, wall_k)
         field = self._cell_field("u", u)
         through_faces = self.apertures * self._coefficient(k) * self._slopes_on_faces(field, walls)
         total = self._outflow(through_faces) + self._flux_into_walls(field, values, k, wall_k)
         return in_dtype_of(u, total / self._divisors)
+
+    def _check_batches_of_diffusion(self, name, field, values, walls, k, wall_k):
+        cells, faces = self.grid.cells, self.grid.faces
+        arguments = [(name, field, cells), ("values", values, cells), ("k", k, faces)]
+        if walls is not None:
+            arguments.append(("walls", walls, self._lift.domain))
+        if wall_k is not None:
+            arguments.append(("wall_k", wall_k, cells))
+        check_batches(*arguments)
 
     def _flux_into_walls(self, u, values, k, wall_k):
         slopes = self._slopes_at_walls(u, self._wall_values(values))
@@ -343,9 +356,11 @@ class CutOperators(CutGrid):
         """
         check_choice("order= of advection", order, (1, 2))
         kind, advice = ("numbers", "") if order == 1 else ("real numbers", "; write u.real and u.imag")
-        field = _checked_field("u", u, self.grid.cells, self.is_fluid, kind, advice)
+        field = checked_field("u", u, self.grid.cells, self.is_fluid, kind, advice)
         v = self._face_field("v", v, "real numbers", "; write v.real")
         entering = self._face_field("inflow", inflow)
+        faces = self.grid.faces
+        check_batches(("u", field, self.grid.cells), ("v", v, faces), ("inflow", entering, faces))
         if order == 1:
             below, above = self.face_values.of_order_1(field, entering)
         else:
@@ -415,15 +430,15 @@ class CutOperators(CutGrid):
 
     def _cell_field(self, name, value):
         """Return an argument as a field on the cells, 0 without fluid; a number is repeated."""
-        return _checked_field(name, value, self.grid.cells, self.is_fluid)
+        return checked_field(name, value, self.grid.cells, self.is_fluid)
 
     def _face_field(self, name, value, kind="numbers", advice=""):
         """Return an argument as a field on the faces, 0 on faces without fluid; a number is repeated."""
-        return _checked_field(name, value, self.grid.faces, self._is_open, kind, advice)
+        return checked_field(name, value, self.grid.faces, self._is_open, kind, advice)
 
     def _wall_values(self, values):
         """Return the values of the condition in the cut cells."""
-        return self._in_cut_cells(_checked_field("values", values, self.grid.cells, self._is_cut))
+        return self._in_cut_cells(checked_field("values", values, self.grid.cells, self._is_cut))
 
     @cached_property
     def _is_cut(self):
@@ -440,7 +455,7 @@ class CutOperators(CutGrid):
     def _wall_coefficient(self, k, wall_k):
         """Return k at the wall, in the cut cells."""
         if wall_k is not None:
-            wall_k = _checked_field("wall_k", wall_k, self.grid.cells, self._is_cut)
+            wall_k = checked_field("wall_k", wall_k, self.grid.cells, self._is_cut)
             check_values(partial(_check_not_negative, "wall_k"), wall_k)
             return self._in_cut_cells(wall_k)
         total = self._in_cut_cells(self._sum_over_faces(self.apertures * self._coefficient(k)))
@@ -448,7 +463,7 @@ class CutOperators(CutGrid):
         return total / anp.where(np.asarray(sample(area)) > 0, area, 1.0)
 
 
-def _checked_field(name, value, space, is_used, kind="numbers", advice=""):
+def checked_field(name: str, value: Any, space: Space, is_used: Any, kind: str = "numbers", advice: str = "") -> Any:
     """Return an argument as a field on a space in double precision, or as a batch of fields; a number is repeated.
 
     Parameters
@@ -474,6 +489,23 @@ def _checked_field(name, value, space, is_used, kind="numbers", advice=""):
     field = anp.where(is_used, _in_double(value), 0.0)
     check_values(partial(check_finite, f"{name} of cut_cells"), field)
     return field
+
+
+def check_batches(*arguments: tuple[str, Any, Space]) -> None:
+    """Raise ShapeError for fields whose leading axes do not broadcast.
+
+    Parameters
+    ----------
+    *arguments : tuples of a name, a number or field, and the space of the field
+    """
+    batches = {name: np.shape(value)[: max(np.ndim(value) - len(space.shape), 0)] for name, value, space in arguments}
+    try:
+        np.broadcast_shapes(*batches.values())
+    except ValueError:
+        shapes = ", ".join(f"{batch} of {name}" for name, batch in batches.items() if batch)
+        raise ShapeError(
+            f"cut_cells needs one shape of the batch, got {shapes}; give each argument the same leading axes, or none"
+        ) from None
 
 
 def _in_double(field):

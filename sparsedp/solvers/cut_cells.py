@@ -250,6 +250,7 @@ class CutCells(CutOperators):
                     f"solve of cut_cells takes one {name} for all right-hand sides, got an array of shape "
                     f"{np.shape(value)}; call solve once for each {name}"
                 )
+        self._check_batches_of_diffusion("b", b, values, walls, k, wall_k)
         rows, columns, entries = self._entries(k, wall_k, shift)
         right = self.volumes * self._cell_field("b", b) + self._at_walls(self._terms_of_values(values, k, wall_k))
         if walls is not None:

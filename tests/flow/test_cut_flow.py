@@ -136,6 +136,37 @@ def test_tiny_cells_do_no_harm():
 
 
 @pytest.mark.whole
+@pytest.mark.parametrize("far", [1e3, 1e9, 1e200])
+def test_large_levels_far_from_the_wall_change_nothing(far):
+    """The force was 50 % too large, as a jump of the level was interpolated to a body."""
+    grid = dp.Grid((12, 8), size=(3.0, 2.0))
+    nodes = np.meshgrid(grid.coordinates(0, "nodes"), grid.coordinates(1, "nodes"), indexing="ij")
+    level = disc(1.0, 1.0, 0.3)(*nodes)
+
+    def drag(level):
+        flow = dp.cut_flow(grid, level, CHANNEL, rtol=1e-13)
+        return flow.force(flow.steady(0.1, parabola(grid)), 0.1)[0]
+
+    jumping = np.where(nodes[0] > 2, far, level)
+    with onp.errstate(all="raise", under="ignore"):
+        assert drag(jumping) == pytest.approx(drag(level), rel=1e-12)
+        assert drag(far * level) == pytest.approx(drag(level), rel=1e-12)
+    slope = dp.grad(drag)(level)
+    assert np.allclose(dp.grad(drag)(jumping), slope, atol=1e-9 * np.max(abs(slope)))
+
+
+def test_public_arrays_are_read_only():
+    grid = dp.Grid((6, 6), size=2.0)
+    level = disc(1.03, 0.97, 0.5)
+    flow = dp.cut_flow(grid, level)
+    body = dp.cut_cells(grid, level)
+    arrays = [flow.apertures, flow.is_free, *flow.face_positions]
+    arrays += [body.fractions, body.volumes, body.apertures, body.areas, body.is_fluid, *body.normals, *body.centroids]
+    for array in arrays:
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0
+
+
 def test_published_drag_and_lift_of_a_cylinder():
     """DFG benchmark 2D-1 at 20 cells a diameter; the grid is stretched behind the cylinder."""
     h = 0.005

@@ -95,3 +95,79 @@ def test_wrong_velocities_of_the_body():
     flow = around_disc(0.0)
     with pytest.raises(ValueError, match="the viscosity of cut_flow must be > 0, got -1"):
         flow.force(flow.steady(1.0, 0.0), -1.0)
+
+
+def test_wrong_kinds_of_velocities():
+    flow = dp.cut_flow(GRID, LEVEL)
+    with refused(TypeError, "v of cut_flow must hold real numbers, got dtype complex128"):
+        flow.steady(1.0, 1j)
+    with refused(TypeError, "v of cut_flow must hold real numbers, got dtype <U1"):
+        flow.steady(1.0, "a")
+    walls = np.zeros(dp.face_lift(GRID).domain.size)
+    with refused(TypeError, "walls of cut_flow must hold real numbers, got dtype complex128"):
+        flow.steady(1.0, walls=1j + walls)
+    with pytest.raises(NonFiniteError, match="^walls of cut_flow must be finite, got 18 that are NaN"):
+        flow.steady(1.0, walls=np.nan + walls)
+
+
+@pytest.mark.parametrize("convection", ["no", 2, None])
+def test_convection_is_true_or_false(convection):
+    with refused(ValueError, f"convection of cut_flow must be one of True, False, got {convection!r}"):
+        dp.cut_flow(GRID, LEVEL, convection=convection)
+
+
+@pytest.mark.parametrize("use", ["steady", "residual", "jacobian", "force"])
+def test_what_is_no_flow(use):
+    flow = dp.cut_flow(GRID, LEVEL)
+    name = "guess" if use == "steady" else "x"
+    call = (lambda x: flow.steady(1.0, guess=x)) if use == "steady" else (lambda x: getattr(flow, use)(x, 1.0))
+    rest = {"v": np.zeros(GRID.faces.size), "p": np.zeros(GRID.shape)}
+    message = f'{name} of cut_flow must be a flow {{"v": faces, "p": cells}}, such as steady returns, got '
+    with refused(TypeError, message + "ndarray"):
+        call(rest["v"])
+    with refused(TypeError, message + "a dict with the keys ['v']"):
+        call({"v": rest["v"]})
+    with refused(
+        ShapeError, "x['v'] of cut_flow takes a field on faces(4, 3) of shape (31,), got an array of shape (3,)"
+    ):
+        call({**rest, "v": np.zeros(3)})
+    with refused(ShapeError, "x['p'] of cut_flow takes a field on cells(4, 3), got an array of shape (3,)"):
+        call({**rest, "p": np.zeros(3)})
+    with refused(TypeError, "x['p'] of cut_flow must hold real numbers, got dtype complex128"):
+        call({**rest, "p": 1j * rest["p"]})
+    with pytest.raises(NonFiniteError, match=r"^x\['v'\] of cut_flow must be finite"):
+        call({**rest, "v": np.nan * rest["v"]})
+
+
+def test_flows_that_nothing_determines():
+    message = (
+        "cut_flow: no wall, inflow or body determines the velocity along {}; give the level a body, or another boundary"
+    )
+    grid = dp.Grid((4, 4), periodic=True)
+    with refused(IncompatibleError, message.format("x")):
+        dp.cut_flow(grid, np.ones(grid.nodes.shape))
+    grid = dp.Grid((4, 4), periodic=(False, True))
+    with refused(IncompatibleError, message.format("y")):
+        dp.cut_flow(grid, np.ones(grid.nodes.shape), {"x": dp.free_slip})
+    dp.cut_flow(grid, np.ones(grid.nodes.shape))
+
+
+def test_batches_of_different_sizes_around_a_body():
+    body = dp.cut_cells(GRID, lambda x, y: np.hypot(x - 2.0, y - 1.4) - 0.8, dp.neumann)
+    u, v = np.ones((3, *GRID.shape)), np.zeros((2, GRID.faces.size))
+    advice = "; give each argument the same leading axes, or none"
+    with refused(ShapeError, f"cut_cells needs one shape of the batch, got (3,) of u, (2,) of v{advice}"):
+        body.advection(u, v)
+    message = f"cut_cells needs one shape of the batch, got (3,) of u, (2,) of values{advice}"
+    for use in (body.slopes, body.flux, body.diffusion):
+        with refused(ShapeError, message):
+            use(u, u[:2])
+    with refused(ShapeError, message.replace("of u", "of b")):
+        body.solve(u, u[:2])
+    move = dp.transport(GRID, "upwind", solid=body)
+    with pytest.raises(ShapeError, match=r"^cut_cells needs one shape of the batch, got \(3,\) of u, \(2,\) of v"):
+        move(u, v, 0.1)
+    with refused(ShapeError, "projection takes a field on faces(4, 3), got an array of shape (30,)"):
+        dp.projection(GRID, body)(np.ones(30))
+    with refused(TypeError, "v of projection must hold numbers, got dtype <U1"):
+        dp.projection(GRID, body)(np.full(GRID.faces.size, "a"))
