@@ -8,9 +8,8 @@ import autograd.numpy as anp
 import numpy as np
 
 from sparsedp._utils.base_classes import Reconstructible
-from sparsedp._utils.validation import check_kind
+from sparsedp._utils.validation import check_kind, check_on
 from sparsedp.autodiff.tape import dtype_of
-from sparsedp.errors import ShapeError
 from sparsedp.flow.projection_setup import mask_of_faces, pressure_conditions
 from sparsedp.grid.boundary_conditions import neumann, no_slip, resolve
 
@@ -62,7 +61,7 @@ class CutProjection(Reconstructible):
         """Return a velocity, or a batch of them, that is 0 on closed walls."""
         faces = self._body.grid.faces
         if np.shape(v)[-1:] != faces.shape:
-            raise ShapeError(f"projection takes a field on {faces}, got an array of shape {np.shape(v)}")
+            check_on("projection", v, faces, "; join its components with grid.join")
         check_kind("v of projection", dtype_of(v), "numbers")
         return anp.where(self._is_open, v, 0.0)
 

@@ -114,6 +114,12 @@ class WeightedProjection:
         """
         check_values(self._setup.check_faces, v)  # on walls too, where the values are not used
         check_values(_check_reciprocal, density)
+        batches = np.shape(v)[:-1], np.shape(density)[:-1]
+        if all(batches) and batches[0] != batches[1]:
+            raise ShapeError(
+                f"projection needs one size of the batch, got {batches[0][0]} velocities and {batches[1][0]} "
+                "densities; give both the same leading axis, or only one of them"
+            )
         v = self._open(v)
         dtype = dtype_of(v)
         v = cast(v, np.result_type(dtype, float))

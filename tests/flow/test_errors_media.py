@@ -1,10 +1,13 @@
 """Messages for a viscosity, diffusivity, density and step length of flow_step that vary."""
 
+import re
+
 import autograd.numpy as anp
 import numpy as np
 import pytest
 
 import sparsedp as dp
+from sparsedp.errors import ShapeError
 
 
 def media(**given):
@@ -174,3 +177,14 @@ def test_what_is_refused_on_ranks(name, monkeypatch):
     monkeypatch.setattr(type(dp.Grid((4, 4)).backend), "check", check)
     with pytest.raises(TypeError, match=name):
         RANKS[name]()
+
+
+def test_batches_of_velocities_and_densities():
+    grid = dp.Grid((4, 3))
+    message = (
+        "projection needs one size of the batch, got 3 velocities and 2 densities; give both the same leading axis, or "
+        "only one of them"
+    )
+    for space in (grid.cells, grid.faces):
+        with pytest.raises(ShapeError, match=f"^{re.escape(message)}$"):
+            dp.projection(grid)(np.ones((3, grid.faces.size)), np.ones((2, *space.shape)))
