@@ -104,7 +104,9 @@ def test_transport_on_faces_preserves_a_uniform_flow(shape, every):
 
 STEPPING = [pytest.param((4, 5), False, name, id=name) for name in STEPS]
 STEPPING += [pytest.param((3, 4, 2), False, "implicit", id="three axes", marks=pytest.mark.whole)]
-STEPPING += [pytest.param(shape, True, name, id=f"{shape}-{name}", marks=WHOLE) for shape in SHAPES for name in STEPS]
+for number, shape in enumerate(SHAPES):  # one half of the steps, and the other one for the next shape
+    names = list(STEPS)[number % 2 :: 2]
+    STEPPING += [pytest.param(shape, True, name, id=f"{shape}-{name}", marks=WHOLE) for name in names]
 
 
 @pytest.mark.parametrize(("shape", "every", "name"), STEPPING)

@@ -204,7 +204,7 @@ for method in ("heun", "backward_euler", "crank_nicolson", "tr_bdf2"):
 
 @case("stepper")
 def stepper_with_tolerance():
-    step = dp.stepper("tr_bdf2", lambda u, p: -p * u, 0.02, tolerance=1e-2)
+    step = dp.stepper("tr_bdf2", lambda u, p: -p * u, 0.002, tolerance=1e-2)
     return step, [lambda s: field(6, s), lambda s: field(6, s)]
 
 

@@ -201,7 +201,8 @@ STEPS = {
 
 def stepped(method, tolerance=None):
     given = dict(STEPS[method])
-    step = dp.stepper(method, given.pop("rate", None), given.pop("dt", 0.01), tolerance=tolerance, **given)
+    dt = given.pop("dt", 0.01 if tolerance is None else 0.001)  # of few intervals also under error control
+    step = dp.stepper(method, given.pop("rate", None), dt, tolerance=tolerance, **given)
     state = (numbers(12), 0.2) if step.problem.timed else numbers(12)
     return step, partial(of_step, state=state, params=0.4)
 

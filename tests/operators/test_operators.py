@@ -51,7 +51,7 @@ def test_transpose_and_twin_in_every_dtype(made, drawn, rng):
     others = [np.float32, np.complex128, np.complex64]
     for number, (op, explicit, free) in enumerate(some(made, *SHAPES)):
         if drawn is list:
-            kinds = [np.float64] * 5 + others
+            kinds = [np.float64, np.float64, *others]
         else:
             kinds = [np.float64, others[number % 3]]
         matrix = explicit.matrix
