@@ -448,6 +448,7 @@ class BorderedEquation:
         self.level = level
         self.nudge = nudge
         self.name = "continuation"
+        self.needs_confirmation = False  # see Curve.point
         self.advice = ""  # a corrector that fails is repeated with a shorter step
         self.size = row.size
 

@@ -7,6 +7,9 @@ systems (see solve.py), x is accepted when
 
     |F| <= rtol |b|,    or    |F| <= 8 eps (|J| |x| + |b|)    (converged_at_roundoff).
 
+Except in time steps, a root that meets this must also meet it with the Jacobian at the root, because terms of F may
+shrink by many orders of magnitude in the last step.
+
 |J| |x| is taken entry by entry: otherwise unknowns of different sizes (species of 1 and 1e-10 with rates of 1e7) would
 be accepted with errors that accumulate over many steps. Each field of a tree must pass the test by itself, because
 pressures of 1e6 would hide a temperature that is no solution. A step must decrease the sum of all fields in these
@@ -201,6 +204,7 @@ class Equation:
     """
 
     root_residual: float | None = None
+    needs_confirmation = True  # whether a root must be tested with the Jacobian there
     advice = "; start from the solution for nearby parameters, or raise maxiter"  # in the message of a failed solve
 
     def __init__(self, residual: Callable[..., Any], unknowns: Unknowns, params: Sequence[Any], name: str) -> None:
@@ -428,6 +432,9 @@ class Newton:
         is_newton_step = not self.is_stale
         self.is_stale = True
         status = self._acceptance(1.0 if is_newton_step else REUSE_TOLERANCE)
+        if status and not self._is_confirmed():
+            self._linearise()
+            return self._acceptance(), LOOSEST_FORCING
         if status or self._reuses_jacobian(ratio):
             return status, LOOSEST_FORCING
         if ratio > SLOW and is_newton_step:
@@ -607,6 +614,18 @@ class Newton:
         if np.all(is_converged | is_exact):
             return "converged_at_roundoff"
         return ""
+
+    def _is_confirmed(self):
+        """Return whether |F| <= rtol |J x - F| also with the Jacobian at x, which takes one product.
+
+        The one of the last iterate may be larger by many orders of magnitude, if an unknown shrinks in the last step.
+        """
+        if self.is_time_step or not (self.equation.needs_confirmation and self.size):
+            return True
+        norms = self.equation.unknowns.norms
+        with np.errstate(all="ignore"):
+            data = norms(self.equation.tangent(self.x, self.leaves)(self.x) - self.F)
+            return bool(np.all(norms(self.F) <= self.rtol * data))
 
     def _field_sizes(self):
         norms = self.equation.unknowns.norms

@@ -331,3 +331,12 @@ def test_supplied_sparsity_is_used():
     lacking = implicit(problem.residual, sparsity=sp.eye_array(n))
     with pytest.raises(DerivativeError, match=r"^the sparsity given for implicit\(residual\) lacks entries in row"):
         lacking(problem.guess, problem.params)
+
+
+@pytest.mark.parametrize("guess", [[1.0, 1.0], [2.0, 1.0], [1.0, 1e10]])
+def test_a_root_is_tested_beside_its_own_terms(guess):
+    """The first step takes x_1 from 1 to 1e-20; its rounding errors are small beside the terms at the guess only."""
+    root = dp.implicit(lambda x: anp.array([1e20 * x[0] * x[1] - 1.0, x[0] - 1.0]))
+    np.testing.assert_allclose(root(np.array(guess)), [1.0, 1e-20], rtol=1e-9)
+    root = dp.implicit(lambda x: anp.array([x[0] - x[1] * anp.exp(x[0]), x[0] - 369.8]))
+    np.testing.assert_allclose(root(np.array([369.8, -1e-142])), [369.8, 369.8 * np.exp(-369.8)], rtol=1e-9)
