@@ -82,6 +82,7 @@ START_STEPS = 3  # of inverse iteration
 GAP_STEPS = 3  # steps of inverse iteration that estimate the distance of the nearest other eigenvalue
 SAME = 1e-9  # distance below which eigenvalues may have a common eigenspace, in units of the mean row of A
 SPACE_STEPS = 4  # of inverse iteration with a block, for the eigenspace of a multiple eigenvalue
+PERPENDICULAR = 1e-14  # the cosine |u^T M v| / (|u| |M v|) below which it is 0 up to rounding
 DEFECTIVE = 1e-7  # |u^T M v| / (|u| |M v|) below which the eigenvalue is a multiple one without enough vectors
 
 
@@ -410,9 +411,9 @@ class Pair:
     mass_v, mass_u : complex arrays
         M v and M^T u.
     is_defective : bool
-        Whether u^T M v is 0 up to rounding. Then u has norm 1.
+        Whether |u^T M v| is so small that derivatives are refused.
     condition_number : float
-        |u| |M v| / |u^T M v|.
+        |u| |M v| / |u^T M v|; inf if u^T M v is 0 up to rounding. Then u has norm 1.
     """
 
     def __init__(self, pencil: Pencil, value: complex, number: int, rtol: float) -> None:
@@ -460,9 +461,10 @@ class Pair:
         self._dtype = bordered.dtype
         self.value = value * 2.0**pencil.exponent
         right = with_fixed_sign(v)
-        self.condition_number = np.inf if self.is_defective else float(1 / cosine)
-        scale_u = 1.0 if self.is_defective else 2.0**-pencil.mass_exponent
-        safe = 1.0 if self.is_defective else product
+        is_perpendicular = cosine <= PERPENDICULAR
+        self.condition_number = np.inf if is_perpendicular else float(1 / cosine)
+        scale_u = 1.0 if is_perpendicular else 2.0**-pencil.mass_exponent
+        safe = 1.0 if is_perpendicular else product
         self._scaled = v, u / safe, mass_v, mass_u / safe
         # In the units of the operators as given, M is 2^mass_exponent times the mass of the pencil.
         self.v = self._embedded(v)
@@ -570,13 +572,14 @@ def _eigenspace(pencil, value, number):
     pairs = []
     for v, u, size in zip(V.T, U.T, sizes, strict=True):
         cosine = size / max(np.linalg.norm(mass @ v), 1e-300)
-        is_defective = bool(cosine <= DEFECTIVE)
+        is_perpendicular = cosine <= PERPENDICULAR
         right = with_fixed_sign(v)
         left = np.conj(u / np.vdot(v, right))
-        if not is_defective:
+        if not is_perpendicular:
             left = left / size * 2.0**-pencil.mass_exponent
         right, left = pencil.embedded(np.array([right, left], complex))
-        pairs.append(PairOfSpace(right, left, np.inf if is_defective else float(1 / cosine), is_defective))
+        condition_number = np.inf if is_perpendicular else float(1 / cosine)
+        pairs.append(PairOfSpace(right, left, condition_number, bool(cosine <= DEFECTIVE)))
     return pairs
 
 

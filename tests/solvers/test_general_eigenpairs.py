@@ -307,10 +307,15 @@ def test_a_defective_eigenvalue_has_left_vectors_of_norm_one():
 
 
 def test_condition_numbers_are_those_of_scipy():
-    matrix = np.array([[1.0, 1.0], [1e-6, 1.0]])
-    pairs = dp.eigenpairs(dp.from_matrix(matrix), 2, symmetric=False)
-    _, left, right = la.eig(matrix, left=True)
-    np.testing.assert_allclose(pairs.condition_numbers, 1 / np.abs(np.sum(left.conj() * right, axis=0)), rtol=1e-8)
+    """The second matrix has simple eigenvalues 1, 2, ..., 12 with condition numbers up to 1e8."""
+    for matrix in (np.array([[1.0, 1.0], [1e-6, 1.0]]), np.diag(np.arange(1.0, 13.0)) + 12 * np.eye(12, k=1)):
+        n = len(matrix)
+        pairs = dp.eigenpairs(dp.from_matrix(matrix), n, symmetric=False)
+        values, left, right = la.eig(matrix, left=True)
+        expected = 1 / np.abs(np.sum(left.conj() * right, axis=0))[np.argsort(values.real)]
+        np.testing.assert_allclose(pairs.condition_numbers, expected, rtol=1e-6)
+        products = np.sum(pairs.left_vectors.conj() * pairs.vectors, axis=1)
+        np.testing.assert_allclose(products, 1.0, rtol=1e-6)
 
 
 # ---- what has no derivative ------------------------------------------------------------------------------------------
