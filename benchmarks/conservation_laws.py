@@ -49,7 +49,7 @@ def gas_state(density, p, *velocities):
 
 
 def run(law, start, end, faster, p=None):
-    """Return the first field at a time, where waves become `faster` times as fast as those of the start."""
+    """Return the first field at a time, where waves become `faster` times as fast as at the start."""
     steps = int(np.ceil(faster * end / law.time_step(start, p, cfl=0.45)))
     return lambda u, params: dp.rollout(dp.stepper("ssprk3", law, end / steps), u, params, steps)[0]
 

@@ -69,7 +69,7 @@ class Timed:
 
 
 def own_seconds(method, loss, grid, iterations):
-    """Return (seconds of an iteration without those of the loss, seconds of one value and gradient of the loss)."""
+    """Return (seconds of an iteration without the loss, seconds of one value and gradient of the loss)."""
     timed = Timed(loss)
     start = np.full(grid.shape, 0.2)
     begin = time.perf_counter()

@@ -44,7 +44,7 @@ def seconds(act, comm):
 
 
 def messages(act):
-    """What an act sends: the bytes are those of all ranks."""
+    """What an act sends: the bytes are the sum over all ranks."""
     with recording() as calls:
         act()
     return ", ".join(f"{calls['ranks', word]} {text}" for word, text in WORDS.items())

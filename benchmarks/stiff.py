@@ -192,7 +192,7 @@ def fastest(task, repeats):
 
 
 def row(name, tolerance, repeats):
-    """(tolerance, steps, (error, seconds) of each solver, (error of the gradient, its time in those of the value))."""
+    """(tolerance, steps, (error, seconds) of each solver, (error of the gradient, time of gradient / value))."""
     _, _, params, _, number, floor = SCENES[name]
     state, slopes = map(np.array, EXACT[name])
     p, (run, step) = np.array(params), by_us(name, tolerance)
@@ -211,7 +211,7 @@ def row(name, tolerance, repeats):
 
 
 def ratios(found):
-    """Our seconds over those of Radau at the same error, by lines between its rows."""
+    """Our seconds divided by the seconds of Radau at the same error, by lines between its rows."""
     ours, theirs = (np.log([row[2][k] for row in found]) for k in (0, 1))
     theirs = theirs[np.argsort(theirs[:, 0])]
     at = np.interp(ours[:, 0], *theirs.T, left=np.nan, right=np.nan)
@@ -298,7 +298,7 @@ def floors_of(start, floor):
 
 
 def pattern_of(rate, start, p):
-    """The sparsity pattern of the Jacobian: all species of a cell, and those of its neighbours."""
+    """The sparsity pattern of the Jacobian: all species of a cell and of its neighbours."""
     shape = next(iter(start.values())).shape
     stencil = abs(dp.laplacian(dp.Grid(shape), dp.neumann).matrix)
     return kron(np.ones((len(start), len(start))), stencil, "csc")
@@ -343,7 +343,7 @@ def on_a_grid(name, tolerances, methods):
 
 
 def times_of_gradient(run, p, seconds):
-    """Text: seconds of value and gradient over those of the value."""
+    """Text: seconds of value and gradient divided by the seconds of the value."""
     both = dp.value_and_grad(lambda p: anp.mean(next(iter(run(p).values())) ** 2))
     clock = perf_counter()
     word = ""

@@ -29,7 +29,7 @@ def has(doc, numpydoc, short):
 
 
 def own_nodes(function):
-    """All nodes of a function's body, without those of functions and classes inside it."""
+    """All nodes of a function's body, without nodes of functions and classes inside it."""
     waiting = list(function.body)
     while waiting:
         node = waiting.pop()

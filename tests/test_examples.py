@@ -91,7 +91,7 @@ def test_states_in_files():
 
 @example("posterior.py")
 def test_posterior():
-    """The truth in the intervals, a mode that is one, and deviations beside those of samples."""
+    """The truth in the intervals, a mode that is a minimum, and standard deviations beside sampled ones."""
     printed = run("posterior.py")
     assert float(re.search(r"mode: +(\S+) standard", printed)[1]) < 1e-2
     assert 85 <= int(re.search(r"95 %: in (\d+) %", printed)[1]) <= 99

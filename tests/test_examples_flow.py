@@ -119,7 +119,7 @@ def test_backward_step():
 
 @example("wake_onset.py")
 def test_wake_onset():
-    """6 cells a diameter: Newton's method on the growth rate converges, and its derivative is that of differences."""
+    """6 cells a diameter: Newton's method on the growth rate converges, and its derivative agrees with differences."""
     printed = run("wake_onset.py")
     rates = [row[1] for row in rows(printed, r"^ +(\S+) +(\S+) +(\S+)$")]
     assert len(rates) == 3

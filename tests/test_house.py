@@ -373,7 +373,7 @@ def test_the_table_of_places_is_true():
 
 
 def public_functions(module):
-    """Return the functions and methods without an underscore in their name, or in that of their class."""
+    """Return the functions and methods without an underscore in their name or in the name of their class."""
     found = []
     for node in definitions(module):
         if isinstance(node, FUNCTION):

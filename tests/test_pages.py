@@ -288,7 +288,7 @@ def test_a_card_is_one_panel_of_readable_size(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_pages_of_the_course_offer_their_notebooks(site):
-    """Each page links to the notebook with the audit, also in the archive; that of an example that runs has outputs."""
+    """Pages link to the notebook with the audit, also in the archive; notebooks of examples that run have outputs."""
     course = [path for path in pages(site) if path.parent.name == "a_course" and path.name != "index.html"]
     offered = {}
     for path in course:

@@ -58,7 +58,7 @@ CHECKLIST = (ROOT / "docs" / "release.md").read_text(encoding="utf-8")
 
 
 def test_the_checklist_names_every_line_with_the_version():
-    """Filled in, its lines are those of the files of today; no other file of the root or the recipe has the version."""
+    """Filled in, its lines equal those in the files; no other file of the root or the recipe has the version."""
     lines = re.findall(r"^\| `([\w./]+)` \| `(.+)` \|$", CHECKLIST, re.M)
     date = str(read("CITATION.cff")["date-released"])
     for file, line in lines:
@@ -243,7 +243,7 @@ def test_sdist_and_wheel_are_sound(built):
 
 @pytest.mark.slow
 def test_the_wheel_works_without_the_checkout(built, tmp_path):
-    """It also has types for users: mypy ignores those of an installed package without the file py.typed."""
+    """It also has types for users: mypy ignores types of an installed package without the file py.typed."""
     run(sys.executable, "-m", "venv", "clean", folder=tmp_path)
     python = str(tmp_path / "clean" / ("Scripts" if os.name == "nt" else "bin") / "python")
     [wheel] = built.glob("*.whl")

@@ -24,7 +24,7 @@ def taylor_green(n, dim):
 
 
 def several_modes(n, seed=42):
-    """Return a random flow in 2-D with wave numbers around 2; its phases are those of jax.random."""
+    """Return a random flow in 2-D with wave numbers around 2; its phases are drawn by jax.random."""
     import jax
 
     wave = n * np.fft.fftfreq(n)
@@ -40,7 +40,7 @@ def several_modes(n, seed=42):
 
 
 def relative_error(v, reference):
-    """Return the root mean square of the difference over that of the reference."""
+    """Return the root mean square of the difference divided by the root mean square of the reference."""
     return float(np.linalg.norm(v - reference) / np.linalg.norm(reference))
 
 

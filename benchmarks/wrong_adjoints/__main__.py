@@ -111,7 +111,7 @@ def print_table(titles, rows, is_markdown):
 
 
 def main(is_markdown):
-    """Print the table of wrong derivatives, that of right ones, and the totals."""
+    """Print the tables of wrong and of right derivatives, and the totals."""
     row_of(RIGHT[0])  # imports
     titles = ["program", "fault", *CHECKS, "culprit or reason", "entry", "runs", "seconds"]
     rows = []

@@ -39,7 +39,7 @@ def gradcheck(program):
     f, vjp, start = flat_functions(program)
 
     class Wrapped(torch.autograd.Function):
-        """The program as a function of torch. A cotangent of torch is the conjugate of that of the collection."""
+        """The program as a function of torch. Cotangents of torch are conjugates of cotangents of the collection."""
 
         @staticmethod
         def forward(ctx, *tensors):

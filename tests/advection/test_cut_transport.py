@@ -25,7 +25,7 @@ def wind(body):
 
 
 def test_without_a_wall_the_steps_are_those_of_the_grid(rng):
-    """The values that enter, and those of the cells at walls of neumann."""
+    """The values that enter; at walls of neumann the values of the cells."""
     everywhere = dp.cut_cells(GRID, np.ones(GRID.nodes.shape))
     u = rng.standard_normal(GRID.shape)
     v = rng.standard_normal(GRID.faces.size)

@@ -18,7 +18,7 @@ SCHEMES = {
     "van_leer": dict(),
     "upwind, advective": dict(velocity="cells"),
     "semi_lagrangian": dict(backtrace="midpoint"),
-    "maccormack": dict(interpolation="cubic", clamp=False),  # the bounds of a clamp are those of four cells
+    "maccormack": dict(interpolation="cubic", clamp=False),  # a clamp takes its bounds from four cells
 }
 
 

@@ -73,7 +73,7 @@ def test_a_function_that_cannot_run_twice_is_not_named():
 
 @pytest.mark.filterwarnings("error::sparsedp.errors.NonFiniteGradientWarning")
 def test_who_refuses_does_not_warn():
-    """Nor do finite derivatives, and those of an argument that is not finite."""
+    """Finite derivatives, and derivatives for an input that is not finite, give no warning either."""
     assert np.allclose(dp.grad(chosen_root)(X + 1.0), 0.5 / np.sqrt(X + 1.0), rtol=1e-15)
     assert np.isnan(dp.vjp(anp.sin, X)[1](np.array([np.nan, 1.0]))[0])
     with pytest.raises(dp.errors.NonFiniteError, match=ROOT_AT_ZERO):

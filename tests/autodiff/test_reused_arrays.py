@@ -1,4 +1,5 @@
-"""A caller may write into an array at once after a call: values and derivatives of all orders are those of copies.
+"""A caller may write into an array at once after a call: values and derivatives of all orders are the same as with
+copies.
 
 Every differentiable callable is called in a loop with constants in one array that is filled anew for each call, and
 with NaN at the end; the same loop with a fresh copy for each call is the reference, to the last bit.

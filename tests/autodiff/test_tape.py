@@ -97,7 +97,7 @@ def test_missing_derivatives_and_hidden_boxes_are_named():
 
 
 def test_a_vjp_of_another_form():
-    """Such as that of JAX."""
+    """Such as a VJP in the form of JAX."""
     cube = dp.differentiable("cube", lambda x: x**3, lambda g, x: (3 * x**2 * g,))
     assert cube(2.0) == 8.0
     with pytest.raises(

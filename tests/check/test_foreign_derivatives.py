@@ -200,7 +200,7 @@ def test_a_state_of_the_last_run():
 
 
 def test_a_random_vjp_has_no_rounding_errors():
-    """Its roughness in g looks like that of an ill-conditioned problem, which would give "inconclusive"."""
+    """Its roughness in g looks like an ill-conditioned problem, which would give "inconclusive"."""
     rng = np.random.default_rng(0)
     result = VJP(lambda u: u**2, lambda u, g: 3 * u * g * (1 + 1e-3 * rng.random()), X)
     assert result.verdict == "disagrees", result

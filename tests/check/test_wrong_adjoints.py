@@ -25,7 +25,7 @@ SAMPLE = {
     "counts and rates",
     "complex polynomial",
 }
-# Errors of right derivatives that are larger than those of rounding in double precision.
+# Errors of right derivatives that are larger than rounding errors in double precision.
 TOLERANCES = {"diffusion in single precision": 1e-6, "contraction": 1e-8, "gas law by bisection": 1e-8}
 
 
@@ -162,7 +162,7 @@ def leaf_and_index(gap):
 
 @pytest.mark.parametrize("case", marked(WRONG))
 def test_wrong_derivatives_disagree(case):
-    """The verdict comes with the stage at fault, and with entries that are wrong: those of x, or of its input."""
+    """The verdict comes with the stage at fault, and with entries that are wrong: entries of x, or of its input."""
     result = check(case)
     assert result.verdict == "disagrees" and names_the_culprit(case, result), result
     x = case.program().x

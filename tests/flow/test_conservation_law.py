@@ -191,7 +191,7 @@ def test_equilibria_are_preserved_bit_for_bit():
 
 
 def test_inflow_with_and_without_an_equilibrium():
-    """Over flat ground the slopes of the difference to a lake are those of the field."""
+    """Over flat ground the slopes of the difference to a lake equal the slopes of the field."""
     laws = [river(24, 1.0, given, bump=False)[0] for given in ("lake", None)]
     _, lake, _ = river(24, 1.0, bump=False)
     wave = lake + 0.1 * np.sin(np.arange(48.0)).reshape(2, 24)

@@ -20,7 +20,7 @@ def channel():
 
 
 def test_speeds_in_a_channel_between_solid_rows():
-    """They are those for one number as viscosity: the friction beside a solid row is that of the fluid."""
+    """They equal the results for one number as viscosity: the fluid determines the friction beside a solid row."""
     grid, solid = channel()
     push = grid.join(1.0, 0.0)
     options = {"force": lambda v, p: push, "solid": solid, "convective": False}
@@ -49,7 +49,7 @@ def test_viscosity_in_solids(in_solids, implicit, rng):
 
 @pytest.mark.parametrize("implicit", [False, True])
 def test_a_law_that_is_infinite_at_rest(implicit):
-    """A solid cell has no shear rate: the law gets that of a fluid cell, and all derivatives are finite."""
+    """A solid cell has no shear rate: the law gets the rate of a fluid cell, and all derivatives are finite."""
     grid, solid = channel()
     profile = np.array([0, 1.0, 2.0, 2.5, 1.5, 0])[None] * np.ones((3, 1))
     law = lambda rate, m: 0.01 * rate ** (m - 1)

@@ -106,7 +106,7 @@ def by_hand(v, w, walls):
                     mean = (on(v, cell) + on(v, cell + 1)) / 2 * (on(w, cell) + on(w, cell + 1)) / 2
                     flux += sign * mean
                     length += h[cell] / 2
-                else:  # beyond a face of the outflow, no stress acts and the velocity is that of the face
+                else:  # beyond a face of the outflow, no stress acts, and the velocity equals the velocity of the face
                     flux += sign * on(v, node) * on(w, node)
             laplacian[c][i, j] = stress / length
             convection[c][i, j] = flux / length

@@ -12,7 +12,7 @@ GRAVITY = 9.81
 
 
 def run(law, u, end, cfl=0.45, fastest=1.0):
-    """Return the state at a time; `fastest` is how much faster than those of the first state waves become."""
+    """Return the state at a time; `fastest` is the largest wave speed divided by the largest one at the start."""
     steps = int(np.ceil(end * fastest / law.time_step(u, cfl=cfl)))
     return dp.rollout(dp.stepper("ssprk3", law, end / steps), u, None, steps)
 

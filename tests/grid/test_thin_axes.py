@@ -166,7 +166,7 @@ def test_catalogue(shape, grids, rng):
 
 
 def layers(average):
-    """The means with the widths of the cells themselves as weights, not those of the other cells: layers in series."""
+    """The means with the widths of the cells themselves as weights, not of the other cells: layers in series."""
     found = average.copy()
     for row in found:
         (place,) = np.nonzero(row)

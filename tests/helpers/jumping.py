@@ -19,7 +19,7 @@ GAUSS = np.polynomial.legendre.leggauss(400)
 
 
 class Scene(NamedTuple):
-    """u' = rate(u, p, t) from u(0) to `end`, and the derivative of its first entry in that of p, or of u(0)."""
+    """u' = rate(u, p, t) from u(0) to `end`, and the derivative of u(end)[0] in p[0], or in u(0)[0]."""
 
     kind: str
     rate: Any

@@ -44,7 +44,7 @@ def test_a_break_that_moves(method, tolerance, near):
     assert slope == pytest.approx(SLOPE(0.98), abs=near)
     assert pushforward(loss, 0.98, 1.0)[1] == pytest.approx(slope, rel=1e-9)
     assert sum(step.taken) == pytest.approx(1.0)
-    if method not in ("radau", "rk4"):  # that of rk4 is in the test below
+    if method not in ("radau", "rk4"):  # rk4 is in the test below
         assert dp.hvp(loss, 0.98, 1.0) == pytest.approx(BEND(0.98), abs=2 * near)
 
 

@@ -203,7 +203,7 @@ def test_direction_twice_in_a_step_and_the_time_in_the_state(name):
 
 @pytest.mark.whole
 def test_events_in_a_rollout_under_a_budget():
-    """Bounces in 8 steps: the same bits for every budget, and those of one step over all to rounding."""
+    """Bounces in 8 steps: the same bits for every budget, and the result of one long step up to rounding."""
     step = dp.stepper("heun", falling, 0.25, tolerance=1e-1, events=(ground, bounce))
     start = (np.array([1.0, 0.0]), 0.0)
     loss = lambda g, **options: dp.rollout(step, start, g, 8, **options)[0][0]

@@ -141,7 +141,7 @@ def test_moved_rates_with_the_default_floor(tolerance):
 
 
 def test_one_step_against_a_root():
-    """The value and gradient of a fixed step are those of the stage equations by `implicit`."""
+    """The value and gradient of a fixed step agree with the stage equations, solved by `implicit`."""
     p = np.array([2.0, 0.5])
     u = np.array([1.0, -0.5, 0.3])
 
@@ -206,7 +206,7 @@ def test_every_mode(count, options, near):
     ],
 )
 def test_all_rows_at_once(rate):
-    """The derivatives of a rate at many points are those of one pass back for each row and point, to rounding."""
+    """The derivatives of a rate at many points agree up to rounding with one backward pass for each row and point."""
     points = np.random.default_rng(0).uniform(0.3, 2.5, (9, 3))
     p = np.array([0.7, 1.6])
     problem = dp.stepper("radau", rate, 1.0).problem

@@ -158,7 +158,7 @@ def test_the_other_side_is_met_later(f, seed):
 
 @pytest.mark.parametrize("f", [relu, relu_of_real, real(relu)], ids=lambda f: f.__name__)
 def test_at_a_kink_and_near_it(f):
-    """Exactly at a kink the derivative is the mean of both sides; next to it that of its side."""
+    """Exactly at a kink the derivative is the mean of both sides; next to the kink it is one-sided."""
     adopted = dp.from_blackbox(f)
     x = np.linspace(1.0, 2.0, 300)
     adopted.jacobian(x)

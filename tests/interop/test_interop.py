@@ -37,7 +37,7 @@ def test_a_library_that_is_not_installed(library, extra, monkeypatch):
 
 
 def like_one_of(module):
-    """An array whose type comes from a module, as those of torch and jax do."""
+    """An array whose type comes from a module, like arrays of torch and jax."""
     return type("Tensor", (), {"__module__": module, "shape": GRID.shape, "dtype": np.dtype(float)})()
 
 

@@ -25,7 +25,7 @@ def tensor(x, moves=True):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_gradcheck(name):
-    """torch's own test, of first and of second order, of all arguments; values are those of the function."""
+    """torch's own test, of first and of second order, of all arguments; values equal the results of the function."""
     f, args = SCENES[name]
     g = to_torch(f)
     given, rebuild = flatten(mapped(tensor, args))

@@ -64,7 +64,7 @@ def test_the_slope_in_a_gap_has_derivatives():
 
 
 def test_plane_walls_are_no_gaps(rng):
-    """The slope at a plane wall is that of the fit, in each direction: exact for quadratic fields."""
+    """The slope at a plane wall equals the slope of the fit, in each direction: exact for quadratic fields."""
     grid = dp.Grid((14, 13), size=(1.1, 0.9))
     for angle in rng.uniform(0, 2 * np.pi, 12):
         normal = np.array([np.cos(angle), np.sin(angle)])

@@ -370,7 +370,7 @@ def test_obstacles_and_patches_work_together():
 
 
 class OnlyWhole(Backend):
-    """A backend that supports no patches, as that of ranks."""
+    """A backend that supports no patches, like the backend of ranks."""
 
     def check(self, name):
         raise TypeError(f"{name} is not supported")

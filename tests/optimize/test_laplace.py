@@ -337,7 +337,7 @@ def test_exact_data():
 
 
 def test_accurate_and_inaccurate_data_together():
-    """Data whose eigenvalues span 21 decades: those of the Hilbert matrix beside exact arithmetic."""
+    """Eigenvalues that span 21 decades: the Hilbert matrix beside exact arithmetic."""
     hilbert = 1e3 / (np.arange(10)[:, None] + np.arange(10) + 1.0)
     posterior = dp.laplace(lambda x: anp.dot(hilbert, x), np.zeros(10), 1.0)
     exact = np.linalg.svd(hilbert)[1][:9] ** 2
@@ -361,7 +361,7 @@ def diagonal_of_inverse(matrix):
 
 
 def test_wide_prior_is_the_covariance_of_least_squares():
-    """Without prior knowledge, the covariance is that of minimize with absolute_sigma."""
+    """Without prior knowledge, the covariance equals `covariance` of minimize with absolute_sigma."""
     times = np.linspace(0.0, 2.0, 30)
     data = 3.0 * np.exp(-1.5 * times) + 0.05 * np.random.default_rng(2).standard_normal(30)
     residuals = lambda p: (p["size"] * anp.exp(-p["rate"] * times) - data) / 0.05

@@ -115,7 +115,7 @@ def test_the_scale_of_the_metric_does_not_matter(method):
 
 
 def test_a_metric_that_is_nearly_singular():
-    """The condition number is 1e13, and the mean of the step is that of the gradient."""
+    """The condition number is 1e13, and step and gradient have the same mean."""
     metric = dp.identity(GRID.cells) - 2e10 * dp.laplacian(GRID)
     best = dp.minimize(lambda x: anp.sum((x - TARGET) ** 2), np.zeros(9), "gd", 1, rate=0.5, metric=metric)
     assert np.allclose(best.x, np.mean(TARGET), rtol=1e-3)

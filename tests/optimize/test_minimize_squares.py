@@ -177,7 +177,7 @@ def test_covariance_of_residuals_of_any_magnitude(rng, exponent):
 
 @pytest.mark.parametrize("method", ["gauss_newton", "levenberg_marquardt"])
 def test_steps_of_low_accuracy_take_fewer_products(method):
-    """The step is that of LSMR with this tolerance, and the search ends at the same point."""
+    """The step is computed by LSMR with this tolerance, and the search ends at the same point."""
     matrix = np.diag(np.geomspace(1.0, 30.0, 40)) + 0.01 * np.sin(np.arange(1600.0)).reshape(40, 40)
     products = []
     row = dp.from_functions(lambda v: products.append(0) or matrix @ v, lambda w: matrix.T @ w, 40, 40)

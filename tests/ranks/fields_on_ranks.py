@@ -122,7 +122,7 @@ REFUSED = [
 
 
 def numpy_is_whole_or_refused():
-    """Arithmetic and sums are those of the whole array; other functions raise an error with their name."""
+    """Arithmetic and sums act on the whole array; other functions raise an error with their name."""
     for whole, u in fields():
         tol = 1e-6 if whole.dtype == np.float32 else 1e-13
         for act in ARITHMETIC + (ORDERED if whole.dtype.kind != "c" else []):

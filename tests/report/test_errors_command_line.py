@@ -423,7 +423,7 @@ def test_an_exit_as_a_command(ending, tmp_path, end):
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes do not fork here")
 def test_a_child_process_may_end_as_it_likes(ending, capsys):
-    """As those of multiprocessing do."""
+    """Child processes of multiprocessing end in this way."""
     ending(
         top="if not (child := os.fork()): os._exit(7)\nassert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7"
     )

@@ -82,7 +82,7 @@ def test_a_fold_at_the_end_of_the_range_ends_the_branch(error):
 
 
 def test_a_fold_has_no_derivative():
-    """The state moves by sqrt(d) at the distance d of the parameter from that of the fold."""
+    """The state moves by sqrt(d) if the parameter is at the distance d from the fold."""
     branch = dp.continuation(lambda x, p, s: s * cubic(x, p), np.array([-3.0]), -4.0, 4.0, 1.0)
     fold = branch.folds[1]
 

@@ -590,7 +590,7 @@ def test_errors_name_the_argument():
 
 
 def test_a_robin_condition_without_u_divides_by_b(rng):
-    """robin(0, b) with the value b g is neumann with the value g, and the dtype of whole numbers is that of floats."""
+    """robin(0, b) with the value b g is neumann with the value g, and whole numbers give float results."""
     grid = dp.Grid((8, 8), size=2.0, origin=-1.0)
     bodies = [
         dp.cut_cells(grid, lambda x, y: 0.7 - np.sqrt(x**2 + y**2), solid_boundary=wall)

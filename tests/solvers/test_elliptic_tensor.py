@@ -345,7 +345,7 @@ def test_values_at_walls_beside_a_tensor():
 @pytest.mark.whole
 @pytest.mark.parametrize("method", ["imex", "backward_euler", "crank_nicolson", "tr_bdf2"])
 def test_steps_with_a_tensor(method, rng):
-    """As the stiff part they are those of the matrix; as a rate they have a derivative in every entry."""
+    """As the stiff part they equal steps with the matrix; as a rate they have a derivative in every entry."""
     grid = dp.Grid((5, 4), size=1.0)
     D = dp.divergence(grid)
     G = dp.gradient(grid, WALLS)

@@ -157,7 +157,7 @@ class Layer:
 
 
 def test_a_singular_mass_is_that_of_the_constrained_system():
-    """The finite eigenvalues are those of the projection on the fields without divergence."""
+    """The finite eigenvalues are the eigenvalues of the projection on the fields without divergence."""
     layer = Layer(4)
 
     def flat(x):

@@ -181,7 +181,7 @@ def test_an_estimate_that_cancels_is_no_missing_constraint():
 
 @pytest.mark.whole
 def test_cells_of_many_diffusion_lengths():
-    """A cavity at up to 125 diffusion lengths a cell: the Schur complement is that of convection."""
+    """A cavity at up to 125 diffusion lengths a cell: convection dominates the Schur complement."""
     cavity = Cavity((8, 8), size=1.0)
     x = cavity.rest
     for reynolds in (100.0, 1000.0):

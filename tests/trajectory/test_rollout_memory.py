@@ -229,7 +229,7 @@ def test_peak_memory_of_a_step_without_other_arrays_is_the_budget(states, params
 
 
 def test_a_slightly_small_budget_warns():
-    """100 steps: the numbers of runs are those of the formula, the least budget is found by trying."""
+    """100 steps: the numbers of runs agree with the formula; the least budget is found by trials."""
     n = 100
     size = U0.nbytes
     runs = []
@@ -299,7 +299,7 @@ def test_a_hundred_thousand_steps(memory):
 
 
 def test_steps_that_solve_run_once_where_no_budget_is_given():
-    """Their tapes are kept beyond those of other steps: here 60 of more than 130 kB each."""
+    """Their tapes are kept longer than the tapes of other steps: here 60 of more than 130 kB each."""
     grid = dp.Grid((128, 128), size=1.0)
     step = dp.stepper("crank_nicolson", dp.laplacian(grid, dp.dirichlet), 1e-4)
     u = np.sin(3 * grid.centres()[0])

@@ -1,4 +1,5 @@
-"""Steps that are run again: what depends on more than its arguments is refused, or its gradient is that of one loop.
+"""Steps that are run again: what depends on more than its arguments is refused, or its gradient equals the gradient of
+a plain loop.
 
 The reference is a loop on the tape of autograd in which every step is called once, in order.
 """

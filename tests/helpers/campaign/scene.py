@@ -474,7 +474,7 @@ def check_close(scene, what, found, wanted, scale):
 
 
 def check_gradient(scene, what, found, wanted, values):
-    """Compare leaf by leaf, relative to the largest entry of the leaf and a little of that of all leaves."""
+    """Compare leaf by leaf, relative to its largest entry plus a small part of the largest entry of all leaves."""
     if set(found) != set(wanted):
         raise Mismatch(f"{what}: leaves {sorted(found)} for {sorted(wanted)}")
     largest = max(np.max(np.abs(leaf), initial=0.0) for leaf in wanted.values())
