@@ -360,8 +360,9 @@ class HalfInverse(LeastSquaresMethod):
     reference.
 
     On the two-scale problem of the reference (7 neurons, 30 weights, 256 samples, 300 iterations) all of 24 random
-    starts reach the published losses, 2.9e-3 for the scale 0.01 and 4.7e-4 for the scale 1. If a loss stays high,
-    `kept` of `update_direction` shows the rank of J; take another start.
+    starts reach the published losses, 2.9e-3 for the scale 0.01 and 4.7e-4 for the scale 1: with a truncation of 1e-5
+    or 1e-7, or with a longer first step, 2 to 7 of them do not. If a loss stays high, `kept` of `update_direction`
+    shows the rank of J; take another start.
 
     References
     ----------
