@@ -74,7 +74,8 @@ class ComponentStep:
     def vjp(self, g: NDArray, of_u: NDArray | None, of_inflow: NDArray, of_w: NDArray | None) -> None:
         """Compute cotangents from the cotangent g of the result: set `of_u` and `of_w`, and add to `of_inflow`.
 
-        If `of_u` is None, those of u and inflow are not computed; if `of_w` is None, that of w is not computed.
+        If `of_u` is None, the cotangents of u and inflow are not computed; if `of_w` is None, the cotangent of w is
+        not.
         """
         if of_u is not None:
             self.values.vjp(g, of_u, of_inflow)

@@ -1617,7 +1617,7 @@ class CompiledLoop:
         return translator.compile()
 
     def _write_cotangents(self, translator, results, step, cotangent_row, input_cotangents):
-        """Store the cotangents of the state, add those of params, and store those of the row of inputs."""
+        """Store the cotangents of the state and of the row of inputs, and add the cotangents of params."""
         n_state = len(self._states)
         n_params = len(self._params)
         for k, result in enumerate(results[:n_state]):

@@ -73,7 +73,26 @@ class ComponentGeometry(NamedTuple):
 
 
 def cut_faces(grid: Grid, level: Any) -> tuple[list[ComponentGeometry], Walls]:
-    """Return the geometry of both components, and the walls in cells, for a level set at the nodes, traced or not."""
+    """Return the geometry of both components, and the walls in cells.
+
+    Parameters
+    ----------
+    grid : Grid
+        In 2-D.
+    level : array, shape `grid.nodes.shape`, traced or not
+
+    Returns
+    -------
+    components : list of ComponentGeometry
+        One for each axis.
+    walls : Walls
+        The parts of the wall in cells.
+
+    Notes
+    -----
+    The level is interpolated to a grid with cells of half the size, whose geometry `cut_geometry` computes. Its parts
+    are collected to the control volumes of the faces.
+    """
     spacing = [np.repeat(0.5 * widths, 2) for widths in grid.widths]
     fine = Grid([2 * n for n in grid.shape], spacing=spacing, origin=grid.origin, periodic=grid.periodic)
     refine = sp.kron(_midpoint_interpolation(grid, 0), _midpoint_interpolation(grid, 1), format="csr")

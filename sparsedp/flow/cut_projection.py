@@ -54,7 +54,18 @@ class CutProjection(Reconstructible):
         return self._body.project(self._open_part(v), density)
 
     def pressure(self, v: Any, density: Any = None) -> Any:
-        """Return the p with P(v) = v + G(p) / density on open faces [velocity length, times the unit of density]."""
+        """Return the p with P(v) = v + G(p) / density on open faces.
+
+        Parameters
+        ----------
+        v : array on faces; leading axes are a batch
+        density : number or array on faces, optional
+            > 0. Default: 1.
+
+        Returns
+        -------
+        array on cells [velocity length, times the unit of density]
+        """
         return -self._body.potential(self._open_part(v), density)
 
     def _open_part(self, v):

@@ -681,7 +681,27 @@ def _check_speeds(what, argument, slowest, fastest):
 
 
 def checked_result(what: str, value: Any, u: Any) -> Any:
-    """Return the result of a user-supplied function as an array; raise unless it is real and has the shape of u."""
+    """Return the result of a user-supplied function as an array.
+
+    Parameters
+    ----------
+    what : str
+        Name in error messages.
+    value : array or list, traced or not
+    u : array
+        An array of the expected shape.
+
+    Returns
+    -------
+    array, shape of u
+
+    Raises
+    ------
+    ShapeError
+        If the result has another shape.
+    TypeError
+        If it does not hold real numbers, or is an array of another library.
+    """
     check_plain(what, value)
     if isinstance(value, (list, tuple)):
         value = anp.array(value)

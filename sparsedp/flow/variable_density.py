@@ -75,7 +75,28 @@ class WeightedProjection:
         self.solver = EllipticSolver(self._divergence, self._gradient, setup.settings)
 
     def face_density(self, density: Any, dtype: np.dtype) -> Any:
-        """Return a density on faces or as a number, given as a number, on cells or on faces; raise if it is invalid."""
+        """Return the density of the control volumes of faces, or a number.
+
+        Parameters
+        ----------
+        density : number or array
+            > 0 in the fluid; an array on cells or on faces, with one leading axis or without.
+        dtype : dtype
+            Dtype of the velocity, whose precision the result has.
+
+        Returns
+        -------
+        number or array on faces
+
+        Raises
+        ------
+        ShapeError
+            If an array has neither the shape of the cells nor of the faces.
+        TypeError
+            If the density does not hold real numbers.
+        ValueError, NonFiniteError
+            If the density is not > 0 and finite in the fluid.
+        """
         grid = self._open.domain.grid
         grid.backend.check("density in projection")
         value = density
@@ -111,6 +132,23 @@ class WeightedProjection:
         """Return the velocity without divergence, and the q of the module docstring.
 
         They are computed in double precision and rounded once, because ratios of densities multiply rounding errors.
+
+        Parameters
+        ----------
+        v : array on faces; leading axes are a batch
+        density : number or array on faces
+            As `face_density` returns it.
+
+        Returns
+        -------
+        w : array like v
+        q : array on cells
+            With the leading axes of v.
+
+        Raises
+        ------
+        NonFiniteError
+            If v contains NaN or infinity, or the reciprocal of the density overflows or is 0.
         """
         check_values(self._setup.check_faces, v)  # on walls too, where the values are not used
         check_values(_check_reciprocal, density)

@@ -123,7 +123,7 @@ def _jax_function(f, structure, like):
 
 
 class _ResultStructure:
-    """The tree structure of the result of a function: that of `like`, or else that of its first result.
+    """The tree structure of the result of a function: the structure of `like`, or else of its first result.
 
     The leaves of later results are reordered to this structure.
 

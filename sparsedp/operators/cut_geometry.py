@@ -105,7 +105,19 @@ def protect(*arrays: Any) -> None:
 
 
 def cut_geometry(grid: Grid, level: Any) -> CutGeometry:
-    """Return the geometry for the values of a level set at the nodes, traced or not."""
+    """Return the volumes, apertures and walls of the cells.
+
+    Parameters
+    ----------
+    grid : Grid
+    level : array, shape `grid.nodes.shape`, traced or not
+        > 0 in the fluid.
+
+    Returns
+    -------
+    CutGeometry
+        Differentiable in the level.
+    """
     dim = grid.dim
     level = anp.reshape(_scaled_level(grid, level), (-1,))
     positive = np.asarray(sample(level)) > 0
@@ -221,7 +233,20 @@ def _simplices(dim: int) -> NDArray[np.float64]:
 
 
 def sum_at_places(places: NDArray[np.int64], size: int | Space) -> Operator:
-    """Return the operator that adds the entries of a flat array at places of a field, given by their flat numbers."""
+    """Return the operator that adds the entries of a flat array to places of a field.
+
+    Parameters
+    ----------
+    places : int array, shape (m,)
+        Flat number of the place for each entry; it may occur several times.
+    size : int or Space
+        The space of the result, or the length of a flat result.
+
+    Returns
+    -------
+    Operator
+        From arrays of shape (m,). Its transpose reads the entries at the places.
+    """
     rows = size if isinstance(size, int) else size.size
     matrix = sp.csr_array((np.ones(places.size), (places, np.arange(places.size))), shape=(rows, places.size))
     return from_matrix(matrix, codomain=size, name="sum at places")

@@ -107,6 +107,14 @@ def find_multipliers(system: System) -> NDArray[np.bool_]:
     """Return for each unknown whether it belongs to a field whose diagonal entries are 0.
 
     Some of its entries may differ from 0, such as the one that fixes the constant of a pressure.
+
+    Parameters
+    ----------
+    system : System
+
+    Returns
+    -------
+    bool array, shape (n,)
     """
     is_unknown = _unknowns(system)
     is_zero = (system.matrix.diagonal() == 0) & is_unknown
