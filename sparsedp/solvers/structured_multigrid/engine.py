@@ -216,7 +216,7 @@ class Structured(Engine):
         inverse_root = padded_grid.cells(self.level.inverse_root)
         root = padded_grid.cells(self.level.root_diagonal)
         # Factors from a right-hand side to the one for the matrix with a unit diagonal.
-        self.factors = (inverse_root * volumes, inverse_root)
+        self.factors = (inverse_root * volumes, np.ascontiguousarray(inverse_root))
         # Factors from a residual of that matrix to one of A or A^T, up to 1 / scale: their maximum, and fields over it.
         gauges = (root / volumes, root)
         self.largest_gauges = tuple(float(gauge.max(initial=0.0)) or 1.0 for gauge in gauges)
@@ -253,10 +253,11 @@ class _ConjugateGradients:
         self.x, self.residual, self.image = engine.vectors
         self.direction = engine.direction
         self.plane_sums = engine.level.plane_sums
-        engine.vectors[...] = 0.0
-        self.direction[...] = 0.0
-        np.multiply(b_factors, b.reshape(b_factors.shape), out=self.padded_grid.cells(self.residual))
-        self.residual *= engine.scale / self.unit
+        vectors = (self.x, self.direction, self.residual, self.image)
+        data = (b_factors, np.ascontiguousarray(b))
+        self.padded_grid.run(
+            engine.loops.set_residual, *vectors, *data, self.padded_grid.sizes, engine.scale / self.unit
+        )
         self._update_solution(0.0)
 
     def iterate(self):
@@ -319,6 +320,8 @@ class _ConjugateGradients:
 
     def solution(self):
         """Return x as a flat field."""
-        values = self.padded_grid.cells(self.x) * self.solution_factors
-        values *= self.unit
+        values = np.empty(self.padded_grid.shape)
+        self.padded_grid.run(
+            self.engine.loops.copy_solution, values, self.x, self.solution_factors, self.padded_grid.sizes, self.unit
+        )
         return values.reshape(-1)

@@ -222,6 +222,49 @@ def combine(
 # ---- conjugate gradients -------------------------------------------------------------------------------------------
 
 
+@kernel("write1 ~write1 write1 write1 read1 read1 index1 real")
+def set_residual(
+    x: Reals,
+    p: Reals,
+    r: Reals,
+    q: Reals,
+    factors: Reals,
+    b: Reals,
+    sizes: Numbers,
+    scale: float,
+    start: int,
+    stop: int,
+) -> None:
+    """Set x, p and q to 0, and r to scale * factors * b; factors and b are fields without ghost cells."""
+    plane, width, _, lines, lead, n = sizes[:6]
+    for g in range(start, stop):
+        at = (GHOST_PLANES + g) * plane
+        solution, direction = x[at : at + plane], p[at : at + plane]
+        residual, image = r[at : at + plane], q[at : at + plane]
+        for k in range(plane):
+            solution[k] = 0.0
+            direction[k] = 0.0
+            residual[k] = 0.0
+            image[k] = 0.0
+        for j in range(lines):
+            first, place = lead + j * width + 1, (g * lines + j) * n
+            row, factor, data = residual[first : first + n], factors[place : place + n], b[place : place + n]
+            for k in range(n):
+                row[k] = scale * (factor[k] * data[k])
+
+
+@kernel("write1 write1 read1 index1 real")
+def copy_solution(out: Reals, x: Reals, factors: Reals, sizes: Numbers, unit: float, start: int, stop: int) -> None:
+    """Set out = unit * factors * x; out and factors are fields without ghost cells."""
+    plane, width, _, lines, lead, n = sizes[:6]
+    for g in range(start, stop):
+        for j in range(lines):
+            first, place = (GHOST_PLANES + g) * plane + lead + j * width + 1, (g * lines + j) * n
+            row, factor, solution = out[place : place + n], factors[place : place + n], x[first : first + n]
+            for k in range(n):
+                row[k] = unit * (factor[k] * solution[k])
+
+
 @kernel("write2 ~write1 write1 index1 index1 write1")
 def apply_matrix(
     c: Reals, x: Reals, out: Reals, steps: Numbers, sizes: Numbers, sums: Reals, start: int, stop: int
