@@ -15,6 +15,7 @@ from sparsedp.autodiff.program_trace import check_values
 from sparsedp.errors import ShapeError
 from sparsedp.grid.boundary_conditions import dirichlet, walls_of
 from sparsedp.operators.cut_geometry import sum_at_places
+from sparsedp.operators.cut_operators import in_dtype_of
 
 if TYPE_CHECKING:
     from sparsedp.advection.settings import TransportSettings
@@ -83,9 +84,9 @@ class CutTransport(Reconstructible):
         check_values(partial(check_stability, self._settings, limit=limit), dt, body.outflow_rates(v))
         entering = self._on_faces(inflow * np.ones(self.walls.size))
         if self._settings.scheme == "upwind":
-            return u + dt * self._rate(u, v, entering, 1)
+            return in_dtype_of(u, u + dt * self._rate(u, v, entering, 1))
         middle = u + dt * self._rate(u, v, entering, 2)
-        return 0.5 * (u + middle + dt * self._rate(middle, v, entering, 2))
+        return in_dtype_of(u, 0.5 * (u + middle + dt * self._rate(middle, v, entering, 2)))
 
     def _rate(self, u, v, entering, order):
         """Return the rate; on walls without inflow, the value of the cell enters."""

@@ -267,7 +267,7 @@ def flow_step(
     )
     settings = FlowSettings(**copied(arguments))  # copies: the caller may change the originals
     _check(settings)
-    return FlowStep(settings)
+    return FlowStep(settings.with_plain_numbers())
 
 
 def _check(settings: FlowSettings) -> None:
@@ -375,8 +375,6 @@ class FlowStep(Reconstructible):
         self.settings = settings
         self.grid = grid
         self.dt: Any = settings.dt
-        if not callable(settings.dt):
-            self.dt = float(settings.dt)
         self.project = projection(grid, settings.solid, settings.boundary)
         self.pressure = self.project.pressure
         self.divergence = divergence(grid)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from inspect import Signature, signature
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 if TYPE_CHECKING:
     from sparsedp.grid.grid import Grid
@@ -31,6 +33,25 @@ class FlowSettings:
     friction: Any
     inflow: Any
     density: Any
+
+    def with_plain_numbers(self) -> FlowSettings:
+        """Return the same settings with Python numbers in place of NumPy numbers.
+
+        The product of a NumPy number in double precision and a field in single precision is in double precision.
+        """
+        scalars = self.scalars
+        if scalars is not None:
+            scalars = {name: dict(entries) for name, entries in scalars.items()}
+            for entries in scalars.values():
+                if "diffusivity" in entries:
+                    entries["diffusivity"] = _plain_number(entries["diffusivity"])
+        return replace(
+            self,
+            dt=_plain_number(self.dt),
+            viscosity=_plain_number(self.viscosity),
+            density=_plain_number(self.density),
+            scalars=scalars,
+        )
 
     @property
     def strict(self) -> bool:
@@ -89,6 +110,13 @@ def needs_fields(argument: str, argument_value: Any, fields: tuple[str, ...]) ->
             "without default values"
         )
     raise TypeError(f"flow_step calls {argument} with {counts}, got a function of {expected}; write {advice}")
+
+
+def _plain_number(value: Any) -> Any:
+    """Return a Python number for a NumPy number or an array without axes, and any other value as it is."""
+    if isinstance(value, (np.generic, np.ndarray)) and value.ndim == 0:
+        return float(value)
+    return value
 
 
 def _signature(function: Any) -> Signature | None:

@@ -55,7 +55,7 @@ from sparsedp._utils.calls import public
 from sparsedp._utils.validation import check_choice, check_finite, check_function, check_kind, check_number
 from sparsedp.autodiff.derivative import entrywise
 from sparsedp.autodiff.program_trace import check_values
-from sparsedp.autodiff.tape import cast, dtype_of, plain, sample
+from sparsedp.autodiff.tape import cast, dtype_of, plain, real_dtype, sample
 from sparsedp.autodiff.tape_constants import constant
 from sparsedp.flow.finite_volumes import FiniteVolumes, check_positive, checked_result, sides_of
 from sparsedp.grid.boundary_conditions import outflow
@@ -394,6 +394,10 @@ class ShallowWater(FiniteVolumes):
         -------
         array like u
         """
+        return cast(self._friction_rate(u, params), real_dtype(dtype_of(u)))
+
+    def _friction_rate(self, u: Any, params: Any) -> Any:
+        """Return the rate of friction in double precision."""
         is_discharge = np.arange(len(u)) - 1 < self.grid.dim
         is_discharge[0] = False
         is_discharge = is_discharge.reshape(-1, *[1] * self.grid.dim)
@@ -574,14 +578,14 @@ class FrictionStep(Reconstructible):
         third = u / 3 + (2 / 3) * self._stage(second, params, dt)
         if self.law.manning is None:
             return cast(third, dtype_of(u))
-        slowing = dt * self.law.friction_rate(third, params)
+        slowing = dt * self.law._friction_rate(third, params)
         end = (third + dt * slowing * self.law.frictionless(third, params)) / (1.0 + slowing * slowing)
         return cast(end, dtype_of(u))
 
     def _stage(self, u: Any, params: Any, dt: Any) -> Any:
         """Return the state after an Euler step with implicit friction."""
         rate = self.law.frictionless(u, params)
-        return (u + dt * rate) / (1.0 + dt * self.law.friction_rate(u, params))
+        return (u + dt * rate) / (1.0 + dt * self.law._friction_rate(u, params))
 
     def __repr__(self) -> str:
         return f"<step of {self.law}>"

@@ -21,7 +21,7 @@ import scipy.sparse as sp
 
 from sparsedp._utils.validation import check_choice, check_finite, check_kind, check_plain, check_precision
 from sparsedp.autodiff.program_trace import check_values
-from sparsedp.autodiff.tape import cast, dtype_of, isbox, sample
+from sparsedp.autodiff.tape import cast, dtype_of, isbox, real_dtype, sample
 from sparsedp.errors import DerivativeError, ShapeError
 from sparsedp.grid.boundary_conditions import check_condition
 from sparsedp.operators.cut_face_values import FaceValues
@@ -358,7 +358,7 @@ class CutOperators(CutGrid):
         kind, advice = ("numbers", "") if order == 1 else ("real numbers", "; write u.real and u.imag")
         field = checked_field("u", u, self.grid.cells, self.is_fluid, kind, advice)
         v = self._face_field("v", v, "real numbers", "; write v.real")
-        entering = self._face_field("inflow", inflow)
+        entering = self._face_field("inflow", inflow, kind, advice.replace("u.", "inflow."))
         faces = self.grid.faces
         check_batches(("u", field, self.grid.cells), ("v", v, faces), ("inflow", entering, faces))
         if order == 1:
@@ -514,10 +514,11 @@ def _in_double(field):
 
 
 def in_dtype_of(field: Any, result: Any) -> Any:
-    """Return a real result in single precision if the field is in single precision."""
-    if dtype_of(result).kind != "f" or dtype_of(field).kind not in "fc":
+    """Return a result in single precision if the field is in single precision."""
+    if dtype_of(field).kind not in "fc":
         return result
-    return cast(result, np.result_type(dtype_of(field), np.float32))
+    least = np.complex64 if dtype_of(result).kind == "c" else np.float32
+    return cast(result, np.result_type(real_dtype(dtype_of(field)), least))
 
 
 def _check_not_negative(name, k):

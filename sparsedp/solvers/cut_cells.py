@@ -205,7 +205,7 @@ class CutCells(CutOperators):
 
         Returns
         -------
-        array of the shape and dtype of b; 0 in cells without fluid
+        array of the shape and precision of b; 0 in cells without fluid
             With the leading axes of `values` or `walls` if these have some.
 
         Raises

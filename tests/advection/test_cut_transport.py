@@ -60,6 +60,17 @@ def test_steps_around_a_body_are_conservative_and_stable(body, rng):
 
 
 @pytest.mark.parametrize("scheme", ["upwind", "van_leer"])
+def test_a_field_in_single_precision_stays_so(scheme, body, rng):
+    move = dp.transport(GRID, scheme, dp.dirichlet, solid=body)
+    u, v = rng.uniform(0.2, 1.0, GRID.shape), wind(body)
+    for dt in (0.01, np.float64(0.01), np.asarray(0.01)):
+        single = move(u.astype(np.float32), v, dt, np.float64(0.3))
+        assert single.dtype == np.float32
+        assert np.allclose(single, move(u, v, dt, 0.3), rtol=1e-6)
+    assert move(u.astype(int), v, 0.01).dtype == float
+
+
+@pytest.mark.parametrize("scheme", ["upwind", "van_leer"])
 def test_derivatives_in_all_arguments_and_the_shape(scheme, rng):
     u, weights = rng.standard_normal((2, *GRID.shape))
 

@@ -82,6 +82,10 @@ def test_without_friction_the_step_is_that_of_ssprk3():
     np.testing.assert_allclose(law.stepper(0.05)(u), dp.stepper("ssprk3", law, 0.05)(u), rtol=1e-12)
     coarse = law.stepper(0.05)(u.astype(np.float32))
     assert coarse.dtype == np.float32
+    friction = dp.shallow_water(grid, manning=np.full(8, 0.03)).friction_rate
+    single = friction(u.astype(np.float32))
+    assert single.dtype == np.float32
+    np.testing.assert_allclose(single, friction(u), rtol=1e-6)
     rough = dp.shallow_water(grid, manning=np.full(8, 0.03)).stepper(0.05)
     for other in (copy.deepcopy(rough), pickle.loads(pickle.dumps(rough)), dp.jit(rough)):
         np.testing.assert_allclose(other(u), rough(u), rtol=1e-14)

@@ -501,6 +501,26 @@ def test_functions_that_return_double_precision(number):
     assert value == energy(np.asarray(0.1))
 
 
+@pytest.mark.parametrize("implicit", [False, True])
+@pytest.mark.parametrize("density", [None, 1.5])
+def test_numbers_in_double_precision(implicit, density, rng):
+    """NumPy numbers do not change the precision of a flow; the step is the one with Python numbers, bit for bit."""
+    grid = dp.Grid((3, 4))
+    v, c = rng.standard_normal(grid.faces.size).astype(np.float32), rng.standard_normal(grid.shape).astype(np.float32)
+
+    def end(number):
+        scalars = {"c": {"diffusivity": number(0.02)}}
+        fluid = None if density is None else number(density)
+        step = dp.flow_step(grid, number(0.1), number(0.03), scalars=scalars, implicit=implicit, density=fluid)
+        state = step(step(step.start(v, None, {"c": c})))
+        return state["v"], state["p"], state["a"], state["s"]["c"], state["r"]["c"]
+
+    for number in (np.float64, np.asarray):
+        for ours, plain in zip(end(number), end(float), strict=True):
+            assert ours.dtype == np.float32
+            np.testing.assert_array_equal(ours, plain)
+
+
 def test_a_step_at_the_limit_in_single_precision():
     """A step length at the limit may be rounded up."""
     grid = dp.Grid((4, 4))

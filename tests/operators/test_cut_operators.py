@@ -265,6 +265,11 @@ def test_refused_arguments(body):
     ):
         body.advection(1j * u, k, order=2)
     with pytest.raises(
+        TypeError,
+        match="^inflow of cut_cells must hold real numbers, got dtype complex128; write inflow.real and inflow.imag$",
+    ):
+        body.advection(u, k, 1j, order=2)
+    with pytest.raises(
         TypeError, match="^u of cut_cells must be float32, float64, complex64 or complex128, got float16"
     ):
         body.gradient(u.astype(np.float16))

@@ -176,6 +176,10 @@ def test_dtypes_batches_and_coefficients():
         exact = function(*arguments)
         single = function(*(argument.astype(np.float32) for argument in arguments))
         assert single.dtype == np.float32 and np.allclose(single, exact, atol=1e-4 * np.max(abs(exact)))
+        wave = function((1j * arguments[0]).astype(np.complex64), *arguments[1:])
+        assert wave.dtype == np.complex64 and np.allclose(wave, 1j * exact, atol=1e-4 * np.max(abs(exact)) + 1e-12)
+    assert body.solve(ONES.astype(np.complex64)).dtype == np.complex64
+    assert body.solve(ONES.astype(np.float32), k=1 + 1j).dtype == np.complex64
     assert np.allclose(body.solve(np.stack([ONES, 3 * ONES]))[1], 3 * u, rtol=1e-12)
     assert np.allclose(body.solve(ONES * 1j), 1j * u, rtol=1e-12)
     assert np.allclose(body.solve(1e250 * ONES, k=1e200), 1e50 * u, rtol=1e-9)
