@@ -254,8 +254,10 @@ def laplacian(
     The truncation error is of order 2 inside the domain, and of order 1 (neumann) or 0 (dirichlet) next to a wall;
     solutions of Poisson problems are nevertheless second-order accurate. With ``order=4`` the truncation error is of
     order 2 next to a wall, and solutions are fourth-order accurate. The operator is then symmetric on periodic axes
-    only. Between walls a step of euler is stable for c dt <= 0.34 / sum(1 / h^2); `stepper` raises UnstableStepError
-    beyond the limit.
+    only. If all walls are neumann, the solutions of `inverse` and `elliptic_solver` have the integral 0 of a quadrature
+    of order 4, whose weights are not equal next to walls; their mean over the cells is therefore not exactly 0.
+    Between walls a step of euler is stable for c dt <= 0.34 / sum(1 / h^2); `stepper` raises UnstableStepError beyond
+    the limit.
 
     Values of the field in solid cells have no effect on the other cells. The result in a solid cell is the net flux
     through its faces to cells of the domain; linear solves exclude solid cells.

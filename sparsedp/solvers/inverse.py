@@ -120,7 +120,7 @@ def inverse(
     -----
     Null space: each connected component of the matrix has at most one null vector, which is computed in the set-up. The
     right-hand side is projected onto the range. For a pure Neumann problem the solution has volume-weighted mean 0 on
-    each singular component; nullspace.py describes the general case.
+    each singular component (order=4: see `laplacian`); nullspace.py describes the general case.
     Transpose: `inv.T` uses the same set-up and the same `rtol`. It projects its data onto the range, and never raises
     IncompatibleError.
     Triangular parts: "direct", "structured", "multigrid" and "auto" use substitution for the unknowns that do not
