@@ -23,7 +23,7 @@ from sparsedp._utils.validation import check_choice, check_finite, check_kind, c
 from sparsedp.autodiff.program_trace import check_values
 from sparsedp.autodiff.tape import cast, dtype_of, isbox, real_dtype, sample
 from sparsedp.errors import DerivativeError, ShapeError
-from sparsedp.grid.boundary_conditions import check_condition
+from sparsedp.grid.boundary_conditions import check_condition, resolve
 from sparsedp.operators.cut_face_values import FaceValues
 from sparsedp.operators.cut_geometry import sum_at_places
 from sparsedp.operators.cut_grid import CutGrid
@@ -56,13 +56,14 @@ class CutOperators(CutGrid):
     def __init__(self, grid: Grid, level: Any, boundary: Any, solid_boundary: Any) -> None:
         check_condition("solid_boundary", solid_boundary)
         self._gradient = gradient(grid, boundary)
+        self._sides = resolve(grid, boundary, patches=True)
         self.boundary = boundary
         self.solid_boundary = solid_boundary
         super().__init__(grid, level)
 
     # ------------------------------------------------------------ slopes and fluxes
 
-    def gradient(self, u: Any, walls: Any = None) -> Any:
+    def gradient(self, u: Any, walls: Any = None, values: Any = 0.0) -> Any:
         """Return the slopes on the faces, 0 on faces without fluid.
 
         Parameters
@@ -70,6 +71,8 @@ class CutOperators(CutGrid):
         u : array, a field on the cells
         walls : array, optional
             Values on the walls of the grid, as `lift` takes them. Default: 0.
+        values : number, or array of the shape of the grid
+            As for `slopes`. Used on walls of the grid with a condition on u, in a narrow gap between them and the body.
 
         Returns
         -------
@@ -87,16 +90,45 @@ class CutOperators(CutGrid):
         The slope of a face is the difference of the values in the centres of both cells, divided by their distance,
         also if the wall cuts the face. It is second-order accurate in the middle of the whole face.
         """
-        return in_dtype_of(u, self._slopes_on_faces(self._cell_field("u", u), walls))
+        self._check_batches("u", u, values, walls)
+        return in_dtype_of(u, self._slopes_on_faces(self._cell_field("u", u), walls, values))
 
-    def _slopes_on_faces(self, u, walls):
-        slopes = self._is_open * self._gradient(u)
-        if walls is not None:
-            slopes = slopes + self._slopes_of_walls(walls)
-        return slopes
+    def _slopes_on_faces(self, u, walls, values):
+        slopes = self._is_simple * self._gradient(u)
+        slope = self._wall_slope
+        if slope.faces.size:
+            terms = slope.coefficients * self._flat(u)[..., slope.cells]
+            of_faces = self._sum_of_pairs(terms)[..., self._geometry.cut.size :] * slope.signs
+            slopes = slopes + self._on_gap_faces(of_faces)
+        terms = self._slopes_of_values(walls, values)
+        return slopes if terms is None else slopes + terms
 
-    def _slopes_of_walls(self, walls):
-        """Return the part of the slopes on the faces that values on the walls of the grid add."""
+    def _slopes_of_values(self, walls, values):
+        """Return the part of the slopes on the faces that values on walls add, or None if there is none."""
+        slope = self._wall_slope
+        lifted = self._lifted(walls)
+        terms = None if walls is None else self._is_simple * lifted
+        if slope.faces.size:
+            _, on_faces = slope.terms_of_values(self._wall_values(values), lifted)
+            in_gaps = self._on_gap_faces(on_faces)
+            terms = in_gaps if terms is None else terms + in_gaps
+        return terms
+
+    @cached_property
+    def _is_simple(self):
+        """The open faces whose slope is that of the operator `gradient`: all but those of `_wall_slope`."""
+        is_simple = self._is_open.copy()
+        is_simple[self._wall_slope.faces] = False
+        return is_simple
+
+    @cached_property
+    def _on_gap_faces(self) -> Operator:
+        return sum_at_places(self._wall_slope.faces, self.grid.faces)
+
+    def _lifted(self, walls):
+        """Return what values on the walls of the grid add to the operator `gradient`, a field on the faces, or 0."""
+        if walls is None:
+            return 0.0
         check_plain("walls of cut_cells", walls)
         slopes = anp.where(self._is_open, self._lift(walls), 0.0)
         check_values(partial(check_finite, "walls of cut_cells, on their faces,"), slopes)
@@ -140,7 +172,7 @@ class CutOperators(CutGrid):
         """
         return in_dtype_of(v, self._outflow(self.apertures * self._face_field("v", v)) / self._divisors)
 
-    def slopes(self, u: Any, values: Any = 0.0) -> Any:
+    def slopes(self, u: Any, values: Any = 0.0, walls: Any = None) -> Any:
         """Return the slope du/dn at the wall, where n points out of the fluid into the body.
 
         Parameters
@@ -149,6 +181,8 @@ class CutOperators(CutGrid):
         values : number, or array of the shape of the grid
             Values of the condition at `centroids`: u for dirichlet, du/dn for neumann, a u + b du/dn for robin. Not
             used in cells without wall.
+        walls : array, optional
+            As for `gradient`. Used in narrow gaps between the body and a wall of the grid with a condition on u.
 
         Returns
         -------
@@ -161,18 +195,18 @@ class CutOperators(CutGrid):
         NonFiniteError
             If an argument contains NaN or infinity where it is used.
         """
-        check_batches(("u", u, self.grid.cells), ("values", values, self.grid.cells))
-        slopes = self._slopes_at_walls(self._cell_field("u", u), self._wall_values(values))
+        self._check_batches("u", u, values, walls)
+        slopes = self._slopes_at_walls(self._cell_field("u", u), self._wall_values(values), self._lifted(walls))
         return in_dtype_of(u, self._at_walls(slopes))
 
-    def flux(self, u: Any, values: Any = 0.0, k: Any = 1.0, wall_k: Any = None) -> Any:
+    def flux(self, u: Any, values: Any = 0.0, k: Any = 1.0, wall_k: Any = None, walls: Any = None) -> Any:
         """Return the integral of k du/dn over the wall in each cell; its sum is what enters the fluid through the wall.
 
         The diffusive flux into the body is minus this sum.
 
         Parameters
         ----------
-        u, values
+        u, values, walls
             As for `slopes`.
         k : number or array, a field on the faces, >= 0
         wall_k : number or array of the shape of the grid, >= 0, optional
@@ -191,8 +225,8 @@ class CutOperators(CutGrid):
         ValueError
             If k or wall_k is negative.
         """
-        self._check_batches_of_diffusion("u", u, values, None, k, wall_k)
-        return in_dtype_of(u, self._flux_into_walls(self._cell_field("u", u), values, k, wall_k))
+        self._check_batches_of_diffusion("u", u, values, walls, k, wall_k)
+        return in_dtype_of(u, self._flux_into_walls(self._cell_field("u", u), values, k, wall_k, walls))
 
     def diffusion(self, u: Any, values: Any = 0.0, walls: Any = None, k: Any = 1.0, wall_k: Any = None) -> Any:
         """Return div(k grad u), averaged over the fluid of each cell: the rate of an explicit or implicit time step.
@@ -219,38 +253,41 @@ class CutOperators(CutGrid):
         """
         self._check_batches_of_diffusion("u", u, values, walls, k, wall_k)
         field = self._cell_field("u", u)
-        through_faces = self.apertures * self._coefficient(k) * self._slopes_on_faces(field, walls)
-        total = self._outflow(through_faces) + self._flux_into_walls(field, values, k, wall_k)
+        through_faces = self.apertures * self._coefficient(k) * self._slopes_on_faces(field, walls, values)
+        total = self._outflow(through_faces) + self._flux_into_walls(field, values, k, wall_k, walls)
         return in_dtype_of(u, total / self._divisors)
 
     def _check_batches_of_diffusion(self, name, field, values, walls, k, wall_k):
         cells, faces = self.grid.cells, self.grid.faces
-        arguments = [(name, field, cells), ("values", values, cells), ("k", k, faces)]
-        if walls is not None:
-            arguments.append(("walls", walls, self._lift.domain))
+        arguments = [("k", k, faces)]
         if wall_k is not None:
             arguments.append(("wall_k", wall_k, cells))
-        check_batches(*arguments)
+        self._check_batches(name, field, values, walls, *arguments)
 
-    def _flux_into_walls(self, u, values, k, wall_k):
-        slopes = self._slopes_at_walls(u, self._wall_values(values))
+    def _check_batches(self, name, field, values, walls, *arguments):
+        cells = self.grid.cells
+        of_walls = [] if walls is None else [("walls", walls, self._lift.domain)]
+        check_batches((name, field, cells), ("values", values, cells), *of_walls, *arguments)
+
+    def _flux_into_walls(self, u, values, k, wall_k, walls):
+        slopes = self._slopes_at_walls(u, self._wall_values(values), self._lifted(walls))
         return self._at_walls(self._geometry.areas * self._wall_coefficient(k, wall_k) * slopes)
 
-    def _slopes_at_walls(self, u, values):
-        """Return the slopes in the cut cells, for a checked field and given values in the cut cells."""
+    def _slopes_at_walls(self, u, values, lifted):
+        """Return the slopes in the cut cells, for a checked field and given values in the cut cells and on the grid."""
         if not self.solid_boundary.a:
             return values / self.solid_boundary.b + 0.0 * self._in_cut_cells(u)  # of the shape of a batch
         slope = self._wall_slope
         terms = slope.coefficients * self._flat(u)[..., slope.cells]
-        return self._sum_of_pairs(terms) + slope.terms_of_values(values)
+        return self._sum_of_pairs(terms)[..., : self._geometry.cut.size] + slope.terms_of_values(values, lifted)[0]
 
     @cached_property
     def _wall_slope(self) -> WallSlope:
-        return wall_slope(self.grid, self._geometry, self.solid_boundary)
+        return wall_slope(self.grid, self._geometry, self.solid_boundary, self._sides)
 
     @cached_property
     def _sum_of_pairs(self) -> Operator:
-        return sum_at_places(self._wall_slope.walls, self._geometry.cut.size)
+        return sum_at_places(self._wall_slope.walls, self._wall_slope.scales.size)
 
     # ------------------------------------------------------------ the matrix of diffusion
 
@@ -289,17 +326,26 @@ class CutOperators(CutGrid):
         coefficient = self.apertures * self._coefficient(k)
         shifts = self.volumes * self._cell_field("shift", shift)
         entries = [factors * coefficient[faces], anp.reshape(shifts, (-1,))]
-        if self.solid_boundary.a:
-            slope = self._wall_slope
-            weights = self._geometry.areas * self._wall_coefficient(k, wall_k)
-            all_rows.append(self._geometry.cut[slope.walls])
+        slope = self._wall_slope
+        if slope.walls.size:
+            cells_of_faces, areas = self._cells_and_areas_of_gap_faces
+            in_cells = self._geometry.areas * self._wall_coefficient(k, wall_k)
+            weights = anp.concatenate([in_cells, coefficient[slope.faces] * areas])
+            rows_of_walls = np.concatenate([self._geometry.cut, cells_of_faces])
+            all_rows.append(rows_of_walls[slope.walls])
             all_columns.append(slope.cells)
             entries.append(-(weights[slope.walls] * slope.coefficients))
         return np.concatenate(all_rows), np.concatenate(all_columns), anp.concatenate(entries)
 
     @cached_property
+    def _cells_and_areas_of_gap_faces(self):
+        """The flat numbers of the cells, and the areas of the whole faces."""
+        entries = sp.csc_array(abs(self._outflow.matrix))[:, self._wall_slope.faces]
+        return entries.indices, entries.data
+
+    @cached_property
     def _entries_of_faces(self):
-        """Rows, columns, faces and factors of -(outflow @ diag(apertures k) @ gradient), for open faces."""
+        """Rows, columns, faces and factors of -(outflow @ diag(apertures k) @ gradient), for the faces `_is_simple`."""
         outflow = sp.csr_array(self._outflow.matrix)
         slope = sp.csr_array(self._gradient.matrix)
         lengths = np.diff(slope.indptr)[outflow.indices]
@@ -307,16 +353,16 @@ class CutOperators(CutGrid):
         of_outflow = np.repeat(np.arange(lengths.size), lengths)
         of_slope = np.arange(of_outflow.size) + (slope.indptr[outflow.indices] - first)[of_outflow]
         faces = outflow.indices[of_outflow]
-        is_open = self._is_open[faces]
+        is_open = self._is_simple[faces]
         rows = np.repeat(np.arange(outflow.shape[0]), np.diff(outflow.indptr))[of_outflow]
         factors = -outflow.data[of_outflow] * slope.data[of_slope]
         return rows[is_open], slope.indices[of_slope][is_open], faces[is_open], factors[is_open]
 
-    def _terms_of_values(self, values, k, wall_k):
+    def _terms_of_values(self, values, k, wall_k, walls):
         """Return the part of the flux through the wall that does not depend on u, for each cut cell."""
         values = self._wall_values(values)
         if self.solid_boundary.a:
-            slopes = self._wall_slope.terms_of_values(values)
+            slopes, _ = self._wall_slope.terms_of_values(values, self._lifted(walls))
         else:
             slopes = values / self.solid_boundary.b
         return self._geometry.areas * self._wall_coefficient(k, wall_k) * slopes

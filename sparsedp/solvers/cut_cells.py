@@ -94,7 +94,8 @@ def cut_cells(
     **Geometry.** The level is linear in each of the 4 triangles (24 tetrahedra in 3-D) between the centre of a cell and
     its edges, so that plane walls are exact. Parts of a body that are thinner than a cell are not resolved. In gaps
     narrower than about 1.5 cells, u is the mean over the fluid of the cell, and the slope at the wall is that of a
-    parabola between two walls.
+    parabola between two walls. In gaps of up to 2 cells between the body and a wall of the grid (0.6 cells if the body
+    has a neumann condition), the mean of u over the gap and the slopes at both walls are those of a parabola, too.
 
     **Derivatives.** In the level, the right-hand side, the wall values and the coefficients, forward and reverse, to
     every order. As a function of the level the solution is continuous, with kinks where the wall passes a node or a
@@ -252,9 +253,12 @@ class CutCells(CutOperators):
                 )
         self._check_batches_of_diffusion("b", b, values, walls, k, wall_k)
         rows, columns, entries = self._entries(k, wall_k, shift)
-        right = self.volumes * self._cell_field("b", b) + self._at_walls(self._terms_of_values(values, k, wall_k))
-        if walls is not None:
-            right = right + self._outflow(self.apertures * self._coefficient(k) * self._slopes_of_walls(walls))
+        right = self.volumes * self._cell_field("b", b) + self._at_walls(
+            self._terms_of_values(values, k, wall_k, walls)
+        )
+        slopes = self._slopes_of_values(walls, values)
+        if slopes is not None:
+            right = right + self._outflow(self.apertures * self._coefficient(k) * slopes)
         solver = self._solver(rows, columns, nullspace)
         self.info = solver.info
         return in_dtype_of(b, solver.solve_with_weights(entries, self.is_fluid * right, self.volumes))

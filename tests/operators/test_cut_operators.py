@@ -63,6 +63,119 @@ def test_the_slope_in_a_gap_has_derivatives():
     assert np.isclose(dp.grad(size)(0.7), (size(0.7 + h) - size(0.7 - h)) / (2 * h), rtol=1e-6)
 
 
+CONDITIONS_OF_GRID_GAPS = [
+    (dp.dirichlet, dp.dirichlet),
+    (dp.dirichlet, dp.neumann),
+    (dp.neumann, dp.dirichlet),
+    (dp.robin(1.0, 0.2), dp.dirichlet),
+    (dp.dirichlet, dp.robin(2.0, 0.6)),
+    (dp.robin(1.0, 0.2), dp.robin(1.0, 0.5)),
+]
+
+
+def gap_at_the_grid(width, conditions, upper):
+    """The fluid between a plane body and a wall of the grid; the height above the body of points."""
+    grid = dp.Grid((4, 9))
+    height = (lambda y: y - 9.0 + width) if upper else (lambda y: width - y)
+    solid, wall = conditions
+    sides = {"x": dp.dirichlet, "y": (dp.neumann, wall) if upper else (wall, dp.neumann)}
+    return dp.cut_cells(grid, lambda x, y: height(y), sides, solid), height
+
+
+def check_gap_at_the_grid(width, conditions, upper, tolerance):
+    """-u'' = q, with values on both walls, against the exact integrals, and linear fields."""
+    solid, wall = conditions
+    gap, height = gap_at_the_grid(width, conditions, upper)
+    grid = gap.grid
+    domain = dp.lift(grid, gap.boundary).domain
+    x, y = grid.centres()
+    # A field that is linear along and across the gap.
+    value = lambda x, y: 1.0 + 2.0 * x + 3.0 * height(y)
+    xw, yw = gap.centroids
+    values = solid.a * value(xw, yw) - 3.0 * solid.b
+    end = 9.0 if upper else 0.0
+    of_wall = wall.a * value(x[:, 0], end) + 3.0 * wall.b
+    ends = (0.0, of_wall) if upper else (of_wall, 0.0)
+    exact = value(*np.broadcast_arrays(x, y))
+    walls = domain.join(exact[0] - 1.0, exact[-1] + 1.0, *ends)
+    u = gap.solve(np.zeros(grid.shape), values, walls)
+    assert np.allclose(u, exact * gap.is_fluid, atol=1e-4)
+    assert np.allclose(gap.slopes(u, values, walls), -3.0 * (gap.areas > 0), atol=1e-3)
+    assert np.allclose(gap.diffusion(u, values, walls) * gap.volumes, 0.0, atol=1e-9)
+    # A source: u = c + s h - h^2 / 2, the same along the gap.
+    plain = dp.cut_cells(grid, lambda x, y: height(y), {"y": gap.boundary["y"]}, solid)
+    u = plain.solve(np.ones(grid.shape))
+    s, c = solve_gap(width, solid, wall)
+    integral = c * width + s * width**2 / 2 - width**3 / 6
+    assert np.isclose(np.sum(plain.volumes * u) / 4, integral, rtol=tolerance)
+    assert np.isclose(np.sum(plain.flux(u)) / 4, -s, rtol=tolerance, atol=1e-9)
+
+
+def solve_gap(width, solid, wall):
+    """The s and c of u = c + s h - h^2 / 2 with homogeneous conditions on both walls."""
+    matrix = [[-solid.b, solid.a], [wall.a * width + wall.b, wall.a]]
+    return np.linalg.solve(matrix, [0.0, wall.a * width**2 / 2 + wall.b * width])
+
+
+@pytest.mark.parametrize("conditions", CONDITIONS_OF_GRID_GAPS[::2], ids=repr)
+def test_gaps_between_the_body_and_a_wall_of_the_grid(conditions):
+    """The integral of the solution and the fluxes are exact; 1.3 to 3.9 times too large if only the body is a wall."""
+    check_gap_at_the_grid(0.3, conditions, False, 1e-4)
+    check_gap_at_the_grid(1.45 if conditions[0].a else 0.55, conditions, True, 1e-4)
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("upper", [False, True])
+@pytest.mark.parametrize("conditions", CONDITIONS_OF_GRID_GAPS, ids=repr)
+def test_gaps_of_all_widths_between_the_body_and_a_wall_of_the_grid(conditions, upper):
+    for width in (0.05, 0.5, 1.0, 1.05, 1.5, 1.9, 2.0, 2.2, 2.5, 3.3, 4.0):
+        if conditions[0].a:
+            check_gap_at_the_grid(width, conditions, upper, 1.5e-3 if width <= 2.0 else 0.12)
+        elif width <= 0.6:
+            check_gap_at_the_grid(width, conditions, upper, 1.5e-3)
+
+
+@pytest.mark.whole
+def test_derivatives_in_a_gap_at_a_wall_of_the_grid():
+    """The integral over a gap of the width w is w^3 / 12, in both modes; and the second derivative."""
+
+    def size(width):
+        gap = dp.cut_cells(dp.Grid((2, 6)), lambda x, y: y - 6.0 + width, {"y": dp.dirichlet}, dp.dirichlet)
+        return np.sum(gap.volumes * gap.solve(np.ones((2, 6)))) / 2
+
+    assert np.isclose(dp.grad(size)(0.4), 0.04, rtol=1e-4)
+    assert np.isclose(dp.grad(dp.grad(size))(1.3), 0.65, rtol=1e-3)
+    h = 1e-5
+    between = 2.2  # between both slopes
+    assert np.isclose(dp.grad(size)(between), (size(between + h) - size(between - h)) / (2 * h), rtol=1e-6)
+
+
+@pytest.mark.whole
+def test_derivatives_in_the_values_of_a_gap_at_a_wall_of_the_grid(rng):
+    gap, _ = gap_at_the_grid(1.3, (dp.dirichlet, dp.robin(1.0, 0.4)), True)
+    domain = dp.lift(gap.grid, gap.boundary).domain
+    weights = rng.standard_normal((3, *gap.grid.shape))
+
+    def loss(values, walls, b):
+        u = gap.solve(b, values, walls)
+        flux = gap.flux(u, values, walls=walls)
+        return np.sum(weights[0] * u + weights[1] * flux + weights[2] * gap.diffusion(u**2, values, walls))
+
+    arguments = rng.standard_normal(gap.grid.shape), rng.standard_normal(domain.size), np.ones(gap.grid.shape)
+    for place in range(3):
+        function = lambda x, place=place: loss(*arguments[:place], x, *arguments[place + 1 :])
+        assert dp.check.gradient(function, arguments[place], quick=True).verdict == "agrees"
+
+
+def test_a_wall_of_the_grid_aside_is_no_gap():
+    """A body whose wall is normal to a wall of the grid: the slope is that of the fit, without values on the grid."""
+    grid = dp.Grid((9, 6))
+    wall = dp.cut_cells(grid, lambda x, y: x - 4.3, {"y": dp.dirichlet}, dp.dirichlet)
+    x, _ = grid.centres()
+    u = (x - 4.3) * np.ones(grid.shape)
+    assert np.allclose(wall.slopes(u), -1.0 * (wall.areas > 0), atol=1e-9)
+
+
 def test_plane_walls_are_no_gaps(rng):
     """The slope at a plane wall equals the slope of the fit, in each direction: exact for quadratic fields."""
     grid = dp.Grid((14, 13), size=(1.1, 0.9))
