@@ -171,7 +171,8 @@ def flow_step(
         values of scalars are functions, it holds these as "values"; if `dt` is a function, the step length as "dt"; if
         an implicit viscosity depends on the shear rate, the previous velocity as "before"; if an implicit diffusivity
         depends on scalars, the previous scalars as "s_before". With a density, the pressure has the unit
-        [density velocity^2].
+        [density velocity^2]. The pressure of a state belongs to the middle of the step before it: it has order 2 there,
+        and order 1 in dt at the time of the velocity.
 
     Raises
     ------

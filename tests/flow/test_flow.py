@@ -347,3 +347,22 @@ def test_deprecated_name_of_the_pressure_gradient():
     step = dp.flow_step(dp.Grid((2, 2)), 0.1)
     with pytest.warns(DeprecationWarning, match="FlowStep.slope is deprecated .* write FlowStep.pressure_gradient"):
         assert step.slope is step.pressure_gradient
+
+
+def test_the_pressure_belongs_to_the_middle_of_the_step():
+    """A force that is a gradient and oscillates is balanced by the pressure."""
+    grid = dp.Grid((6, 5), size=1.0)
+    x, y = grid.centres()
+    potential = np.cos(np.pi * x) * np.cos(np.pi * y)
+    push = dp.gradient(grid)(potential)
+    errors = []
+    for n in (20, 40):
+        dt = 1.0 / n
+        step = dp.flow_step(grid, dt, force=lambda v, t: np.sin(t) * push)
+        state = step.start(np.zeros(grid.faces.size), 0.0)
+        for i in range(n):
+            state = step(state, i * dt)
+        middle, end = (np.max(abs(state["p"] - np.sin(t) * potential)) for t in (1.0 - dt / 2, 1.0))
+        errors.append((middle, end))
+    orders = np.log2(np.divide(*errors))
+    assert abs(orders[0] - 2.0) < 0.1 and abs(orders[1] - 1.0) < 0.1
