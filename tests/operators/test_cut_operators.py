@@ -302,6 +302,31 @@ def test_advection_of_order_2_is_exact_for_linear_fields(rng):
     assert np.allclose(body.advection(ones, body.project(v), 1.0, order=2), 0.0, atol=1e-9)  # constants are kept
 
 
+@pytest.mark.parametrize("upper", [False, True])
+def test_advection_of_order_2_is_continuous_where_the_flow_turns_at_a_wall(upper, rng):
+    """The slope in the cell at the wall changes with the direction of the flow, while fluid crosses its other face."""
+    grid = dp.Grid((6, 3), size=1.0)
+    plain = dp.cut_cells(grid, np.ones(grid.nodes.shape))
+    x, _ = grid.centres()
+    u = (x**2 if upper else (1 - x) ** 2) + 0.0 * grid.centres()[1]
+    x_faces = np.ones(grid.faces.parts[0])
+    place = -1 if upper else 0
+
+    def rate(speed):
+        at_wall = np.zeros(x_faces.shape)
+        at_wall[place] = 1.0
+        v = grid.join((1.0 - at_wall) * x_faces + speed * at_wall, 0.0)
+        return plain.advection(u, v, inflow=2.0, order=2)
+
+    inside, outside = (rate(sign * 1e-9 * (-1.0 if upper else 1.0)) for sign in (1.0, -1.0))
+    assert np.allclose(inside, outside, atol=1e-6)
+    entering = rate(-1.0 if upper else 1.0)
+    assert np.max(abs(entering - inside)) > 0.1
+    for speed in (0.05, -0.05, 0.3):
+        direction = dp.jvp(rate, speed, 1.0)[1]
+        assert np.allclose(direction, (rate(speed + 1e-6) - rate(speed - 1e-6)) / 2e-6, atol=1e-6)
+
+
 def test_derivatives_of_advection_of_order_2(rng):
     body, v, ink = rotating_cylinder(8)
     weights, tangent = rng.standard_normal((2, 8, 8))
