@@ -129,7 +129,10 @@ def cut_flow(
     -----
     **Derivatives.** In the viscosity, the given velocities, the level and the velocity of the body, forward and
     reverse, to every order: the derivative of the force in the shape of the body. Where the wall passes a node or a
-    centre of the grid, the derivative in the level is one-sided, and the force may jump by about 1e-4 of it.
+    centre of the grid, the derivative in the level is one-sided. The force jumps there, because other faces are open:
+    by about 1e-4 of it where the wall passes one node, but where a whole edge lies on faces by up to the error of the
+    force. For a square in a channel with 4 cells along each edge (Reynolds number 20), this is 12 %; with 8 and 16
+    cells, 2 % and 0.2 %. Do not place straight walls on the lines of the grid if you differentiate in the level.
 
     **Resolution.** Parts of a body that are thinner than a cell, and gaps that are narrower than two, are not resolved.
 

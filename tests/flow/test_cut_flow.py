@@ -288,3 +288,23 @@ def test_the_derivative_in_the_level_of_a_closed_box_with_a_moving_wall():
 
     slope = (energy(0.35 + 1e-5) - energy(0.35 - 1e-5)) / 2e-5
     assert dp.grad(energy)(0.35) == pytest.approx(slope, rel=1e-6)
+
+
+@pytest.mark.whole
+def test_the_jump_of_the_force_on_a_square_on_grid_lines_decreases_with_the_cells():
+    """Its edges lie on faces, which are open if the body is smaller by 1e-9: 12, 2 and 0.2 % with 4, 8 and 16 cells."""
+    jumps = []
+    for n in (4, 8, 16):
+        grid = dp.Grid((3 * n, 2 * n), size=(3.0, 2.0))
+        v = grid.join(np.ones(grid.faces.parts[0]), 0.0)
+        sides = {"x": (dp.inflow, dp.outflow), "y": dp.no_slip}
+
+        def drag(shift, grid=grid, v=v, sides=sides):
+            level = lambda x, y: np.maximum(abs(x - 1.0), abs(y - 1.0)) - 0.5 + shift
+            flow = dp.cut_flow(grid, level, sides)
+            return flow.force(flow.steady(0.05, v), 0.05)[0]
+
+        on_lines = drag(0.0)
+        assert np.isclose(drag(-1e-9), on_lines, rtol=1e-6)
+        jumps.append(abs(drag(1e-9) / on_lines - 1.0))
+    assert jumps[0] < 0.13 and jumps[1] < jumps[0] / 4 and jumps[2] < jumps[1] / 4
