@@ -89,6 +89,7 @@ def run(count, seed, before=0):
     return tally
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(("count", "seed"), [(10, 5), pytest.param(40, 4, marks=pytest.mark.whole)])
 def test_a_few_scenes(count, seed):
     tally = run(count, seed)

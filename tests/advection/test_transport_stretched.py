@@ -33,7 +33,7 @@ def scene(shape, periodic, scheme, form, interpolation="linear", of="cells", vel
     return move, (rng.standard_normal(move.space.shape), v, 0.31, 0.4)
 
 
-@pytest.mark.sampled
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("boundary", [dp.neumann, dp.dirichlet], ids=repr)
 @pytest.mark.parametrize(("scheme", "form"), SCHEMES)
 @pytest.mark.parametrize(("shape", "periodic"), GRIDS)
@@ -71,7 +71,7 @@ def test_zero_velocity_is_the_identity_with_a_two_sided_mean_slope(scheme, form,
             assert slope[k] == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-5, abs=1e-6)
 
 
-@pytest.mark.sampled
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
 @pytest.mark.parametrize(("scheme", "form"), SCHEMES)
 def test_gradient_agrees_with_differences(scheme, form, interpolation):
@@ -110,6 +110,7 @@ def error(n, options):
     return np.sqrt(np.sum(grid.volumes * (value - wave(0.0)) ** 2)), abs(slopes[0] - slopes[1])
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize(
     ("options", "least", "most", "sizes"),
     [

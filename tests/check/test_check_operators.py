@@ -253,6 +253,7 @@ def test_a_check_draws_from_its_own_generator():
     assert dp.check.transpose(RIGHT["gradient"], seeds=2, rng=7).ok
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("method", ["auto", "direct", "separable", "krylov", "multigrid"])
 def test_an_inverse_is_an_operator_too(method, drawn):
     """Judged by its rtol: what an iteration leaves is not a mistake, 0.1 % in the transpose is."""

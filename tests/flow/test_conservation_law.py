@@ -76,6 +76,7 @@ def sod(x, time):
     return np.select([s < -cl, s < v - c, s < v, s < shock], [left[0], fan, behind_fan, behind_shock], right[0])
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize(("speed", "most"), [(euler_speed, 0.002), (rusanov(euler_speed), 0.0023)])
 def test_sod(speed, most):
     """Mean error of the density with 400 cells; the required accuracy is 0.004."""

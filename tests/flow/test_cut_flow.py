@@ -123,6 +123,7 @@ def test_a_body_may_cross_a_periodic_side():
         assert np.allclose(force(axis, place), middle, rtol=1e-8, atol=1e-10)
 
 
+@pytest.mark.whole
 def test_tiny_cells_do_no_harm():
     """Wherever the wall passes, force and velocities change little."""
     found = []
@@ -167,6 +168,7 @@ def test_public_arrays_are_read_only():
             array[0] = 0
 
 
+@pytest.mark.whole
 def test_published_drag_and_lift_of_a_cylinder():
     """DFG benchmark 2D-1 at 20 cells a diameter; the grid is stretched behind the cylinder."""
     h = 0.005

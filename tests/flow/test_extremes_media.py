@@ -68,6 +68,7 @@ def test_projection(contrast, solids):
         agree(project(v, np.where(solid, 1e-300, density)), matrix @ v)
 
 
+@pytest.mark.sampled(0)
 @CONTRASTS
 @pytest.mark.parametrize("solids", [False, True])
 def test_a_step(contrast, solids):
@@ -85,6 +86,7 @@ def test_a_step(contrast, solids):
     agree(end["v"], project @ predicted, rel=1e-7)
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("shape", FEW)
 def test_few_cells(shape):
     """As one number, where all cells are of one kind; with a contrast, without divergence."""

@@ -92,6 +92,7 @@ def test_without_friction_the_step_is_that_of_ssprk3():
     assert repr(rough) == "<step of <shallow_water van_leer: cells(8)>>"
 
 
+@pytest.mark.whole
 def test_derivatives_of_steps_with_friction():
     """In the state, the coefficient in every cell, gravity and the length of the steps; also where water stands."""
     grid = dp.Grid(6)

@@ -30,7 +30,7 @@ def test_speeds_in_a_channel_between_solid_rows():
     np.testing.assert_allclose(speeds, [0, 0.10862927, 0.2104785, 0.2104785, 0.10862927, 0], rtol=1e-7)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled(0)
 @IN_SOLIDS
 @pytest.mark.parametrize("implicit", [False, True])
 def test_viscosity_in_solids(in_solids, implicit, rng):
@@ -136,7 +136,7 @@ def test_the_stress_has_a_twin(rng):
     assert np.all(np.isfinite(tangent))
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("where", ["cells", "faces"])
 @IN_SOLIDS
 def test_density_in_solids(where, in_solids, rng):

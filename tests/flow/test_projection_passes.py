@@ -24,6 +24,7 @@ def projections(shape):
                     yield grid, P.setup
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.skipif(not kernels.compiled(), reason="numba is not installed")
 @pytest.mark.parametrize("shape", SHAPES)
 def test_compiled_passes_agree_with_the_operators(shape):

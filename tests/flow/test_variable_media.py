@@ -480,6 +480,7 @@ def test_limit_of_the_courant_number():
                 step(step.start(wind))
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("number", [float, np.float64, np.asarray])
 def test_functions_that_return_double_precision(number):
     """A flow in single precision stays so, forward and in its derivative."""
@@ -501,6 +502,7 @@ def test_functions_that_return_double_precision(number):
     assert value == energy(np.asarray(0.1))
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("implicit", [False, True])
 @pytest.mark.parametrize("density", [None, 1.5])
 def test_numbers_in_double_precision(implicit, density, rng):

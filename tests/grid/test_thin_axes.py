@@ -68,6 +68,7 @@ def projections(grid, rng, most):
                 assert "enters a region without an outflow" in str(error)
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_projection(shape, grids, most, rng):
     """P, its transpose, the pressure, and their transposes; D as the user makes it finds nothing."""
@@ -93,6 +94,7 @@ def test_what_acts_on_a_velocity(shape, grids, most, rng):
                 near(dp.face_laplacian(grid, boundary, solid, along)(v), dense.viscous(along) @ v)
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("shape", [(1,), (2,), (1, 3), (3, 1), (1, 1), (1, 2, 1), (2, 1, 2)])
 def test_flow_step(shape, grids, most, rng):
     """Value, and gradient against the step written with dense matrices."""
@@ -139,6 +141,7 @@ def walls(grid, rng):
         yield boundary, solid, Dense(grid, resolve(grid, boundary), solid)
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_catalogue(shape, grids, rng):
     """Both forms of every operator between cells and faces."""

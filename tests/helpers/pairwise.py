@@ -1,8 +1,9 @@
 """Samples of cross products of parameters in which every pair of values occurs.
 
 A test with the mark `sampled` runs by default on such a sample of its parameters; the other cases have the marker
-`whole`, and .ci/run runs them. With ``sampled(1)`` every value occurs, not every pair: for two long lists. Faults that
-need three values together may show only in the whole product.
+`whole`, and .ci/run runs them. With ``sampled(1)`` every value occurs, not every pair: for two long lists. With
+``sampled(0)`` one case runs: for cases that take the same path through the code. Faults that need three values together
+may show only in the whole product.
 """
 
 import random

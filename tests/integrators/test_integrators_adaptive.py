@@ -41,6 +41,7 @@ def pendulum_by_scipy(a, g, end):
     return solve_ivp(rate, (0.0, end), [a, 0.0], method="DOP853", rtol=1e-13, atol=1e-14).y[0, -1]
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize(
     "method",
     [

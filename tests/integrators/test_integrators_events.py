@@ -77,6 +77,7 @@ def landing_time(drag, speed=30.0):
     return t, -by_drag / (fall * decay - 9.81 / drag)
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize(
     "method, tolerance",
     [
@@ -217,6 +218,7 @@ def halve(u, g):
     return anp.array([u[0], 0.5 * u[1]])
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize(
     "events, factor",
     [

@@ -77,6 +77,7 @@ def test_no_derivative_across_a_jump_is_wrong(seed, count):
     assert not wrong and sum(found.values()) == count * len(methods)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("seed, count", [(3, 3), pytest.param(4, 60, marks=pytest.mark.slow)])
 def test_smooth_rates_are_not_refused(seed, count):
     """Steep layers may be; of the others most are right."""

@@ -84,6 +84,7 @@ def test_nothing_outlives_a_step():
         np.testing.assert_array_equal(slope(memory), wanted)
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("method", ["backward_euler", "crank_nicolson"])
 def test_the_end_of_a_step_is_not_solved_for_again(method):
     """Going back through a loop that keeps its states; the gradient has the bits of one under a budget."""

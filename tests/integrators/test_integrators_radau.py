@@ -56,6 +56,7 @@ def test_order_five():
     assert np.log2(np.array(errors[:-1]) / errors[1:]) == pytest.approx([5, 5], abs=0.25)
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("stiffness", [1e2, 1e6])
 def test_prothero_robinson(stiffness, monkeypatch):
     """u' = -k (u - cos t) - sin t, whose solution is cos t: at every tolerance, and better with the tolerance."""
@@ -166,6 +167,7 @@ def test_one_step_against_a_root():
     assert dp.check.gradient(ours, x, directions=1).verdict == "agrees"
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize(
     "count, options, near", [(1, dict(tolerance=1e-7), 1e-6), (3, dict(tolerance=1e-7), 1e-6), (20, {}, 1e-6)]
 )
@@ -265,6 +267,7 @@ def test_second_derivatives_of_the_time_of_an_event():
     assert dp.hvp(ours, x, tangent) == pytest.approx(dp.hvp(exact, x, tangent), rel=1e-8)
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-4, pytest.param(1e-6, marks=pytest.mark.whole)])
 def test_intervals_that_meet_in_a_jump(tolerance):
     """Terms of the derivative there cancel to a thousandth: right, or refused."""
@@ -318,6 +321,7 @@ def test_what_matters_early_only():
     assert g[0] == pytest.approx(0.01 * np.sqrt(np.pi), rel=1e-5) and abs(g[1]) <= 1e-9
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("given", [lambda u, p: of_hires(u, p)[0], lambda u, p: 1.1 * of_hires(u, p)[0]])
 def test_a_jacobian_that_is_given(given):
     """It serves Newton's method; a poor one costs steps, and never the derivative."""
@@ -353,6 +357,7 @@ def test_kinds_of_states():
     assert from_zero(np.zeros(2), 3.0) == pytest.approx([6.0, 6.0], rel=1e-12)
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("tolerance", [1e-12, 1e-14])
 def test_fine_tolerances(tolerance):
     """Near rounding: met, or refused in words."""

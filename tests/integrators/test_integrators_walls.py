@@ -69,6 +69,7 @@ def test_moving_walls(method, reaction):
     assert np.all(found[-1] <= {1: 2e-2, 2: 3e-4, 4: 1e-7}[order]), found
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("method", ORDERS)
 def test_prothero_robinson(method):
     """u' = -a (u - g(t)) + g'(t), u = g: the error at the end, the largest over all stiffnesses a."""

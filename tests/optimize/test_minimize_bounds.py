@@ -61,6 +61,7 @@ def test_starts_on_bounds_and_close_to_them(seed):
 LONG = {"deconvolution", "tomography"}
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize(
     "problem",
     [pytest.param(one, id=one.__name__, marks=[pytest.mark.whole] * (one.__name__ in LONG)) for one in PROBLEMS],

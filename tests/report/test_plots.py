@@ -116,6 +116,7 @@ def test_the_place_can_be_named(ax):
     assert corners[0, 0, 0] == -0.5  # node 0 is in the middle of its patch
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     "kind", ["faces", *(pytest.param(kind, marks=pytest.mark.whole) for kind in ("cells", "nodes"))]
 )

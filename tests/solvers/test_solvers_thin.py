@@ -41,6 +41,7 @@ def varied(boundary):
     return -dp.divergence(grid) @ k @ dp.gradient(grid, boundary)
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("boundary", [dp.dirichlet, dp.neumann], ids=str)
 @pytest.mark.parametrize("make", [weak, flat, clustered, varied])
 def test_thin_scenes(make, boundary, rng):

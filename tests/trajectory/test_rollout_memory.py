@@ -80,6 +80,7 @@ def test_a_rule_gives_the_gradient_of_the_formula(keep, memory):
     assert all(a.tobytes() == b.tobytes() for a, b in zip(slope, again))
 
 
+@pytest.mark.whole
 def test_a_wrong_rule_is_caught_by_the_check():
     assert dp.check.gradient(lambda x: loss(RULE, x), (U0, C0), quick=True).verdict == "agrees"
     assert dp.check.gradient(lambda x: loss(shift("identity"), x), (U0, C0)).verdict == "disagrees"
