@@ -103,7 +103,8 @@ def waves(damped=False, memory=None):
         D = dp.divergence(grid)
         G = dp.gradient(grid)
         inside = dp.interior(grid)
-        damping = dp.sponge(grid, min(grid.shape, default=0) and 1, 1.0) if damped else None
+        cells = 1 if min(grid.shape, default=0) and not all(grid.periodic) else 0
+        damping = dp.sponge(grid, cells, 1.0) if damped else None
         rates = (lambda v, c: -c * D(v)), (lambda p, c: -inside(G(p)))
         step = dp.stepper("leapfrog", rates, 0.1, damping=damping)
         return lambda p, v, c: dp.rollout(step, (p, v), c, 3, memory=memory)[0]

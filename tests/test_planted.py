@@ -81,7 +81,7 @@ BUGS = {
     ),
     "a gap between a body and a wall of the grid that is no gap": Bug(
         "operators/cut_wall_slope.py",
-        "        closeness = has_u * facing * ",
+        "        closeness = facing * ",
         "        closeness = 0.0 * facing * ",
         "tests/operators/test_cut_operators.py::test_gaps_between_the_body_and_a_wall_of_the_grid",
     ),

@@ -66,7 +66,6 @@ __all__ = ["CutFlow", "cut_flow"]
 
 SHORTEST = 1e-3  # distance of two faces below which their difference is not divided by it, in the smallest cell width
 FARTHEST = 8.0  # largest value of the level far from the wall, relative to those next to it
-HUGE = 1e150  # values of the level beyond are far from the wall: near it they are of order 2^half
 LARGEST_IMBALANCE = 1e-6  # relative imbalance of the given velocities around a region without an outflow
 LARGEST_NORMAL_SHARE = 0.25  # of the velocity of the body, on a wall that is a polygon
 NOT_TANGENTIAL = (
@@ -203,7 +202,7 @@ class CutFlow(Reconstructible):
 
         self._has_walls = [(entry.axis, entry.side, entry.component) for entry in wall_sides(grid, self._sides)]
         self._walls_space = wall_velocities(grid, self._sides)
-        geometries, walls = cut_faces(grid, _of_order_one(level))
+        geometries, walls = cut_faces(grid, _of_order_one(grid, level))
         apertures = [
             anp.reshape(anp.transpose(g.apertures) if c else g.apertures, (-1,)) for c, g in enumerate(geometries)
         ]
@@ -678,23 +677,31 @@ class CutFlow(Reconstructible):
         return f"<cut_flow: {counts}, {self._walls_of_pairs.domain.size} control volumes are cut>"
 
 
-def _of_order_one(level):
+def _of_order_one(grid, level):
     """Return the level, clipped far from the wall, and divided by a power of two.
 
     Jumps far from the wall would appear as bodies where the level is interpolated. Products of the levels of some nodes
     do not overflow.
     """
     values = np.asarray(sample(level))
+    padded = values > 0
+    for axis, is_periodic in enumerate(grid.periodic):
+        padding = [(int(a == axis),) * 2 for a in range(grid.dim)]
+        padded = np.pad(padded, padding, mode="wrap" if is_periodic else "edge")
     is_near = np.zeros(values.shape, bool)
-    for step in product((-1, 0, 1), repeat=values.ndim):
-        is_near |= (values > 0) != (np.roll(values, step, range(values.ndim)) > 0)
+    for step in product((0, 1, 2), repeat=grid.dim):
+        neighbours = tuple(slice(first, first + n) for first, n in zip(step, values.shape, strict=True))
+        is_near |= (values > 0) != padded[neighbours]
     sizes = np.where(is_near, np.abs(values), 0.0) if is_near.any() else np.abs(values)
-    largest = int(np.argmax(sizes))
-    exponent = int(np.frexp(sizes.reshape(-1)[largest])[1])
+    place = int(np.argmax(sizes))
+    largest = float(sizes.reshape(-1)[place])
+
+    beyond = min(2.0 * FARTHEST * largest, float(np.finfo(float).max))  # larger values may overflow below
+    clipped = anp.minimum(anp.maximum(level, -beyond), beyond)
+    exponent = int(np.frexp(largest)[1])
     half = exponent // 2  # 2^-exponent alone overflows for the smallest numbers
-    halved = 2.0**-half * anp.clip(level, -(2.0**half) * HUGE, 2.0**half * HUGE)
-    scaled = halved * 2.0 ** (half - exponent)
-    limit = FARTHEST * anp.abs(anp.reshape(scaled, (-1,))[largest])
+    scaled = 2.0**-half * clipped * 2.0 ** (half - exponent)
+    limit = FARTHEST * anp.abs(anp.reshape(scaled, (-1,))[place])
     return anp.minimum(anp.maximum(scaled, -limit), limit)
 
 

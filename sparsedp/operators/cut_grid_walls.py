@@ -1,6 +1,7 @@
 """The faces on the walls of the grid next to a body.
 
-In a narrow gap between the body and such a face, both are walls of the gap; see cut_wall_slope.py.
+In a narrow gap between the body and such a face with a dirichlet condition, both are walls of the gap; see
+cut_wall_slope.py.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ __all__ = ["GridWalls", "are_near", "grid_walls"]
 
 
 class GridWalls(NamedTuple):
-    """Open faces on the walls of the grid, near cells that the body cuts; shape (q,) each.
+    """Open faces on dirichlet walls of the grid, near cells that the body cuts; shape (q,) each.
 
     Attributes
     ----------
@@ -30,8 +31,8 @@ class GridWalls(NamedTuple):
         Flat numbers of the faces and of their cells.
     sides : int array
         2 axis + side, where side is 0 for the lower and 1 for the upper wall of an axis.
-    a, b : arrays
-        The condition a u + b du/dn = value.
+    a : array
+        The condition a u = value.
     areas : array
         Open area of the face.
     normals, centroids : lists of arrays, one for each axis
@@ -42,14 +43,13 @@ class GridWalls(NamedTuple):
     cells: NDArray[np.int64]
     sides: NDArray[np.int64]
     a: NDArray[np.float64]
-    b: NDArray[np.float64]
     areas: Any
     normals: list
     centroids: list
 
 
-def grid_walls(grid: Grid, geometry: CutGeometry, sides: tuple, reach: int, neumann: bool) -> GridWalls:
-    """Return the open faces whose cell is up to `reach` cells from a cut cell, along each axis.
+def grid_walls(grid: Grid, geometry: CutGeometry, sides: tuple, reach: int) -> GridWalls:
+    """Return the open faces on dirichlet walls whose cell is up to `reach` cells from a cut cell, along each axis.
 
     Parameters
     ----------
@@ -58,13 +58,11 @@ def grid_walls(grid: Grid, geometry: CutGeometry, sides: tuple, reach: int, neum
     sides : tuple
         The conditions, as `resolve` returns them.
     reach : int
-    neumann : bool
-        Whether faces without a condition on u are returned, too.
     """
     is_near = are_near(grid, geometry.cut, reach)
     all_cells = np.arange(grid.cells.size).reshape(grid.shape)
     apertures = np.asarray(sample(geometry.apertures))
-    faces, cells, of_sides, a, b = [], [], [], [], []
+    faces, cells, of_sides, a = [], [], [], []
     for axis, side, wall in walls_of(sides):
         first, last = grid.faces.offsets[axis : axis + 2]
         of_wall: Any = np.arange(first, last).reshape(grid.faces.parts[axis]).take(-side, axis)
@@ -73,20 +71,19 @@ def grid_walls(grid: Grid, geometry: CutGeometry, sides: tuple, reach: int, neum
         regions = wall.regions if isinstance(wall, MixedWall) else ((wall, np.ones(of_wall.shape, bool)),)
         for condition, region in regions:
             chosen = is_open & region
-            if not (condition.a or neumann) or not chosen.any():
+            if not condition.a or condition.b or not chosen.any():
                 continue
             faces.append(of_wall[chosen])
             cells.append(of_cells[chosen])
             of_sides.append(np.full(faces[-1].size, 2 * axis + side))
             a.append(np.full(faces[-1].size, float(condition.a)))
-            b.append(np.full(faces[-1].size, float(condition.b)))
-    numbers = [np.concatenate([np.zeros(0, int), *parts]) for parts in (faces, cells, of_sides)]
-    conditions = [np.concatenate([np.zeros(0), *parts]) for parts in (a, b)]
-    return _with_geometry(grid, geometry, *numbers, *conditions)
+    joined = [np.concatenate([np.zeros(0, int), *parts]) for parts in (faces, cells, of_sides)]
+    return _with_geometry(grid, geometry, joined, np.concatenate([np.zeros(0), *a]))
 
 
-def _with_geometry(grid, geometry, faces, cells, sides, a, b):
-    """Return the faces with their areas, normals and centres."""
+def _with_geometry(grid, geometry, numbers, a):
+    """Return the faces with their areas, normals and centres; `numbers` are faces, cells and sides."""
+    faces, cells, sides = numbers
     places: Any = np.unravel_index(cells, grid.shape)
     across, upper = sides // 2, sides % 2
     areas = geometry.apertures[faces]
@@ -98,7 +95,7 @@ def _with_geometry(grid, geometry, faces, cells, sides, a, b):
         nodes = grid.coordinates(axis, "nodes")
         ends = nodes[0] + upper * grid.size[axis]
         centroids.append(np.where(is_across, ends, grid.coordinates(axis)[places[axis]]))
-    return GridWalls(faces, cells, sides, a, b, areas, normals, centroids)
+    return GridWalls(faces, cells, sides, a, areas, normals, centroids)
 
 
 def are_near(grid: Grid, cells: NDArray[np.int64], reach: int) -> NDArray[np.bool_]:

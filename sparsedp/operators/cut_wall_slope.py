@@ -15,20 +15,16 @@ wall, which is fitted to the values at the other walls:
 
     du/dn = dl/dn - (u - l(centre of the cell)) / (L/3).
 
-The values u_w are those of the conditions, g / a, minus r du/dn with r = b / a. So linear fields are exact, and so are
-sources between walls with one value. Between L = 0.6 and 0.9 cells the slope changes smoothly into the slope of the
-fit, so that derivatives in the level exist.
+The differences of the values at the walls are those of the condition, (g_j - g_i) / a, times a L / (a L + b): the share
+that falls off between the walls. So linear fields are exact, and so are sources between walls with one value. Between
+L = 0.6 and 0.9 cells the slope changes smoothly into the slope of the fit, so that derivatives in the level exist.
 
-Gaps between the body and a wall of the grid. Two walls are a gap if their normals differ by more than 120 degrees. L is
-then half of their distance. With r_j of the other wall, s = r_j / (L + r_j), and s = 1 if it has a neumann
-condition, the parabola has the slope
-
-    du/dn = dl/dn - (u - l(centre)) / d,   d = (L (1 + s) - r (1 - s)) / 3,
-
-where u and the centre are means over the fluid of the cells between both walls. The slope du/dn of a neumann wall is
-the slope of l. So fields that are quadratic across the gap have exact integrals. On a face of the grid the slope
--(u - u_w) / (h/2) changes into this one, too. This is between 2 L = 2 and 2.4 cells, or between 0.6 and 0.9 cells if
-the body has a neumann condition, so that a body along faces of the grid is the same as solid cells.
+Gaps between the body and a wall of the grid, both with dirichlet conditions. The wall of the grid is then the other
+wall, if the normals differ by more than 120 degrees. L is half of the distance of the walls, and u and the centre are
+means over the fluid of the cells between them: fields that are quadratic across the gap have exact integrals. On the
+face of the grid the slope -(u - u_w) / (h/2) of `gradient` changes into the slope in the gap, too. The change happens
+for 2 L between 2 and 2.4 cells. With another condition on one of both walls, the slope on a wall of the grid is that of
+`gradient`.
 """
 
 from __future__ import annotations
@@ -77,7 +73,7 @@ WIDE_GRID = 1.2
 # The radius around a wall in which other walls of its gap lie, in cell widths, and in which number of cells.
 WIDE_RADIUS = 3.5
 WIDE_REACH = 4
-# The area of the opposite wall, relative to that of the own wall, from which on two walls are a gap, is 1 / FACING.
+# Two walls are a gap if the area of the opposite wall is at least 1 / FACING of the area of the own wall.
 FACING = 3.0
 THINNEST = 1e-3  # half of the width of a gap below which the slope does not become steeper, in cell widths
 
@@ -86,8 +82,8 @@ class WallSlope(NamedTuple):
     """The slopes at walls, out of the fluid, as linear functions of a field u and of the values of the conditions.
 
     A slope is the sum of coefficients * u[cells] over the pairs of the wall, plus of_value * value, plus the sum of
-    of_difference * (v[others] - v[gap_walls]) + of_slope * v[others] over pairs of walls in gaps, where v is
-    value / scale. Walls are numbered: first the m cut cells, then the q faces on the walls of the grid.
+    of_difference * (v[others] - v[gap_walls]) over pairs of walls in gaps, where v is value / scale. Walls are
+    numbered: first the m cut cells, then the q faces on the walls of the grid.
 
     Attributes
     ----------
@@ -102,7 +98,7 @@ class WallSlope(NamedTuple):
     scales : array, shape (m + q,)
         a of the conditions, or b if a is 0.
     gap_walls, others : int arrays, shape (pairs of walls,)
-    of_difference, of_slope : arrays, shape (pairs of walls,)
+    of_difference : array, shape (pairs of walls,)
     """
 
     walls: NDArray[np.int64]
@@ -116,7 +112,6 @@ class WallSlope(NamedTuple):
     gap_walls: NDArray[np.int64]
     others: NDArray[np.int64]
     of_difference: Any
-    of_slope: Any
 
     def terms_of_values(self, values: Any, lifted: Any) -> tuple[Any, Any]:
         """Return the parts of the slopes that the values of the conditions add.
@@ -141,8 +136,7 @@ class WallSlope(NamedTuple):
             batch = np.broadcast_shapes(np.shape(values)[:-1], np.shape(on_faces)[:-1])
             values = anp.concatenate([part + np.zeros((*batch, 1)) for part in (values, on_faces)], axis=-1)
         of_walls = values / self.scales
-        of_others = of_walls[..., self.others]
-        terms = self.of_difference * (of_others - of_walls[..., self.gap_walls]) + self.of_slope * of_others
+        terms = self.of_difference * (of_walls[..., self.others] - of_walls[..., self.gap_walls])
         slopes = self.of_value * values + sum_at_places(self.gap_walls, self.scales.size)(terms)
         return slopes[..., :m], slopes[..., m:] * self.signs
 
@@ -172,11 +166,12 @@ def wall_slope(grid: Grid, geometry: CutGeometry, condition: Any, sides: tuple) 
     grid : Grid
     geometry : CutGeometry
     condition : condition
-        On the wall. For neumann only the slopes on faces of the grid are computed.
+        On the wall of the body. For neumann there is nothing to compute.
     sides : tuple
         Conditions on the walls of the grid, as `resolve` returns them.
     """
-    faces = grid_walls(grid, geometry, sides, WIDE_REACH, bool(condition.a))
+    is_dirichlet = bool(condition.a) and not condition.b
+    faces = grid_walls(grid, geometry, sides if is_dirichlet else (), WIDE_REACH)
     walls = _joined_walls(geometry, faces, condition)
     m = geometry.cut.size
     widths = _widths(grid, walls)
@@ -205,13 +200,12 @@ def wall_slope(grid: Grid, geometry: CutGeometry, condition: Any, sides: tuple) 
         anp.concatenate([slopes * (of_fit * walls.a / denominators)[numbers], gap.coefficients]),
         anp.where(has_u, of_value, 1.0 / _nonzero(walls.b)),
         faces.faces,
-        signs * (faces.a * half_widths + faces.b),
+        signs * faces.a * half_widths,
         signs,
         np.where(has_u, walls.a, walls.b),
         gap.first,
         gap.others,
         gap.of_difference,
-        gap.of_slope,
     )
 
 
@@ -237,7 +231,7 @@ def _joined_walls(geometry, faces, condition):
         np.concatenate([geometry.cut, faces.cells]),
         np.concatenate([np.full(m, -1), faces.sides]),
         np.concatenate([np.full(m, float(condition.a)), faces.a]),
-        np.concatenate([np.full(m, float(condition.b)), faces.b]),
+        np.concatenate([np.full(m, float(condition.b)), np.zeros(faces.a.size)]),
         anp.concatenate([geometry.areas, faces.areas]),
         [anp.concatenate(pair) for pair in zip(geometry.normals, faces.normals, strict=True)],
         [anp.concatenate(pair) for pair in zip(geometry.centroids, faces.centroids, strict=True)],
@@ -327,9 +321,8 @@ class _Gap(NamedTuple):
     coefficients : array, shape (pairs,)
         -share / distance, times the weights of the mean over the gap.
     first, others : int arrays, shape (pairs of walls,)
-    of_difference, of_slope : arrays, shape (pairs of walls,)
-        What differences between the values at two walls, value / a, and slopes at other walls with a neumann condition
-        add to the slopes.
+    of_difference : array, shape (pairs of walls,)
+        What differences between the values at two walls, value / a, add to the slopes.
     """
 
     share: Any
@@ -340,7 +333,6 @@ class _Gap(NamedTuple):
     first: NDArray[np.int64]
     others: NDArray[np.int64]
     of_difference: Any
-    of_slope: Any
 
 
 def _gap(grid, geometry, walls, pairs, widths, faces, lack):
@@ -377,9 +369,7 @@ def _gap(grid, geometry, walls, pairs, widths, faces, lack):
     has_u = walls.a != 0
     ratios = walls.b / np.where(has_u, walls.a, 1.0)
     half = anp.concatenate([thickness, WIDE_GRID * width[m:]]) if q else thickness
-    softness = ratios / (half + ratios)
     shares: Any = np.ones(first.size)
-    of_slope: Any = np.zeros(first.size)
     facing: Any = np.zeros(size)
     if q:
         is_grid_gap = (walls.sides[first] < 0) != (walls.sides[others] < 0)
@@ -395,15 +385,10 @@ def _gap(grid, geometry, walls, pairs, widths, faces, lack):
         facing = 1.0 - anp.maximum(1.0 - FACING * opposite / _nonzero(same), 0.0) ** 2
         between = gather(area_ahead * ahead) / _nonzero(opposite)
         half = (1.0 - facing) * half + facing * 0.5 * between
-        of_other = anp.where(has_u[others], ratios[others] / (half[first] + ratios[others]), 1.0)
-        of_slope = area_ahead / _nonzero(opposite)[first]
-        softness = (1.0 - facing) * ratios / (half + ratios) + facing * gather(of_slope * of_other)
-        of_slope = of_slope * ~has_u[others]
-        narrow, wide = (NARROW_GRID, WIDE_GRID) if np.all(has_slope) else (0.5 * NARROW, 0.5 * WIDE)
-        closeness = has_u * facing * _smooth_step((wide - half / width) / (wide - narrow))
+        closeness = facing * _smooth_step((WIDE_GRID - half / width) / (WIDE_GRID - NARROW_GRID))
         share = 1.0 - (1.0 - share) * (1.0 - closeness)
     half = anp.sqrt(half**2 + (THINNEST * width) ** 2)
-    length = (half * (1.0 + softness) - ratios * (1.0 - softness)) / 3.0
+    length = half / 3.0
     distance = _nonzero(length + ratios)
 
     # In a gap at a wall of the grid, the mean over the fluid between the walls; else the value in the cell.
@@ -429,10 +414,9 @@ def _gap(grid, geometry, walls, pairs, widths, faces, lack):
     of_difference = _slopes_of_differences(
         walls, widths, first, others, steps, (shares * kernel)[used], length, to_centre
     )
-    depth = reduce(add, [x * h * n for x, h, n in zip(to_centre, widths, walls.normals, strict=True)])
-    of_difference = (share / distance)[first] * of_difference
-    of_slope = (share * (depth - length) / distance)[first] * of_slope[used]
-    return _Gap(share, distance, numbers, cells, coefficients, first, others, of_difference, of_slope)
+    inside = half / (half + ratios)
+    of_difference = (share * inside / distance)[first] * of_difference
+    return _Gap(share, distance, numbers, cells, coefficients, first, others, of_difference)
 
 
 def _smooth_step(x):
@@ -484,9 +468,6 @@ def _steps_between_walls(grid, walls, pairs, index, others, widths):
 def _slopes_of_differences(walls, widths, first, others, steps, shares, length, to_centre):
     """Return what differences between the values at two walls add to the slopes, times d: d dl/dn + l(mean) - u_w.
 
-    The values are value / a of the conditions. With r = b / a, differences of u in a linear field with the slope -t at
-    the first wall are those of the values plus t (r_j (n_i . n_j) - r_i).
-
     Parameters
     ----------
     walls, widths
@@ -511,21 +492,9 @@ def _slopes_of_differences(walls, widths, first, others, steps, shares, length, 
         row = [gather(weights * steps[i] * steps[j]) for j in range(i + 1)]
         row[i] = row[i] + VALUE_DAMPING * (length / widths[i]) ** 2 * total
         matrix.append(row)
-    outward = [-walls.normals[a] / widths[a] for a in axes]
-
-    def of_differences(right):
-        solution = solve_definite(matrix, right)
-        return weights * reduce(add, [z[first] * step for z, step in zip(solution, steps, strict=True)])
-
-    of_slope = of_differences(outward)
-    result = of_differences([length * n + x for n, x in zip(outward, to_centre, strict=True)])
-    ratios = walls.b / np.where(walls.a != 0, walls.a, 1.0)
-    if not ratios.any():
-        return result
-    products = reduce(add, [normal[first] * normal[others] for normal in walls.normals])
-    of_t = ratios[others] * products - ratios[first]
-    factor = gather(result * of_t) / (1.0 + gather(of_slope * of_t))
-    return result - of_slope * factor[first]
+    right = [to_centre[a] - length * walls.normals[a] / widths[a] for a in axes]
+    solution = solve_definite(matrix, right)
+    return weights * reduce(add, [z[first] * step for z, step in zip(solution, steps, strict=True)])
 
 
 def _thickness(grid, geometry, pairs):

@@ -137,7 +137,7 @@ def test_tiny_cells_do_no_harm():
 
 
 @pytest.mark.whole
-@pytest.mark.parametrize("far", [1e3, 1e9, 1e200])
+@pytest.mark.parametrize("far", [1e3, 1e9, 1e200, 1e300])
 def test_large_levels_far_from_the_wall_change_nothing(far):
     """The force was 50 % too large, as a jump of the level was interpolated to a body."""
     grid = dp.Grid((12, 8), size=(3.0, 2.0))
@@ -152,6 +152,11 @@ def test_large_levels_far_from_the_wall_change_nothing(far):
     with onp.errstate(all="raise", under="ignore"):
         assert drag(jumping) == pytest.approx(drag(level), rel=1e-12)
         assert drag(far * level) == pytest.approx(drag(level), rel=1e-12)
+    beside = np.minimum(level, nodes[1] - 0.13)  # a second body along one side of the grid
+    for part in (slice(-1, None), slice(4, 7)):
+        jumping_at_the_side = beside.copy()
+        jumping_at_the_side[10:, part] = far
+        assert drag(jumping_at_the_side) == pytest.approx(drag(beside), rel=1e-12)
     slope = dp.grad(drag)(level)
     assert np.allclose(dp.grad(drag)(jumping), slope, atol=1e-9 * np.max(abs(slope)))
 

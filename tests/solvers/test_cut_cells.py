@@ -95,7 +95,8 @@ def test_slopes_of_linear_fields_are_exact_at_walls_of_any_direction(dim, condit
     errors = abs(body.slopes(u, condition.a * at_wall + condition.b * slope, walls) - slope)
     inside = (slice(2, -2),) * dim
     assert np.count_nonzero(body.areas[inside]) > 3
-    assert np.all(errors[inside][body.areas[inside] > 0] < 1e-5)
+    tolerance = 1e-5 if condition == dp.dirichlet else 1e-7  # in gaps at the grid, the fit to values on walls is damped
+    assert np.all(errors[inside][body.areas[inside] > 0] < tolerance)
 
 
 @pytest.mark.whole
