@@ -175,8 +175,8 @@ def eigenpairs(
         dlambda = w^H (dA - lambda dM) v .
 
     `.condition_numbers` are |w| |M v| / |w^H M v|. A multiple eigenvalue with enough vectors (semisimple) has bases
-    with w_i^H M v_j = 1 for i = j and 0 otherwise, without derivatives. A defective one has fewer vectors, of which
-    some are repeated, w^H M v = 0, an infinite condition number, and left vectors of norm 1.
+    with w_i^H M v_j = 1 for i = j and 0 otherwise, without derivatives. A defective one, up to rounding, has fewer
+    vectors, of which some are repeated, w^H M v = 0, an infinite condition number, and left vectors of norm 1.
 
     The vectors take one sparse LU factorisation for each eigenvalue. Near a number `which` ARPACK iterates with the LU
     factors of A - which M, in complex arithmetic if `which` is complex. A singular M has infinite eigenvalues; they are

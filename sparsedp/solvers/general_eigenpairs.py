@@ -78,12 +78,14 @@ __all__ = ["GeneralEigenpairs", "GeneralEigenProblem", "JacobianMember"]
 CORRECTIONS = 4  # of an eigenvalue, each with one factorisation; they converge quadratically
 RESIDUAL = 1e3 * AT_ROUNDOFF  # share of the terms below which the residual of a pair is rounding
 NEAR = 1e-9  # distance of the shift of inverse iteration from the eigenvalue, in units of the mean row of A
+SHIFTS = (1.0, -1.7, 2.9)  # in units of `NEAR`, tried in turn if a matrix with an earlier one is exactly singular
 START_STEPS = 3  # of inverse iteration
 GAP_STEPS = 3  # steps of inverse iteration that estimate the distance of the nearest other eigenvalue
 SAME = 1e-9  # distance below which eigenvalues may have a common eigenspace, in units of the mean row of A
 SPACE_STEPS = 4  # of inverse iteration with a block, for the eigenspace of a multiple eigenvalue
 PERPENDICULAR = 1e-14  # the cosine |u^T M v| / (|u| |M v|) below which it is 0 up to rounding
-DEFECTIVE = 1e-7  # |u^T M v| / (|u| |M v|) below which the eigenvalue is a multiple one without enough vectors
+DEFECTIVE = 1e-7  # |u^T M v| / (|u| |M v|) below which an eigenvalue has no derivative
+LARGEST_DEFECTIVE = 1e-5  # the same below which an eigenvalue that is a multiple one up to rounding is defective
 
 
 class JacobianMember(PencilMember):
@@ -347,7 +349,7 @@ class GeneralSolution:
     def _find(self, number):
         """Compute the vectors of an eigenvalue, and those of its copies."""
         least = SAME * float(np.ldexp(self.pencil.scale, self.pencil.exponent))
-        copies = np.flatnonzero(np.abs(self.values - self.values[number]) <= least)
+        copies = self._cluster(number, least)
         failure = None
         pair = None
         try:
@@ -358,11 +360,19 @@ class GeneralSolution:
             space = _eigenspace(self.pencil, complex(np.mean(self.values[copies])), number)
             if space and (len(space) > 1 or pair is None):
                 for place, copy in enumerate(copies):
-                    self._pairs[int(copy)] = space[place % len(space)]
+                    self._pairs.setdefault(int(copy), space[place % len(space)])
                 return
         if failure is not None:
             raise failure
         self._pairs[number] = pair
+
+    def _cluster(self, number, least):
+        """Return the numbers of the eigenvalues at a distance of at most `least` from another one of the cluster."""
+        is_near = np.abs(self.values[:, None] - self.values) <= least
+        is_member = is_near[number]
+        for _ in self.values:
+            is_member = np.any(is_near[is_member], axis=0)
+        return np.flatnonzero(is_member)
 
     def refusal(self, number: int) -> DerivativeError | None:
         """Return the error for the derivative of an eigenvalue that is not simple; None if it is simple."""
@@ -413,7 +423,14 @@ class Pair:
     is_defective : bool
         Whether |u^T M v| is so small that derivatives are refused.
     condition_number : float
-        |u| |M v| / |u^T M v|; inf if u^T M v is 0 up to rounding. Then u has norm 1.
+        |u| |M v| / |u^T M v|; inf if the eigenvalue is defective up to rounding errors of A. Then u has norm 1.
+
+    Notes
+    -----
+    Let h(lambda) be the last unknown of the bordered system, which is 0 at an eigenvalue, scaled by u. Then
+    h' = u^T M v and h'' / 2 = u^T M dv/dlambda. A change of A by |h'|^2 / (2 |h''|) makes the eigenvalue a multiple
+    one. If this is a rounding error, the cosine of a computed defective eigenvalue, about 1e-8 for two copies, has no
+    correct digit. The cosine of a simple eigenvalue that is sensitive may be as small, but is correct.
     """
 
     def __init__(self, pencil: Pencil, value: complex, number: int, rtol: float) -> None:
@@ -456,15 +473,18 @@ class Pair:
         else:
             raise _no_vector(number, f"residual {np.max(residuals) / (np.linalg.norm(terms) or 1.0):.1e}")
         cosine = abs(product) / max(np.linalg.norm(u) * np.linalg.norm(mass_v), 1e-300)
-        self.is_defective = bool(cosine <= DEFECTIVE)
+        slope = factors.solve(np.append(mass_v, 0.0).astype(bordered.dtype))[:n]  # dv/dlambda
+        allowed = 4 * AT_ROUNDOFF * np.linalg.norm(terms) * abs(mass_u @ slope)
+        is_multiple = cosine <= LARGEST_DEFECTIVE and abs(product) ** 2 <= allowed
+        is_infinite = bool(is_multiple or cosine <= PERPENDICULAR)
+        self.is_defective = bool(is_infinite or cosine <= DEFECTIVE)
         self._factors = factors
         self._dtype = bordered.dtype
         self.value = value * 2.0**pencil.exponent
         right = with_fixed_sign(v)
-        is_perpendicular = cosine <= PERPENDICULAR
-        self.condition_number = np.inf if is_perpendicular else float(1 / cosine)
-        scale_u = 1.0 if is_perpendicular else 2.0**-pencil.mass_exponent
-        safe = 1.0 if is_perpendicular else product
+        self.condition_number = np.inf if is_infinite else float(1 / cosine)
+        scale_u = 1.0 if is_infinite else 2.0**-pencil.mass_exponent
+        safe = 1.0 if is_infinite else product
         self._scaled = v, u / safe, mass_v, mass_u / safe
         # In the units of the operators as given, M is 2^mass_exponent times the mass of the pencil.
         self.v = self._embedded(v)
@@ -554,7 +574,7 @@ def _eigenspace(pencil, value, number):
         value = value.real
     shifted = stiffness - value * mass
     try:
-        factors = _factors(shifted - NEAR * pencil.scale * mass, number)
+        factors = _shifted_factors(stiffness, mass, value, pencil.scale, number)
     except ConvergenceError:
         return []
     bases = []
@@ -572,14 +592,14 @@ def _eigenspace(pencil, value, number):
     pairs = []
     for v, u, size in zip(V.T, U.T, sizes, strict=True):
         cosine = size / max(np.linalg.norm(mass @ v), 1e-300)
-        is_perpendicular = cosine <= PERPENDICULAR
+        is_defective = bool(cosine <= LARGEST_DEFECTIVE)
         right = with_fixed_sign(v)
         left = np.conj(u / np.vdot(v, right))
-        if not is_perpendicular:
+        if not is_defective:
             left = left / size * 2.0**-pencil.mass_exponent
         right, left = pencil.embedded(np.array([right, left], complex))
-        condition_number = np.inf if is_perpendicular else float(1 / cosine)
-        pairs.append(PairOfSpace(right, left, condition_number, bool(cosine <= DEFECTIVE)))
+        condition_number = np.inf if is_defective else float(1 / cosine)
+        pairs.append(PairOfSpace(right, left, condition_number, is_defective))
     return pairs
 
 
@@ -614,9 +634,19 @@ def _factors(matrix, number):
         raise _no_vector(number, "the matrix is singular") from None
 
 
+def _shifted_factors(stiffness, mass, value, scale, number):
+    """Return the LU factors of A - (lambda + e) M for a small number e with which they exist."""
+    for factor in SHIFTS:
+        try:
+            return _factors(stiffness - (value + factor * NEAR * scale) * mass, number)
+        except ConvergenceError:
+            continue
+    raise _no_vector(number, "the matrix is singular")
+
+
 def _largest_entries(stiffness, mass, value, scale, number):
     """Return the places of the largest entries of v and u, by inverse iteration."""
-    factors = _factors(stiffness - (value + NEAR * scale) * mass, number)
+    factors = _shifted_factors(stiffness, mass, value, scale, number)
     places = []
     for transposed in (False, True):
         matrix = mass.T if transposed else mass
@@ -657,8 +687,8 @@ class GeneralEigenpairs:
     vectors, left_vectors : array, shape (k, *domain.shape), or trees of them
         Computed when they are first read.
     condition_numbers : array, shape (k,)
-        Computed when they are first read. Infinite for a defective eigenvalue, which has fewer vectors than its
-        multiplicity: some are repeated, and left ones with w^H M v = 0 have norm 1.
+        Computed when they are first read. Infinite for an eigenvalue that is defective up to rounding: it has fewer
+        vectors than its multiplicity, some are repeated, and left ones with w^H M v = 0 have norm 1.
     """
 
     def __init__(self, problem: GeneralEigenProblem, split: Callable | None) -> None:
@@ -684,7 +714,7 @@ class GeneralEigenpairs:
     def left_vectors(self) -> Any:
         """The left eigenvectors, w^H A = lambda w^H M, with w^H M v = 1 (adjoint modes).
 
-        If w^H M v is 0, as for a defective eigenvalue, w has norm 1.
+        If w^H M v is 0 up to rounding, as for a defective eigenvalue, w has norm 1.
         """
         return self._fields(self._problem.all_vectors(left=True))
 

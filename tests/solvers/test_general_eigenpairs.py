@@ -306,6 +306,33 @@ def test_a_defective_eigenvalue_has_left_vectors_of_norm_one():
     np.testing.assert_allclose(np.linalg.norm(pairs.left_vectors, axis=1), 1.0)
 
 
+@pytest.mark.parametrize("sizes", [(2,), (3,), (2, 1), (2, 2)])
+@pytest.mark.parametrize("unit", [1.0, 2.0**-300])
+def test_defective_eigenvalues_that_rounding_splits_have_infinite_condition_numbers(sizes, unit):
+    """Rounding splits a Jordan block of size m into eigenvalues at distances of about eps^(1/m)."""
+    rng = np.random.default_rng(0)
+    count = sum(sizes)
+    blocks = la.block_diag(*[np.eye(size) + np.eye(size, k=1) for size in sizes], np.diag(np.arange(2.0, 10 - count)))
+    n = len(blocks)
+    for _ in range(4):
+        Q = rng.standard_normal((n, n))
+        pairs = dp.eigenpairs(dp.from_matrix(unit * Q @ blocks @ np.linalg.inv(Q)), count, symmetric=False)
+        norms = np.linalg.norm(pairs.left_vectors, axis=1)
+        is_infinite = np.isinf(pairs.condition_numbers)
+        assert np.any(is_infinite)
+        assert np.any(~is_infinite) == (1 in sizes)
+        np.testing.assert_allclose(norms[is_infinite], 1.0, rtol=1e-12)
+        np.testing.assert_allclose(norms[~is_infinite], pairs.condition_numbers[~is_infinite], rtol=1e-6)
+        assert np.all(norms < 1e3)
+
+
+def test_vectors_where_the_first_shift_of_inverse_iteration_is_an_eigenvalue():
+    """1 + 2e-9 is the shift for the eigenvalue 1 of this matrix, whose mean row is 2."""
+    matrix = np.diag([1.0, 1 + 2e-9, 3.0, 3.0 - 2e-9])
+    pairs = dp.eigenpairs(dp.from_matrix(matrix), 2, symmetric=False)
+    np.testing.assert_allclose(np.abs(pairs.vectors), np.eye(2, 4), atol=1e-6)
+
+
 def test_condition_numbers_are_those_of_scipy():
     """The second matrix has simple eigenvalues 1, 2, ..., 12 with condition numbers up to 1e8."""
     for matrix in (np.array([[1.0, 1.0], [1e-6, 1.0]]), np.diag(np.arange(1.0, 13.0)) + 12 * np.eye(12, k=1)):
