@@ -908,15 +908,15 @@ class Follower:
 
     def _turns_back(self, point, following):
         """Return whether p turns back between two points."""
-        slopes = np.array([point.tangent[-1], following.tangent[-1]])
-        if self.is_natural or not slopes[0] * slopes[1] < 0:
+        slopes = np.array([self._slope(point.tangent), self._slope(following.tangent)])
+        if self.is_natural or not np.sign(slopes[0]) * np.sign(slopes[1]) < 0:
             return False
-        return bool(np.max(np.abs(slopes)) * self.curve.units[-1] > SLOPE_NOISE)
+        return bool(np.max(np.abs(slopes)) > SLOPE_NOISE)
 
     def _path(self, point, following, depth=0):
         """Return the points after `point` up to `following`, such that at most one fold is between neighbours."""
         slopes = self._slopes(point, following)
-        if slopes[1] * slopes[2] <= 0:
+        if np.sign(slopes[1]) * np.sign(slopes[2]) <= 0:
             return [following]
         share, least = _smallest_slope(*slopes)
         if depth == SLOPE_STEPS or not 0 < share < 1 or least > SMALL_SLOPE * max(map(abs, slopes[1:])):
@@ -926,10 +926,10 @@ class Follower:
         middle = self.curve.point(point, prediction, row)
         self.iterations += middle.iterations
         middle = middle._replace(iterations=0)
-        slope = middle.tangent[-1] / (row @ middle.tangent) * np.sign(slopes[1])
+        slope = self._slope(middle.tangent) / (row @ middle.tangent) * np.sign(slopes[1])
         if slope <= 0:
             return [middle, following]
-        if abs(slope - least) <= SLOPE_TOLERANCE * slope or slope * self.curve.units[-1] <= FOLD_TOLERANCE:
+        if abs(slope - least) <= SLOPE_TOLERANCE * slope or slope <= FOLD_TOLERANCE:
             return [following]
         before = self._path(point, middle, depth + 1)
         after = self._path(middle, following, depth + 1)
@@ -938,10 +938,17 @@ class Follower:
         return [*before, *after]
 
     def _slopes(self, point, following):
-        """Return the mean slope dp/ds between two points, and those at both; s is the way along the first tangent."""
+        """Return the mean slope dp/ds between two points, and those at both; s is the way along the first tangent.
+
+        p is in units of its range.
+        """
         row = self.curve.row_along(point.tangent)
         change = following.z - point.z
-        return [t[-1] / (row @ t) for t in (change, point.tangent, following.tangent)]
+        return [self._slope(t) / (row @ t) for t in (change, point.tangent, following.tangent)]
+
+    def _slope(self, t):
+        """Return the component of a vector along p, in units of the range, so that products do not underflow."""
+        return self.curve.units[-1] * t[-1]
 
     def _end_at(self, fold):
         """Return the status word if the parameter of a fold is an end of the range up to the tolerance."""
@@ -978,17 +985,16 @@ class Follower:
         """Return the point between two others at which the tangent has no component along p: regula falsi."""
         row = self.curve.row_along(point.tangent)
         low, high = 0.0, float(row @ (following.z - point.z))
-        low_slope, high_slope = point.tangent[-1], following.tangent[-1]
+        low_slope, high_slope = self._slope(point.tangent), self._slope(following.tangent)
         fold = following
-        unit = self.curve.units[-1]
         slope = 0.0
         for _ in range(FOLD_STEPS):
             size = (low * high_slope - high * low_slope) / (high_slope - low_slope)
             last_slope = slope
             fold = self._point_at(point, size, FOLD_ACCURACY)
             self.iterations += fold.iterations
-            slope = fold.tangent[-1]
-            if abs(slope) * unit <= FOLD_TOLERANCE:
+            slope = self._slope(fold.tangent)
+            if abs(slope) <= FOLD_TOLERANCE:
                 return fold._replace(iterations=0)
             if not low < size < high:
                 break
@@ -1000,7 +1006,7 @@ class Follower:
                 low, low_slope = size, slope
                 if slope * last_slope > 0:
                     high_slope *= 0.5
-        if abs(slope) * (high - low) <= self.curve.root.rtol * abs(self.steps.stop - self.steps.start):
+        if abs(slope) * (high - low) <= self.curve.root.rtol:
             return fold._replace(iterations=0)  # p turns back at a kink
         raise ConvergenceError(f"the fold near parameter {fold.z[-1]:.8g} is not located")
 

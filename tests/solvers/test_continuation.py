@@ -32,6 +32,16 @@ def test_folds_of_a_cubic_are_exact():
     assert repr(branch) == f"<branch of {len(branch)} steady states, parameter -4 to 4, 2 folds, reached_stop>"
 
 
+@pytest.mark.parametrize("scale", [1e-250, 1e-170, 1e160, 1e200])
+def test_folds_are_found_in_any_unit_of_the_parameter(scale):
+    """Products of two slopes dp/ds, which are proportional to the scale, would underflow or overflow."""
+    branch = dp.continuation(lambda x, p: cubic(x, p, scale), -3.0, -4.0 * scale, 4.0 * scale)
+    assert branch.status == "reached_stop"
+    assert [fold.parameter / scale for fold in branch.folds] == pytest.approx([2.0, -2.0], rel=1e-14)
+    branch = dp.continuation(lambda x, p: cubic(x, p, scale), -3.0, -4.0 * scale, 4.0 * scale, largest_step=8.0 * scale)
+    assert [fold.parameter / scale for fold in branch.folds] == pytest.approx([2.0, -2.0], rel=1e-14)
+
+
 def inflected(x, p, a):
     """p = x^3 - a x: two folds at p = -+2 (a / 3)^(3/2), which are close together for a small a; none for a <= 0."""
     return p - x**3 + a * x
