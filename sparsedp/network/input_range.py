@@ -34,8 +34,8 @@ def training_range(inputs: ArrayLike, axis: int | None = None, margin: float = 0
     Returns
     -------
     TrainingRange
-        ``guarded(x)`` returns x, with the derivative 1. The first x with a value outside the range, or NaN, issues a
-        `RangeWarning`. ``guarded.outside(x)`` returns where values are outside.
+        ``guarded(x)`` returns x, with the derivative 1. The first x with a value that is outside the range, or not
+        finite, issues a `RangeWarning`. ``guarded.outside(x)`` returns where values are outside or not finite.
 
     Raises
     ------
@@ -83,9 +83,10 @@ def training_range(inputs: ArrayLike, axis: int | None = None, margin: float = 0
         others = tuple(number for number in range(inputs.ndim) if number != inputs.ndim + axis)
     least = np.min(inputs, axis=others)
     largest = np.max(inputs, axis=others)
-    with np.errstate(over="ignore"):  # a range that overflows is unbounded
+    greatest = np.finfo(float).max
+    with np.errstate(over="ignore"):
         slack = np.multiply(margin, 0.5 * largest - 0.5 * least) * 2.0
-        return TrainingRange(least - slack, largest + slack, axis)
+        return TrainingRange(np.maximum(least - slack, -greatest), np.minimum(largest + slack, greatest), axis)
 
 
 def _real_array(name: str, values: Any) -> NDArray:
@@ -97,13 +98,19 @@ def _real_array(name: str, values: Any) -> NDArray:
         return array.astype(float)
 
 
+def _read_only(bound):
+    bound = np.array(bound)
+    bound.flags.writeable = False
+    return bound
+
+
 class TrainingRange(Reconstructible):
     """The range of the inputs of a network in training; see `training_range`.
 
     Parameters
     ----------
     lower, upper : arrays
-        The least and the largest value, one number or one for each feature.
+        The least and the largest value, one number or one for each feature; finite, and read-only.
     axis : int or None
         The axis of the features.
 
@@ -116,8 +123,8 @@ class TrainingRange(Reconstructible):
     name = "training_range"
 
     def __init__(self, lower: NDArray, upper: NDArray, axis: int | None) -> None:
-        self.lower = lower
-        self.upper = upper
+        self.lower = _read_only(lower)
+        self.upper = _read_only(upper)
         self.axis = axis
         self.has_warned = False
 
@@ -144,10 +151,10 @@ class TrainingRange(Reconstructible):
             If x does not hold real numbers.
         """
         check_values(self._warn, x)
-        return x
+        return np.asarray(x) if isinstance(x, (list, tuple)) else x
 
     def outside(self, x: Any) -> NDArray:
-        """Return where values of an array are outside the range, or NaN.
+        """Return where values of an array are outside the range, or not finite.
 
         Parameters
         ----------

@@ -113,13 +113,25 @@ def test_ranges_of_channels_of_all_values_and_of_nan():
         (np.uint8([0, 250]), -25, 275),
         (np.array([False, True]), -0.1, 1.1),
         (np.array([-1e308, 1e308]), -1.2e308, 1.2e308),
-        (np.array([-1.7e308, 1.7e308]), -np.inf, np.inf),
+        (np.array([-1.7e308, 1.7e308]), -np.finfo(float).max, np.finfo(float).max),
     ],
 )
 def test_the_range_does_not_overflow_in_the_dtype_of_the_data(inputs, lower, upper):
     guarded = training_range(inputs)
     assert (guarded.lower, guarded.upper) == pytest.approx((lower, upper), rel=1e-15)
     assert not np.any(guarded.outside(inputs))
+    assert np.all(guarded.outside([np.inf, -np.inf, np.nan]))
+
+
+def test_bounds_are_read_only_and_lists_become_arrays():
+    guarded = training_range(SEEN, axis=-1)
+    for bounds in (guarded, copy.deepcopy(guarded), pickle.loads(pickle.dumps(guarded))):
+        for bound in (bounds.lower, bounds.upper):
+            with pytest.raises(ValueError, match="read-only"):
+                bound[0] = -99.0
+    x = guarded([0.5, 20.0])
+    assert isinstance(x, np.ndarray)
+    assert np.array_equal(x, [0.5, 20.0])
 
 
 def test_values_are_compared_in_double_precision():
@@ -154,5 +166,6 @@ def test_in_a_rollout_its_gradient_and_a_program():
     guarded = training_range(u, margin=1.0)
     program = dp.jit(lambda u: guarded(u) * 1.1)
     program(u)
-    with pytest.warns(dp.errors.RangeWarning, match="the first is 5, outside 0 to 1.5"):
+    with pytest.warns(dp.errors.RangeWarning, match="the first is 5, outside 0 to 1.5") as caught:
         program(10 * u)
+    assert caught[0].filename == __file__
