@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Container, Sequence
 
 __all__ = [
+    "PROGRAM",
     "advice_near",
     "deprecated_attribute",
     "describe_module",
@@ -34,6 +35,7 @@ __all__ = [
 ]
 
 PACKAGE = Path(__file__).parent.parent
+PROGRAM = "<program of dp.jit>"  # file name of the code that `dp.jit` generates
 # Packages whose frames are removed from tracebacks: this library, and packages that call its code.
 HIDDEN = ("sparsedp", "autograd", "functools", "contextlib", "scipy", "pyamg")
 # Keyword argument of other libraries -> {parameter of ours: advice}. The first parameter that the function has is used.
@@ -297,14 +299,19 @@ def _is_of_the_user(frame):
     return frame.f_globals.get("__name__", "").partition(".")[0] not in HIDDEN
 
 
+def _is_of_the_package(file_name):
+    return file_name == PROGRAM or Path(file_name).is_relative_to(PACKAGE)
+
+
 def frames_inside() -> int:
     """Return the number of frames of this package from the caller of this function up to the user's code.
 
-    The caller itself is counted. A warning with ``stacklevel=frames_inside() + 1`` names the line of the user's code.
+    The caller itself is counted, and so are programs of `dp.jit`. A warning with ``stacklevel=frames_inside() + 1``
+    names the line of the user's code.
     """
     frame: Any = sys._getframe(1)
     count = 0
-    while frame is not None and Path(frame.f_code.co_filename).is_relative_to(PACKAGE):
+    while frame is not None and _is_of_the_package(frame.f_code.co_filename):
         frame = frame.f_back
         count += 1
     return count

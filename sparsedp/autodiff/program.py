@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import autograd.numpy as anp
 import numpy as np
 
+from sparsedp._utils.calls import PROGRAM
 from sparsedp.autodiff.fast_derivatives import ARRAY, ITEM, NUMBERS
 from sparsedp.autodiff.program_trace import Slot
 from sparsedp.autodiff.tape import executed_function
@@ -93,7 +94,7 @@ def compile_program(
     returned = "".join(f"{writer.name(result)}, " for result in results)
     body = "".join(f"    {line}\n" for line in lines)
     text = f"def program({parameters}):\n{body}    return ({returned})\n"
-    exec(compile(text, "<program of dp.jit>", "exec"), writer.constants)
+    exec(compile(text, PROGRAM, "exec"), writer.constants)
     return writer.constants["program"]
 
 
