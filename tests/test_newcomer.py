@@ -289,6 +289,7 @@ def precision_of_jax():
         sys.modules["jax"].config.update("jax_enable_x64", False)
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("task", TASKS)
 def test_both_ways_give_the_same(task, tmp_path, monkeypatch):
     library, by_hand, now = TASKS[task]

@@ -323,6 +323,7 @@ def gradient_of(f):
     return lambda x: dp.value_and_grad(f)(x)[1]
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("outer", [gradient_of, autograd.grad])
 @pytest.mark.parametrize("inner", [gradient_of, autograd.grad])
 def test_nested_derivatives(check, outer, inner):
@@ -424,6 +425,7 @@ def bowl(number):
     return lambda x: np.sum((solve(x) - b) ** 2) + 0.01 * np.sum(x**4)
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("method", ["gd", "adam", "lbfgs", "newton_cg"])
 def test_minimize(check, method):
     def work(number):
@@ -484,6 +486,7 @@ sys.exit(not len(found) == 4 == found.count(found[0]))
 """
 
 
+@pytest.mark.whole
 def test_the_first_use_of_the_library_by_four_threads():
     assert subprocess.run([sys.executable, "-c", FIRST], check=False, timeout=300).returncode == 0
 

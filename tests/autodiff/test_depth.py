@@ -50,6 +50,7 @@ def test_sums_and_products_of_many_operators_are_not_nested():
     assert np.all(np.isfinite(many_factors.T(u)))
 
 
+@pytest.mark.whole
 def test_deeper_operators_are_refused():
     with pytest.raises(
         ValueError,

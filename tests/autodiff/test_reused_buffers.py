@@ -162,7 +162,7 @@ def test_residuals_and_jacobians(rng, form, size):
 METHODS = ["euler", "heun", "ssprk3", "rk4", "backward_euler", "crank_nicolson", "tr_bdf2"]
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("tolerance", [None, 1e-4])
 def test_rates(rng, method, tolerance):

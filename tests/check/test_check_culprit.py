@@ -308,6 +308,7 @@ def test_complex_step():
     assert "complex step" not in str(AUDIT(lambda u: anp.sum(anp.abs(u) ** 2), X))
 
 
+@pytest.mark.whole
 def test_in_pytest(tmp_path):
     """A failing assertion shows the table and the culprit."""
     test = tmp_path / "test_it.py"

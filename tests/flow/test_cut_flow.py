@@ -209,6 +209,7 @@ def test_the_gradient_agrees_with_differences():
     assert verdict.verdict == "agrees", verdict
 
 
+@pytest.mark.whole
 def test_forward_and_second_derivatives():
     gradient = dp.grad(weighted_force)
     direction = np.array([0.3, -0.1, 0.5, 0.2])

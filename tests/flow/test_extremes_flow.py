@@ -124,6 +124,7 @@ def test_nonfinite_values_are_named(method):
             timed((u, np.nan), 1.0)
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("method", [word for word in METHODS if word != "radau"])  # real states only
 def test_dtypes_in_a_loop_of_linear_steps(method, rng):
     """The step's own pullback gives the dtypes of the tape: single precision, complex state and real coefficient."""

@@ -36,6 +36,7 @@ def test_explicit_viscosity_at_its_limit_does_not_grow():
     assert np.max(np.abs(dp.rollout(step, step.start(v), None, 300)["v"])) < np.max(np.abs(first))
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("shape", [(6, 5), (4, 3, 5), (7,)])
 @pytest.mark.parametrize("word", [dp.no_slip, dp.free_slip])
 def test_viscosity_is_symmetric_and_dissipates_energy(shape, word):
@@ -133,6 +134,7 @@ def test_convection_and_its_derivatives_agree_with_slices():
     np.testing.assert_allclose(tangent, convect(v, w) + convect(w, v), atol=1e-13)
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("shape", [(6, 5), (4, 3, 5), (7,)])
 def test_convection_conserves(shape):
     """Momentum on periodic grids, and energy wherever nothing enters, when the carrier has no divergence."""

@@ -59,6 +59,7 @@ def scenes(shape, drawn):
     return [(grid, obstacles(grid)[n]) for grid, n in map(many.get, drawn(list(many)))]
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("shape", SHAPES[:-1])
 def test_agrees_with_the_dense_projection_and_its_transpose(shape, scenes):
     for grid, solid in scenes:
@@ -69,6 +70,7 @@ def test_agrees_with_the_dense_projection_and_its_transpose(shape, scenes):
         np.testing.assert_allclose(P.T(v), matrix.T @ v, atol=1e-9)
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_divergence_idempotence_and_symmetry(shape, scenes):
     for grid, solid in scenes:

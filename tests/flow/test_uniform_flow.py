@@ -71,6 +71,7 @@ def rounding(flow):
     return 1e-13 / least**2
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize(("shape", "every"), KINDS)
 def test_each_term_preserves_a_uniform_flow(shape, every):
     for flow in flows(shape, every):
@@ -89,6 +90,7 @@ def test_each_term_preserves_a_uniform_flow(shape, every):
             np.testing.assert_allclose(on(v, np.zeros(shape), 0.1, flow.walls)[: grid.dim], 0.0, **close)
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize(("shape", "every"), KINDS)
 def test_transport_on_faces_preserves_a_uniform_flow(shape, every):
     for flow in flows(shape, every):
@@ -109,6 +111,7 @@ for number, shape in enumerate(SHAPES):  # one half of the steps, and the other 
     STEPPING += [pytest.param(shape, True, name, id=f"{shape}-{name}", marks=WHOLE) for name in names]
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize(("shape", "every", "name"), STEPPING)
 def test_flow_steps_preserve_a_uniform_flow(shape, every, name):
     """Yield wall velocities as a function and, where it determines them, as the result of `face_lift`."""

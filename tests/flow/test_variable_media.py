@@ -351,6 +351,7 @@ def test_functions_of_all_kinds(law, plain, rng):
         np.testing.assert_array_equal(rate(law), rate(plain))
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("argument", ["density", "diffusivity", "dt"])
 def test_methods_as_other_arguments(argument, rng):
     """Density and diffusivity take the params, or scalars and params; dt the params, with or without default values."""
@@ -425,6 +426,7 @@ def batch(rng, lead, implicit):
     return lambda v, c, p: step(step.start(v, p, {"c": c}), p), v, c
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("implicit", [False, True])
 @pytest.mark.parametrize("lead", [(2,), (2, 1, 2)])
 def test_a_batch_of_flows(lead, implicit, rng):

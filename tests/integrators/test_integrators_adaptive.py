@@ -65,6 +65,7 @@ def test_tolerance_and_derivatives(method):
     assert pushforward(loss, x, np.array([0.3, 0.5, -0.2]))[1] == pytest.approx(g @ [0.3, 0.5, -0.2], rel=1e-9)
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("method", ["backward_euler", "tr_bdf2", "imex", "etdrk4"])
 def test_operators_take_halves_of_halves(method):
     """Lengths are powers of two, so that few set-ups serve many steps."""

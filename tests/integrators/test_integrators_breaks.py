@@ -64,6 +64,7 @@ def test_a_source_switched_on_at_a_fixed_time(method):
     assert slope == pytest.approx(np.exp(-1.0), rel=1e-5)
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("off", [0.25, 0.5, 0.6])
 def test_a_break_at_the_end_of_a_step(off):
     """It is a break of the step that ends there; the step that begins there takes the rate after it."""

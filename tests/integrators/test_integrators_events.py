@@ -305,6 +305,7 @@ def test_a_jump_discards_the_rest_of_its_step(method):
     assert len(step.t_events[0]) == 0 and step.t_events[1] == pytest.approx([0.4])
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("level", [0.49, 0.6, 0.73, 0.89])
 def test_an_event_of_a_smooth_rate_does_not_look_like_a_layer(level):
     """u' = -p u has the derivative -exp(-1) after t = 1, with an event or without."""

@@ -219,6 +219,7 @@ def check_allen_cahn(method, cells):
     assert np.isfinite(value) and g == pytest.approx(central, rel=1e-7)
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("method", ["backward_euler", "tr_bdf2", "imex", "etdrk4"])
 def test_allen_cahn(method):
     check_allen_cahn(method, 16)

@@ -158,6 +158,7 @@ WRITERS = {
 ALIKE = {"table.save", "animate", "work_precision(file)"}  # what they write goes the way of the others
 
 
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.whole] if n in ALIKE else []) for n in WRITERS])
 def test_no_room(tmp_path, name):
     """The second, larger write fails: the files of the first one stand there, and nothing else."""

@@ -61,6 +61,7 @@ def test_environment_variable_disables_numba():
     assert run("assert 'numba' not in sys.modules and not kernels.compiled()", SPARSEDP_NUMBA="0").returncode == 0
 
 
+@pytest.mark.whole
 @NUMBA
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
 def test_kernels_in_a_forked_process():

@@ -54,7 +54,7 @@ def nonlinear(method, rtol):
 SCENES = {"poisson": poisson, "weighted": weighted, "implicit steps": implicit_steps, "nonlinear": nonlinear}
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("method", ["krylov", "multigrid"])
 @pytest.mark.parametrize("name", SCENES)
 def test_effectivity(name, method):

@@ -45,7 +45,7 @@ def solved(how, method, D, G, k, b):
     return x, y, [(info.iterations, info.status) for info in (solve.info.forward, solve.info.adjoint)]
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("dim", SHAPES)
 @pytest.mark.parametrize("how", [inverse, elliptic, entries])

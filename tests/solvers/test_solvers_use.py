@@ -163,6 +163,7 @@ def test_wrong_shapes():
 # ---------------------------------------------------------------- derivatives
 
 
+@pytest.mark.sampled(0)
 @EVERY
 @pytest.mark.parametrize("problem", ["wind", "stretched neumann"])
 def test_derivatives_of_every_order(problem, method, rng):

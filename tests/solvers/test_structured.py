@@ -81,7 +81,7 @@ def test_the_null_space_equals_the_one_from_the_entries(rng):
             assert mine.null_space.count == known.null_space.count
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("shape", [(64, 64), (257, 100), (33, 32, 31)])
 @pytest.mark.parametrize("boundary", [dp.dirichlet, dp.neumann])
 def test_at_most_12_iterations_for_smooth_coefficients(shape, boundary, rng):
@@ -107,6 +107,7 @@ def test_inclusions_with_jumps_of_a_million(shape, rng):
     assert inv.info.forward.iterations <= 30 and inv.info.forward.backward_error <= 1e-12
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("jump, precision", [(1e4, "single"), (1e6, "double"), (1e10, "double")])
 def test_the_precision_of_the_cycle_follows_the_jumps(jump, precision, rng):
     """Twelve balls: in single precision 1e6 takes twice as many iterations, and 1e10 ends far off."""

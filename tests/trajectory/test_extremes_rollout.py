@@ -131,6 +131,7 @@ def test_the_projection_everywhere(where, rng):
     assert not np.any(u[~np.any(matrix, axis=0)])
 
 
+@pytest.mark.sampled(0)
 @FEW
 @pytest.mark.parametrize("name", ["inclusion 1e8", "random 8 decades"])
 def test_jumps_within_their_certificate(name, few, rng):

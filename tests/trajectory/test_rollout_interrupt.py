@@ -130,6 +130,7 @@ except KeyboardInterrupt:
 """
 
 
+@pytest.mark.whole
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for one process")
 def test_a_real_signal():
     child = subprocess.Popen([sys.executable, "-c", LONG], stdout=subprocess.PIPE, text=True)

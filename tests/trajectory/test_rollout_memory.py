@@ -158,6 +158,7 @@ def peak(call):
         tracemalloc.stop()
 
 
+@pytest.mark.sampled(0)
 @KINDS
 @pytest.mark.parametrize("keep", ["last", "all"])
 def test_peak_is_the_trajectory(step, keep, monkeypatch):
@@ -196,7 +197,7 @@ def test_peak_under_a_budget(step, states):
 SCALED = Rule("scaled", lambda u, c: u * c, lambda nums, ans, u, c: lambda g: tuple(g * (c, u)[num] for num in nums))
 
 
-@pytest.mark.sampled
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("keep", ["last", "each"])
 @pytest.mark.parametrize("params", [True, False])
 @pytest.mark.parametrize("states", [8, 9, 16, 80])
