@@ -235,7 +235,7 @@ def stepper(
     vectorized. For derivatives of higher order radau records each step: a Hessian product of two parameters takes 50
     times as long as a gradient. A step of rodas5p takes one Jacobian, one factorisation and eight solves; the gradient
     takes 24 transposed solves for each step, with the factorisations of the last steps (up to 0.5 GB) and new ones.
-    On grids with 1e4 unknowns it takes 2 to 3 times as long as the value, for a few unknowns ten times (take radau
+    On grids with 1e4 unknowns it takes 1.7 to 2.9 times the time of the value, for a few unknowns ten times (take radau
     there).
 
     Breaks and events: du/db = f_- - f_+ just after a break b, where f_- and f_+ are the rates before and after it. The

@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 
 __all__ = ["FaceValues"]
 
-# The slope on a wall of the grid counts in full from this share of the speed on the opposite face on, 1 / FULL.
+# The slope on a wall of the grid is used without reduction if the inflow is at least 1 / FULL of the speed on the
+# opposite face.
 FULL = 10.0
 
 

@@ -301,7 +301,9 @@ CHOICES = [
     (
         lambda: dp.from_matrix((-dp.laplacian(CUBE, dp.dirichlet)).matrix, CUBE.cells, CUBE.cells),
         "structured" if compiled() else "multigrid",
-        "multigrid on the grid itself" if compiled() else "structured multigrid needs numba, which is not installed",
+        "multigrid on the grid itself"
+        if compiled()
+        else "structured multigrid needs numba, which is not installed or switched off",
     ),
     (
         lambda: -dp.divergence(CUBE) @ dp.diagonal(CUBE.faces, LAYERS) @ dp.gradient(CUBE),

@@ -234,7 +234,9 @@ def test_an_unknown_precision_raises():
 
 def test_without_numba(monkeypatch):
     monkeypatch.setattr(kernels, "compiled", lambda: False)
-    with pytest.raises(ValueError, match="^structured needs numba, which is not installed; write method='multigrid'$"):
+    with pytest.raises(
+        ValueError, match="^structured needs numba, which is not installed or switched off; write method='multigrid'$"
+    ):
         dp.inverse(PLUS - dp.laplacian(SQUARE), "structured")
     grid = dp.Grid((30, 30, 30))
     assert "structured multigrid needs numba" in dp.inverse(conductance(grid, smooth(grid))).reason

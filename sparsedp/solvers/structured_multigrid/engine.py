@@ -72,7 +72,7 @@ def structured_engine(system: System, *, precision: str = "auto") -> Structured:
     """
     check_precision(precision)
     if not kernels.compiled():
-        raise ValueError("structured needs numba, which is not installed; write method='multigrid'")
+        raise ValueError("structured needs numba, which is not installed or switched off; write method='multigrid'")
     try:
         return _build_engine(system, PRECISIONS[precision])
     except UnsuitableOperator as reason:
@@ -103,7 +103,7 @@ def structured_if_suited(system: System) -> tuple[Structured | None, str]:
     if grid is None or grid.dim == 1:
         return None, "structured multigrid is for grids in 2-D and 3-D"
     if not kernels.compiled():
-        return None, "structured multigrid needs numba, which is not installed"
+        return None, "structured multigrid needs numba, which is not installed or switched off"
     try:
         engine = _build_engine(system)
     except UnsuitableOperator as reason:
